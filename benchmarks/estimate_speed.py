@@ -21,7 +21,7 @@ import numpy as np
 from static_kernel import StaticKernel
 
 from devices.frames import FrameBatch
-from service.estimation.calibration import make_paper_eq2_preset
+from service.estimation.calibration import make_paper_shape_preset
 from service.estimation.estimate import Estimator
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 
@@ -52,7 +52,7 @@ def plan_of(models: tuple[str, ...], count: int = 4) -> EstimationPlan:
     tare = make_tare(
         count, baseline_kpa=100.0, baseline_sigma_kpa=0.165 / 20, noise_kpa=0.165, t_ns=0
     )
-    return make_plan(info, make_paper_eq2_preset(), tare, models=models, lag_ms=10.0)
+    return make_plan(info, make_paper_shape_preset(), tare, models=models, lag_ms=10.0)
 
 
 def frames_of(n: int, count: int = 4) -> FrameBatch:

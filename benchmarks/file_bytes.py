@@ -26,7 +26,7 @@ import recording_formats as formats
 import recording_sealing as sealing
 from side_by_side import note, table
 
-from service.estimation.calibration import Calibration, make_paper_eq2_preset
+from service.estimation.calibration import Calibration, make_paper_shape_preset
 from service.offline.calibration_lookup import find_calibration
 from storage.journal.journal import Journal
 from storage.schema import MEASURED_COLUMNS
@@ -55,7 +55,7 @@ def measured(recording: data.Recording, folder: Path, *, with_ladder: bool) -> l
     note(f"sealing {recording.title}")
     formats.write_journal(folder / "journal", recording)
     ways: dict[str, tuple[Calibration, tuple[str, ...]]] = {
-        "`static`": (make_paper_eq2_preset(), sealing.STATIC)
+        "`static`": (make_paper_shape_preset(), sealing.STATIC)
     }
     if with_ladder:
         ways["whole ladder"] = (

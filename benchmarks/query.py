@@ -20,7 +20,7 @@ from recording_formats import write_journal
 from recording_sealing import STATIC, sources_of
 from side_by_side import in_turns, note, spread, table
 
-from service.estimation.calibration import make_paper_eq2_preset
+from service.estimation.calibration import make_paper_shape_preset
 from service.offline.archive.query import run_query
 from service.offline.archive.session_search import find_sessions
 from service.sessions.sealing import seal_session
@@ -45,7 +45,7 @@ def sealed(recording: Recording, folder: SessionsFolder, session_id: str, work: 
     journal_folder = work / session_id
     write_journal(journal_folder, recording)
     journal = Journal.open(journal_folder)
-    sources = sources_of(journal, make_paper_eq2_preset(), STATIC)
+    sources = sources_of(journal, make_paper_shape_preset(), STATIC)
     named = {"id": session_id, "name": recording.title}
     sources = type(sources)(
         **{**vars(sources), "session": sources.session.model_copy(update=named)}

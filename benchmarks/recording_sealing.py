@@ -11,7 +11,7 @@ from recording_data import FULL_RATE_HZ, Extent, Recording, emulated
 from recording_formats import flat_table, minute, write_journal
 from side_by_side import in_turns, note, spread, table
 
-from service.estimation.calibration import Calibration, make_paper_eq2_preset
+from service.estimation.calibration import Calibration, make_paper_shape_preset
 from service.offline.calibration_lookup import find_calibration
 from service.sessions.frames import SessionFrames
 from service.sessions.inputs import SessionInputs
@@ -62,7 +62,7 @@ def seal(sources: SessionInputs, path: Path, *, with_stances: bool = True) -> in
             if with_stances:
                 stances.add_frames(batch.seq, batch.t_ns, columns)
             count += len(batch)
-    stances.write_file(path.parent, compute_sha256(path))
+    stances.try_write_or_delete_file(path.parent, compute_sha256(path))
     if sources.calibration is not None:
         assert frames.problem is None, frames.problem
     return count
@@ -95,9 +95,9 @@ def jobs(
         "pyarrow alone, from memory": bare,
         "raw": lambda: sealing("raw", None, ()),
         "with estimates, `static`, without stances": lambda: sealing(
-            "static", make_paper_eq2_preset(), STATIC, with_stances=False
+            "static", make_paper_shape_preset(), STATIC, with_stances=False
         ),
-        "with estimates, `static`": lambda: sealing("static", make_paper_eq2_preset(), STATIC),
+        "with estimates, `static`": lambda: sealing("static", make_paper_shape_preset(), STATIC),
     }
     if with_ladder:
         bench = find_calibration("emulated-rig", recording.info.serials)

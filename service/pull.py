@@ -33,7 +33,7 @@ from storage.parquet_hash import compute_sha256
 from storage.sessions.folder import FRAMES_NAME
 from storage.sessions.metadata import SESSION_NAME
 from storage.verify.export import RECOGNISED_FORMATS as PROVEN
-from storage.verify.export import read_export
+from storage.verify.export import verify_export
 
 if TYPE_CHECKING:
     import httpx
@@ -206,7 +206,7 @@ def _download_export(
         ):
             _write_response(answer, file)
         # For other formats, only the connection detects truncation.
-        report = read_export(partial) if export_format.name in PROVEN else None
+        report = verify_export(partial) if export_format.name in PROVEN else None
         if export_format.name in PROVEN and (report is None or report.problems):
             why = "it cannot be read" if report is None else report.problems[0]
             raise foottile.DamagedError(

@@ -68,7 +68,7 @@ def make_app(
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        running = asyncio.create_task(server.run())
+        running = asyncio.create_task(server.run_ticks())
         try:
             yield
         finally:

@@ -53,7 +53,7 @@ def _tabulate_weights(calibration: Calibration, tile: TileCalibration) -> Table:
             _format_number(step.noise_kpa, 2),
             f"{step.settle_kpa:+.2f}",
             f"{step.residual_n:+.2f}",
-            f"±{facts.interpolate_half_width_n(step.gauge_kpa):.2f}",
+            f"±{facts.interpolate_half_width_95_n(step.gauge_kpa):.2f}",
         )
     return table
 

@@ -70,7 +70,7 @@ class TileCalibration(CalibrationPart):
     loop_misfit_n: NonNegative
     """Scatter of a new loading's force about the curve: its variance is the sum of
     (`relative_misfit` F)^2, a gain that differs between loadings, and (`loop_misfit_n`
-    `loop_share(F)`)^2, a hysteresis loop that opens with the first newton."""
+    `compute_relative_loop_width(F)`)^2, a hysteresis loop that opens with the first newton."""
     r2: Number | None
     rmse_n: Number | None
     cv_rmse_n: Number | None
@@ -99,7 +99,7 @@ class TileCalibration(CalibrationPart):
         matrix = np.array(self.covariance)
         if matrix.shape != (CUBIC_TERMS, CUBIC_TERMS):
             raise ValueError(f"covariance is {matrix.shape}, expected {(CUBIC_TERMS, CUBIC_TERMS)}")
-        if self.monotonic != is_monotonic(self.coefficients, self.range_u):
+        if self.monotonic != is_increasing_cubic(self.coefficients, self.scaled_pressure_range):
             raise ValueError(f"monotonic = {self.monotonic} is not true of the coefficients")
         rubber = self.effects.rubber
         if rubber is not None:
@@ -108,12 +108,12 @@ class TileCalibration(CalibrationPart):
                 raise ValueError(
                     f"covariance of rubber is {shape}, expected {(CUBIC_TERMS, CUBIC_TERMS)}"
                 )
-            if not is_monotonic(rubber.coefficients, self.range_u):
+            if not is_increasing_cubic(rubber.coefficients, self.scaled_pressure_range):
                 raise ValueError("the curve beneath rubber does not rise all over its range")
         return self
 
     @property
-    def range_u(self) -> tuple[float, float]:
+    def scaled_pressure_range(self) -> tuple[float, float]:
         """Calibrated range in the polynomial's variable."""
         low, high = ((p - self.p_offset_kpa) / self.p_scale_kpa for p in self.range_kpa)
         return low, high
@@ -140,14 +140,12 @@ class Calibration(CalibrationPart):
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
 
     def find_tile(self, serial: str) -> TileCalibration | None:
-        """Return the entry for a serial; None without one, as for bare tiles."""
-        for tile in self.tiles:
-            if tile.serial in (serial, ANY_SERIAL):
-                return tile
-        return None
+        """Return the entry for a serial, else for any (`*`); None without, as for bare tiles."""
+        by_serial = {tile.serial: tile for tile in self.tiles}
+        return by_serial.get(serial, by_serial.get(ANY_SERIAL))
 
     def get_tile(self, serial: str) -> TileCalibration:
-        """Return the entry for a serial.
+        """Return the entry for a serial, else that for any (`*`).
 
         Raises:
             CalibrationError: there is none.
@@ -175,7 +173,7 @@ class Calibration(CalibrationPart):
 
     @classmethod
     def from_json(cls, text: str, *, where: str) -> Calibration:
-        """Parse a calibration file; one without an id was written or edited by hand.
+        """Parse a calibration file and check its id; without an id the name gets ", unproven".
 
         Raises:
             CalibrationError: not JSON, a field is missing or unknown, or the id does not match.
@@ -208,22 +206,27 @@ class Calibration(CalibrationPart):
         return calibration
 
 
-def compute_loop_share(force_n: Floats) -> Floats:
-    """Return the width of the loop at a force over the final one: 0 at 0 N, a half at 1 N."""
+def compute_relative_loop_width(force_n: Floats) -> Floats:
+    """Return the loop's width at each force, relative to its final width: 0 at 0 N, 0.5 at 1 N."""
     return np.asarray(1.0 - LOOP_HALF_WIDTH_FORCE_N / (np.abs(force_n) + LOOP_HALF_WIDTH_FORCE_N))
 
 
-def is_monotonic(coefficients: Sequence[float], range_u: tuple[float, float]) -> bool:
-    """Return whether the cubic rises all over `range_u`, by its slope at ends and vertex."""
+def is_increasing_cubic(
+    coefficients: Sequence[float], scaled_pressure_range: tuple[float, float]
+) -> bool:
+    """Return whether the cubic rises all over a range, by its slope at ends and vertex."""
     _, c1, c2, c3 = coefficients
-    places = list(range_u)
-    if c3 != 0.0 and range_u[0] < (vertex := -c2 / (3 * c3)) < range_u[1]:
+    places = list(scaled_pressure_range)
+    if (
+        c3 != 0.0
+        and scaled_pressure_range[0] < (vertex := -c2 / (3 * c3)) < scaled_pressure_range[1]
+    ):
         places.append(vertex)
     return all(c1 + u * (2 * c2 + u * 3 * c3) > 0.0 for u in places)
 
 
-def make_paper_eq2_preset() -> Calibration:
-    """Make the preset of the paper's eq. 2 as a shape, for any tile, with an assumed scale.
+def make_paper_shape_preset() -> Calibration:
+    """Make a preset with the shape of the paper's eq. 2, for any tile, with an assumed scale.
 
     F = 0.13 p^3 + 0.02354 p^2 + 0.5702 p + 0.1309 has no stated units, and no reading in SI units
     gives the paper's 25 to 35 N at saturation (hardware.md 7). So: p = gauge / 15 kPa, zero at zero
@@ -263,7 +266,7 @@ def make_paper_eq2_preset() -> Calibration:
     )
 
 
-PRESETS = {"paper-eq2-shape": make_paper_eq2_preset}
+PRESETS = {"paper-eq2-shape": make_paper_shape_preset}
 
 
 class BandPoint(CalibrationPart):
@@ -331,7 +334,7 @@ class WeightFacts(CalibrationPart):
     band_95: Annotated[tuple[BandPoint, ...], Field(max_length=_ROWS_MAX)]
     """Bands at ten equal steps; `new_loading_n` is for an estimate of a settled load."""
 
-    def interpolate_half_width_n(self, gauge_kpa: float) -> float:
-        """Return the half width of the 95 % interval of a new loading at this pressure."""
+    def interpolate_half_width_95_n(self, gauge_kpa: float) -> float:
+        """Interpolate the half width of a new loading's 95 % interval; constant beyond the band."""
         grid = [point.gauge_kpa for point in self.band_95]
         return float(np.interp(gauge_kpa, grid, [point.new_loading_n for point in self.band_95]))

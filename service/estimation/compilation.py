@@ -21,7 +21,7 @@ from devices.frames import (
     allocate_columns,
 )
 from devices.jit import NotCompiledError, forbid_compilation
-from service.estimation.calibration import Calibration, make_paper_eq2_preset
+from service.estimation.calibration import Calibration, make_paper_shape_preset
 from service.estimation.effects import (
     Effects,
     FlowEffect,
@@ -112,7 +112,7 @@ def _tile(channel: int) -> TileInfo:
 
 def _calibration() -> Calibration:
     tenth = Parameter(value=0.1, sigma=0.01)
-    curve = make_paper_eq2_preset().tiles[0]
+    curve = make_paper_shape_preset().tiles[0]
     effects = Effects(
         gas=GasEffect(gamma=Parameter(value=1.3, sigma=0.01), tau_s=tenth, misfit=0.1),
         rubber=RubberEffect(

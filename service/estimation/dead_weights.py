@@ -50,15 +50,17 @@ def parse_weight(text: str) -> DeadWeight | None:
     return DeadWeight(force_n, float(np.hypot(0.01 * percent / np.sqrt(3.0), gravity)))
 
 
-def make_weight_labels(texts: Sequence[str], tolerance_percent: float) -> tuple[str, ...]:
-    """Make the texts of weights for markers, `500 g +-0.5 %`; a tolerance in a text stays.
+def check_and_label_weights(
+    texts: Sequence[str], default_tolerance_percent: float
+) -> tuple[str, ...]:
+    """Check that weights suffice for a curve; label them `500 g +-0.5 %`, a stated tolerance stays.
 
     Raises:
         UsageError: a text is no weight, or there are too few for a curve.
     """
     labels, forces_n = [], []
     for text in texts:
-        label = text if "%" in text else f"{text} +-{round(tolerance_percent, 4):g} %"
+        label = text if "%" in text else f"{text} +-{round(default_tolerance_percent, 4):g} %"
         found, weight = _WEIGHT.fullmatch(label.strip()), parse_weight(label)
         if found is None or weight is None:
             raise UsageError(
@@ -67,13 +69,13 @@ def make_weight_labels(texts: Sequence[str], tolerance_percent: float) -> tuple[
         labels.append(f"{found['size']} {found['unit']} +-{found['off']} %")
         forces_n.append(weight.force_n)
     try:
-        check_weight_count(forces_n)
+        check_enough_distinct_weights(forces_n)
     except CalibrationError as error:
         raise UsageError(error.what, expected=error.expected, remedy=error.remedy) from error
     return tuple(labels)
 
 
-def check_weight_count(forces_n: Sequence[float], where: str = "") -> None:
+def check_enough_distinct_weights(forces_n: Sequence[float], where: str = "") -> None:
     """Reject weights that are too few, or too similar, for a curve.
 
     Raises:

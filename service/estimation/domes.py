@@ -55,8 +55,8 @@ class Dome:
         return f"v{self.material.name.split()[-1]}-{self.diameter_mm:.0f}"
 
     @property
-    def area_mm2(self) -> float:
-        """Area of the base."""
+    def base_area_mm2(self) -> float:
+        """Area of the base in mm2."""
         return pi * (self.diameter_mm / 2) ** 2
 
 
@@ -83,8 +83,10 @@ def compute_volume_ratio(
     return float((initial_kpa / final_kpa) ** (1.0 / exponent))
 
 
-def compute_fast_load_ratio(seal_kpa: float = SEAL_KPA, exponent: float = ADIABATIC) -> float:
-    """Return the change of volume of a fast load at full scale over that of a slow one: 0.73.
+def compute_fast_to_slow_load_ratio(
+    seal_kpa: float = SEAL_KPA, exponent: float = ADIABATIC
+) -> float:
+    """Return the change of volume at full scale of a fast load, relative to a slow one: 0.73.
 
     With volume proportional to force this is also the ratio of the loads ([D], estimate).
     """
@@ -138,8 +140,8 @@ def compute_saturation_load(dome: Dome) -> SaturationLoad:
     """
     if dome == PAPER_DOME:
         return SaturationLoad(dome, *PAPER_RANGE_N, "paper")
-    scale = (dome.material.modulus_mpa * dome.area_mm2) / (
-        PAPER_DOME.material.modulus_mpa * PAPER_DOME.area_mm2
+    scale = (dome.material.modulus_mpa * dome.base_area_mm2) / (
+        PAPER_DOME.material.modulus_mpa * PAPER_DOME.base_area_mm2
     )
     return SaturationLoad(dome, scale * PAPER_RANGE_N[0], scale * PAPER_RANGE_N[1], "estimate")
 

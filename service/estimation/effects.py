@@ -177,9 +177,9 @@ class Effects(CalibrationPart):
     """Delay of the tile's samples behind the instants in its frames: the data sheet does not say
     where in a conversion the chip samples. None: not determined, for want of fast loads."""
     late_common_s: NonNegative = 0.0
-    """Standard uncertainty that all tiles' `residual_lag_s` share, by the reference's own delay."""
+    """Standard uncertainty that all tiles' `late_s` share, by the reference's own delay."""
     reference_late_s: Number = 0.0
-    """Assumed delay of the reference; the rig measured the sum of `residual_lag_s` and this."""
+    """Assumed delay of the reference; the rig measured the sum of `late_s` and this."""
     at_bound: Annotated[tuple[Text, ...], TermLimit] = ()
     """Parameters at a bound."""
     refused: dict[EffectName, Text] = Field(default={})
@@ -191,8 +191,8 @@ class Effects(CalibrationPart):
         return self
 
     @property
-    def wall_per_kpa(self) -> float:
-        """Compliance of the wall from the thermal soak, else the estimate for the material."""
+    def wall_compliance_per_kpa(self) -> float:
+        """Compliance of the wall per kPa from the thermal soak, else the default `WALL_PER_KPA`."""
         return WALL_PER_KPA if self.temperature is None else self.temperature.wall_per_kpa.value
 
 

@@ -24,25 +24,25 @@ from service.estimation.foot.geometry import transform_to_ground_x_m
 from service.estimation.foot.kinematics import interpolate_servo_counts
 from service.estimation.models import denoise
 from service.estimation.pipeline import grf_cop
-from service.estimation.pipeline.counts import load_frames
+from service.estimation.pipeline.counts import append_frames_to_buffer
 from service.estimation.pipeline.frame_buffer import (
     ROWS_MIN,
     FrameBuffer,
     TileSample,
-    compact,
+    compact_or_grow_buffer,
     make_frame_buffer,
 )
 from service.estimation.pipeline.params import KernelParams, make_kernel_params
 from service.estimation.pipeline.plan import EstimationPlan
-from service.estimation.pipeline.sample_stage import compute_apparent_forces
+from service.estimation.pipeline.sample_stage import compute_apparent_forces_and_contact
 from service.estimation.pipeline.smoothing_stage import (
     BOUND_SIGMAS,
     TILE_FORCE,
     TileForce,
-    compute_tile_forces,
+    compute_forces_and_after_saturation,
 )
 from service.estimation.pipeline.state import FootState, TileState, initial_state
-from service.estimation.records import Columns, RecordArray, as_bytes
+from service.estimation.records import Columns, RecordArray, view_records_as_bytes
 
 _COP_MASKED = int(EstimateFlag.COP_MASKED)
 _AFTER_SATURATION = int(EstimateFlag.AFTER_SATURATION)
@@ -93,7 +93,7 @@ class Estimator:
         self._unmeasured = [row for rows, is_measured in axes if not is_measured for row in rows]
 
     def process_frames(self, frames: FrameBatch) -> Estimates:
-        """Process the next frames, in order; return the estimates that are due.
+        """Add the next frames; return the estimates now due, a look-ahead later than their frames.
 
         Args:
             frames: n frames with rising `seq` and `t_mono_ns`.
@@ -123,9 +123,12 @@ class Estimator:
         return _make_estimates(output, self._unmeasured)
 
     def state_dict(self) -> Columns:
-        """Return a copy of its state for `from_state`; records as their bytes."""
+        """Return a copy of the state for `from_state`, records as bytes; compacts the buffer."""
         self._compact_buffer(0)  # drops rows that nothing reaches back to
-        return {name: as_bytes(column).copy() for name, column in self._state_columns().items()}
+        return {
+            name: view_records_as_bytes(column).copy()
+            for name, column in self._state_columns().items()
+        }
 
     @classmethod
     def from_state(cls, plan: EstimationPlan, state: Columns) -> Self:
@@ -133,7 +136,7 @@ class Estimator:
 
         Args:
             plan: plan of the estimator that the state comes from.
-            state: result of `state_dict`, of the same version.   (not my package)
+            state: result of `state_dict`, of the same version.
 
         Raises:
             ValueError: the state is of another plan; compiled code would read beyond its memory.
@@ -143,7 +146,7 @@ class Estimator:
         new._buffer = make_frame_buffer(max(ROWS_MIN, rows), len(new._tile_states))
         new._foot_state["end_row"] = rows
         for name, column in new._state_columns().items():
-            memory, given = as_bytes(column), state[name]
+            memory, given = view_records_as_bytes(column), state[name]
             if (given.dtype, given.shape) != (memory.dtype, memory.shape):
                 raise ValueError(f"{name} is {given.dtype}{given.shape}, not {memory.shape}")
             memory[...] = given
@@ -167,7 +170,7 @@ class Estimator:
             oldest_ns = t_mono_ns[min(due, end - 1)] - denoise.PAST_NS
             within = int(np.searchsorted(t_mono_ns, oldest_ns))
             first = min(first, max(within, due - int(denoise.WINDOW_REACHES[-1])))
-        self._buffer = compact(self._buffer, first, end, new_rows)
+        self._buffer = compact_or_grow_buffer(self._buffer, first, end, new_rows)
         for name in _ROW_FIELDS:
             self._foot_state[name] -= first
 
@@ -226,13 +229,15 @@ def _step(
     frame_flags: npt.NDArray[np.uint8],
 ) -> KernelOutput:
     foot_params, foot_state = params.foot[0], foot_states[0]
-    load_frames(
+    append_frames_to_buffer(
         params, foot_state, tile_states, buffer, seq, t_mono_ns, t_ns, pressure_raw,
         temperature_raw, sample_offset_us, servo_counts, servo_age_us, tile_flags, frame_flags,
     )  # fmt: skip
     # With look-ahead and averages, a frame waits for the next one, for outlier replacement.
     while foot_state.sample_row < foot_state.end_row - foot_params.waits_for_next:
-        compute_apparent_forces(params, foot_state, tile_states, buffer, foot_state.sample_row)
+        compute_apparent_forces_and_contact(
+            params, foot_state, tile_states, buffer, foot_state.sample_row
+        )
         foot_state.sample_row += 1
     until, due_ns = foot_state.release_row, foot_state.newest_ns - foot_params.lag_ns
     while until < foot_state.sample_row and buffer.t_mono_ns[until] <= due_ns:
@@ -249,7 +254,9 @@ def _finish(
 ) -> KernelOutput:
     foot_state = foot_states[0]
     while foot_state.sample_row < foot_state.end_row:
-        compute_apparent_forces(params, foot_state, tile_states, buffer, foot_state.sample_row)
+        compute_apparent_forces_and_contact(
+            params, foot_state, tile_states, buffer, foot_state.sample_row
+        )
         foot_state.sample_row += 1
     return _estimate_due_rows(params, foot_state, tile_states, buffer, foot_state.end_row)
 
@@ -283,8 +290,10 @@ def _estimate_due_rows(
         row = buffer.rows[i]
         out[:] = math.nan
         if foot_params.has_denoise == 1:
-            rows = denoise.find_window_limits(buffer.t_mono_ns, i, 0, end, rows, look_ns)
-        unsettled = compute_tile_forces(params, tile_states, buffer, i, rows, windows, forces)
+            rows = denoise.find_window_rows(buffer.t_mono_ns, i, 0, end, rows, look_ns)
+        unsettled = compute_forces_and_after_saturation(
+            params, tile_states, buffer, i, rows, windows, forces
+        )
         if foot_params.has_servo == 1:
             counts = interpolate_servo_counts(buffer.readings, i, end, lookahead_ns)
             out[grf_cop.FOOT_ANGLE] = (counts - foot_params.zero_counts) * foot_params.rad_per_count
@@ -294,7 +303,7 @@ def _estimate_due_rows(
         if is_debounced(buffer.since_ns, buffer.t_mono_ns, i, end, min_ns, lookahead_ns):
             foot_state.is_contact = row.is_loaded
         in_contact = foot_state.is_contact == 1
-        masked = grf_cop.is_cop_masked(params, out) or not in_contact
+        masked = grf_cop.is_cop_unreliable(params, out) or not in_contact
         # A lower bound can prove contact, and never its absence.
         is_proven = in_contact and out[grf_cop.GRF_LOWER_BOUND] >= foot_params.contact_bound_n
         is_known = not math.isnan(out[grf_cop.GRF]) or is_proven

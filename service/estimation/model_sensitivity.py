@@ -77,8 +77,8 @@ class OmittedModelEffect:
             off_n = np.abs(without_n - whole_n)[judged]
             self._sums[name] += int(np.rint(_NANONEWTONS * off_n).astype(np.int64).sum())
 
-    def compute_effects_n(self) -> dict[str, float]:
-        """Return the omitted models that matter with their effect in newtons, largest first."""
+    def compute_notable_mean_effects_n(self) -> dict[str, float]:
+        """Return mean absolute effects of omitted models, from `EFFECT_MIN_N` on, largest first."""
         if not self._frames:
             return {}
         newtons = {name: total / _NANONEWTONS / self._frames for name, total in self._sums.items()}

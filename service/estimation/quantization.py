@@ -65,7 +65,7 @@ class Quantization:
         names = least[0] if least else ()
         return cls({name: _select_steps([each[name] for each in least]) for name in names})
 
-    def quantize(self, columns: Columns) -> dict[str, npt.NDArray[Any]]:
+    def round_to_steps(self, columns: Columns) -> dict[str, npt.NDArray[Any]]:
         """Round columns of estimates, (n,) or (n, tiles), to multiples of their steps.
 
         Other columns, NaN and infinity are unchanged; zero has no sign.
@@ -77,7 +77,7 @@ class Quantization:
             for name, values in columns.items()
         }
 
-    def steps_by_column(self) -> dict[str, float]:
+    def collect_flat_column_steps(self) -> dict[str, float]:
         """Return the step of each quantized flat column, in its unit, for a file's metadata."""
         return {
             f"{name}_{i}" if name in _BY_TILE else name: float(step)
@@ -94,7 +94,7 @@ def _round_to_step(values: npt.NDArray[Any], step: Floats, *, down: bool) -> npt
 
 
 def _select_steps(sigmas: Sequence[Floats]) -> Floats:
-    """Return the largest powers of two within each sigma over `PART`; 0 without a sigma."""
+    """Return the largest power of two within sigma over `STEPS_PER_SIGMA`; 0 without a sigma."""
     most = np.min(np.stack(sigmas), axis=0) / STEPS_PER_SIGMA
     usable = np.isfinite(most) & (most >= _STEP_MIN)
     exponent = np.frexp(np.where(usable, most, 1.0))[1] - 1

@@ -63,7 +63,7 @@ class KernelRecord:
     def dtype(cls) -> np.dtype[np.void]:
         """Return the record's layout, aligned as the processor prefers."""
         hints = get_type_hints(cls, include_extras=True)
-        return record_type([(name, *_layout(hint)) for name, hint in hints.items()])
+        return make_record_dtype([(name, *_layout(hint)) for name, hint in hints.items()])
 
     @classmethod
     def array(cls, n: int, **columns: Any) -> RecordArray[Self]:
@@ -72,7 +72,7 @@ class KernelRecord:
         Raises:
             ValueError: a column is no field, or does not fit.
         """
-        return records(cls.dtype(), n, **columns)
+        return make_records(cls.dtype(), n, **columns)
 
 
 def _layout(hint: Any) -> tuple[Any, ...]:
@@ -86,12 +86,12 @@ def _layout(hint: Any) -> tuple[Any, ...]:
     return ({float: np.float64, int: np.int64}.get(hint, hint),)
 
 
-def record_type(fields: list[Any]) -> np.dtype[np.void]:
+def make_record_dtype(fields: list[Any]) -> np.dtype[np.void]:
     """Make a record layout from names, types and shapes, aligned as the processor prefers."""
     return np.dtype(fields, align=True)
 
 
-def records(dtype: np.dtype[np.void], n: int, **columns: Any) -> Records:
+def make_records(dtype: np.dtype[np.void], n: int, **columns: Any) -> Records:
     """Make n records with these columns, zero elsewhere.
 
     Raises:
@@ -103,7 +103,7 @@ def records(dtype: np.dtype[np.void], n: int, **columns: Any) -> Records:
     return made
 
 
-def as_bytes(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def view_records_as_bytes(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """View records as their bytes, (n, ...); return any other array unchanged. Copies nothing."""
     if column.dtype.names is None:
         return column

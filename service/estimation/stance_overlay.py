@@ -54,7 +54,7 @@ class Overlay:
 
 
 def select_evenly(count: int, max_count: int) -> npt.NDArray[np.int64]:
-    """Select at most `most` of `count` rows: the first, the last, and evenly in between."""
+    """Return at most `max_count` of `count` indices: first, last, and evenly in between."""
     if count <= max_count:
         return np.arange(count)
     return np.round(np.linspace(0, count - 1, max_count)).astype(np.int64)

@@ -71,8 +71,8 @@ class PeakSearch:
             self._search(slice(0, _CHUNK + 2 * MAX_HALF_WIDTH))
             self._t_ns, self._forces = self._t_ns[_CHUNK:], self._forces[:, _CHUNK:]
 
-    def finish(self) -> tuple[float, int, float] | None:
-        """Return force, UTC and standard uncertainty of the peak; None without a force."""
+    def estimate_peak(self) -> tuple[float, int, float] | None:
+        """Estimate the peak so far: force, UTC in ns, standard uncertainty; None without one."""
         if not self._frames:
             return None
         self._search(slice(None))

@@ -147,7 +147,7 @@ class StanceDetector:
         over: list[Stance] = []
         sure = np.flatnonzero(columns["contact"] != CONTACT_UNKNOWN)
         if not len(sure):
-            self._unsure.add_flags(columns["estimate_flags"])
+            self._unsure.add_frames(columns["estimate_flags"])
             return over
         known: npt.NDArray[Any] | slice = sure
         if len(sure) == len(columns["contact"]):
@@ -156,7 +156,7 @@ class StanceDetector:
         loaded = columns["contact"][known] == 1
         frames = _KnownFrames(seq[known], t_ns[known], part, loaded, columns["grf_n"][known])
         for first, end in frames.iterate_runs():
-            begin, last = frames.frame(first), frames.frame(end - 1)
+            begin, last = frames.get_frame(first), frames.get_frame(end - 1)
             if first or not begin.continues(self._seen):
                 over += self._end_stance(begin)
             if begin.loaded:
@@ -171,7 +171,7 @@ class StanceDetector:
                 self._open.add_frames(slice(since, int(sure[end - 1]) + 1), t_ns, columns)
                 self._open.last = last
             self._seen, self._unsure = last, _UnknownFrames()
-        self._unsure.add_flags(columns["estimate_flags"][int(sure[-1]) + 1 :])
+        self._unsure.add_frames(columns["estimate_flags"][int(sure[-1]) + 1 :])
         return over
 
     def finish(self) -> list[Stance]:
@@ -220,7 +220,7 @@ class _KnownFrames:
     loaded: npt.NDArray[np.bool_]
     grf_n: Floats
 
-    def frame(self, i: int) -> _Frame:
+    def get_frame(self, i: int) -> _Frame:
         """Return frame `i`."""
         seq, t_ns, part = int(self.seq[i]), int(self.t_ns[i]), int(self.part[i])
         return _Frame(seq, t_ns, part, bool(self.loaded[i]), float(self.grf_n[i]))
@@ -240,7 +240,7 @@ class _UnknownFrames:
     frames: int = 0
     status: int = 0
 
-    def add_flags(self, status: npt.NDArray[np.uint16]) -> None:
+    def add_frames(self, status: npt.NDArray[np.uint16]) -> None:
         self.frames += len(status)
         self.status |= int(np.bitwise_or.reduce(status))
 
@@ -405,7 +405,7 @@ class _OpenStance:
     def to_stance(self, behind: _Frame | None) -> Stance:
         """Make the stance; `behind` is the next frame with known contact, if there is one."""
         missing = self.last.seq - self.first.seq + 1 - self.frames
-        peak = None if self.status & EstimateFlag.SATURATED else self.peak.finish()
+        peak = None if self.status & EstimateFlag.SATURATED else self.peak.estimate_peak()
         peak_n, peak_t_ns, peak_sigma_n = peak or (np.nan, None, np.nan)
         x_first_m, x_last_m = self.cop_x_m or (np.nan, np.nan)
         range_m, range_sigma_m = self._cop_range_m()

@@ -11,11 +11,15 @@ import numpy as np
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.fitting.confidence import (
     compute_curve_n,
-    compute_mean_band_n,
-    compute_new_loading_band_n,
+    compute_mean_half_width_95_n,
+    compute_new_loading_half_width_95_n,
 )
-from service.estimation.fitting.effects_fit import ReplaySection, extract_replays
-from service.estimation.fitting.rig.indentation import Indentation, average_strokes, select_loaded
+from service.estimation.fitting.effects_fit import ReplaySection, replay_release_and_tap
+from service.estimation.fitting.rig.indentation import (
+    Indentation,
+    average_stroke_blocks,
+    select_loaded,
+)
 from service.offline.figure_output import create_figure, render_png
 
 if TYPE_CHECKING:
@@ -44,7 +48,7 @@ def plot_calibration(
         MissingExtraError: matplotlib is not installed.
     """
     tiles = calibration.tiles
-    fast = {tile.serial: extract_replays(recordings[tile.serial], tile) for tile in tiles}
+    fast = {tile.serial: replay_release_and_tap(recordings[tile.serial], tile) for tile in tiles}
     kinds = [kind for kind in FAST_LOADS if any(kind in found for found in fast.values())]
     lines = [tiles[i : i + MAX_TILES_PER_LINE] for i in range(0, len(tiles), MAX_TILES_PER_LINE)]
     columns = min(MAX_TILES_PER_LINE, len(tiles))
@@ -85,11 +89,14 @@ def plot_calibration(
 def _plot_curve(
     curve: Axes, residual: Axes, tile: TileCalibration, recordings: Sequence[Indentation]
 ) -> None:
-    blocks = average_strokes(*select_loaded(recordings))
+    blocks = average_stroke_blocks(*select_loaded(recordings))
     end_kpa = tile.range_kpa[1]
     grid_kpa = np.linspace(0.0, end_kpa, 200)
     force_n = compute_curve_n(tile, grid_kpa)
-    mean_n, new_n = compute_mean_band_n(tile, grid_kpa), compute_new_loading_band_n(tile, grid_kpa)
+    mean_n, new_n = (
+        compute_mean_half_width_95_n(tile, grid_kpa),
+        compute_new_loading_half_width_95_n(tile, grid_kpa),
+    )
     left_n = blocks.force_n - compute_curve_n(tile, blocks.gauge_kpa)
     for axis, centre_n in ((curve, force_n), (residual, np.zeros_like(force_n))):
         axis.fill_between(

@@ -32,7 +32,7 @@ from service.offline.compare.plausibility import (
 )
 from service.offline.compare.signals import ForceSignal
 from service.offline.compare.trials import TrialMarker, split_into_trials
-from storage.formats.readers.session import is_sealed_session
+from storage.formats.readers.session import is_sealed_session_file
 from storage.formats.reference import ReferenceData, ReferenceOptions, read_reference
 from storage.formats.sealed_export import place_session_markers
 from storage.formats.slice import Slice
@@ -127,7 +127,7 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
         UsageError: a unit or sign of the reference is not stated.
         ComparisonError: the two cannot be compared.
     """
-    if is_sealed_session(reference_path) and not is_sealed_session(path):
+    if is_sealed_session_file(reference_path) and not is_sealed_session_file(path):
         raise FileFormatError(
             f"it is not a session, and {reference_path.name} is one",
             where=str(path),
@@ -168,7 +168,7 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
     at_ns = int(t_ns[0]) + round(1e9 * alignment.mid_t_s)
     by_clocks = (
         _compute_clock_lag(path, reference_path, at_ns)
-        if is_sealed_session(reference_path)
+        if is_sealed_session_file(reference_path)
         else None
     )
     notes += describe_clock_contradiction(alignment, by_clocks)

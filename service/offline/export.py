@@ -61,7 +61,7 @@ def export_session(source: Path, out: Path, options: ExportOptions) -> ExportRes
         StorageError: `out` cannot be written.
     """
     to = get_format(options.to)
-    with SealedFileReader(source, only_slices=not options.part.is_whole_session) as reader:
+    with SealedFileReader(source, only_slices=not options.part.is_unrestricted) as reader:
         export, lacks_marks = _prepare_export(reader, options)
         return _write_export(out, to.encode(export), [export], lacks_marks)
 
@@ -83,7 +83,7 @@ def export_merged(sources: Sequence[Path], out: Path, options: ExportOptions) ->
     with ExitStack() as opened:
         readers = [
             opened.enter_context(
-                SealedFileReader(source, only_slices=not options.part.is_whole_session)
+                SealedFileReader(source, only_slices=not options.part.is_unrestricted)
             )
             for source in sources
         ]

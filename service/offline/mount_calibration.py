@@ -12,7 +12,7 @@ from devices.errors import CalibrationError, FileFormatError
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration
 from service.estimation.effects import Parameter
-from service.estimation.foot.geometry import compute_tile_axes_rad
+from service.estimation.foot.geometry import fit_tile_axis_angles_rad
 from service.estimation.mounting import MountCalibration
 from service.offline.compare.mount_fit import MountFit, fit_mount
 from service.offline.compare.paired_frames import PairedFrames
@@ -125,7 +125,7 @@ def _compute_tilt_loss(info: ArrayInfo, pairs: PairedFrames) -> Floats:
     positions_m = np.array([(tile.x_m, tile.y_m, tile.z_m) for tile in info.tiles])
     bearing = np.array([not tile.reference for tile in info.tiles])
     axes = np.zeros(len(positions_m))
-    axes[bearing] = compute_tile_axes_rad(positions_m[bearing])
+    axes[bearing] = fit_tile_axis_angles_rad(positions_m[bearing])
     turned_rad = np.zeros(len(pairs.t_s))
     if info.servo is not None:
         known = pairs.columns.get(ANGLE_COLUMN)

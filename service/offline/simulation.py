@@ -35,7 +35,7 @@ from service.offline.estimate_summary import EstimateSummarizer, EstimateSummary
 from service.rig.array_info import make_array_info
 from service.rig.emulated_foot import EmulatedFoot
 from service.rig.rig import open_reference_sensor, open_scene_recovery
-from service.sessions.pipeline import EstimateOptions, EstimateStream, Extra, make_notes
+from service.sessions.pipeline import EstimateOptions, EstimateStream, Extra, make_estimate_metadata
 from storage.sessions.writer import SealedFileWriter
 
 START_NS = 1_577_836_800_000_000_000
@@ -188,7 +188,7 @@ def run_simulation(
         began_s = time.perf_counter()
         for batch, extra in pieces:
             if stream is not None and stream.plan is not None and not frames:
-                writer.add_notes(make_notes(stream.plan, stream.rounding))
+                writer.add_notes(make_estimate_metadata(stream.plan, stream.rounding))
             writer.append_frames(batch, extra)
             first_ns = first_ns or int(batch.t_ns[0])
             last_ns = int(batch.t_ns[-1])

@@ -58,7 +58,7 @@ class DataFolder:
             self._lock.close()
             raise
 
-    def check_in_place(self) -> None:
+    def check_still_in_place(self) -> None:
         """Check that the folder in use is still at its path. Runs in any thread.
 
         Raises:
@@ -76,7 +76,7 @@ class DataFolder:
             errno=errno.ENOENT,
         )
 
-    def reopen(self) -> None:
+    def relock_same_folder(self) -> None:
         """Lock the folder at the path anew; it must have the same id: mounted again, or a copy.
 
         Files that are open in the former folder are lost: the caller has closed them all.
@@ -86,7 +86,7 @@ class DataFolder:
             StorageError: another server has locked it.
         """
         if is_still_locked_folder(self.path) or self._read_id_at_path() != self.id:
-            self.check_in_place()
+            self.check_still_in_place()
             return
         lock = self._acquire_lock()
         self._lock.close()
@@ -100,7 +100,7 @@ class DataFolder:
             FolderGoneError: it is not in place.
             StorageError: it is not writable.
         """
-        self.check_in_place()
+        self.check_still_in_place()
         # The size of some seconds of frames: a full disk still accepts an empty file.
         write_atomically(self.path / _PROBE_NAME, bytes(_PROBE_BYTES))
 

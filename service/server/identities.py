@@ -71,7 +71,7 @@ class NodeIdentities:
         self.problems: list[str] = []
         """Damage found, and the consequence, as text."""
 
-    def read_secret(self, node: str) -> str | None:
+    def read_secret_or_set_aside(self, node: str) -> str | None:
         """Read the secret of a node; None if there is none, or if it is damaged and set aside.
 
         Args:
@@ -96,22 +96,22 @@ class NodeIdentities:
         """Make the challenge for a machine that connects as this node.
 
         Raises:
-            StorageError: as `read_secret`.
+            StorageError: as `read_secret_or_set_aside`.
         """
-        is_known = self.read_secret(node) is not None
+        is_known = self.read_secret_or_set_aside(node) is not None
         return Challenge(
             protocol=PROTOCOL, server_id=server_id, nonce=generate_secret(), is_known=is_known
         )
 
-    def verify_claim(self, claim: IdentityClaim, now_t_ns: int) -> bool:
+    def verify_or_refuse_claim(self, claim: IdentityClaim, now_t_ns: int) -> bool:
         """Refuse a false claim; return whether it is proven, False if the node has no secret here.
 
         Raises:
             CloseConnection: (same text)
-            StorageError: as `read_secret`.
+            StorageError: as `read_secret_or_set_aside`.
         """
         node, answer = claim.node, claim.proof
-        secret = self.read_secret(node)
+        secret = self.read_secret_or_set_aside(node)
         if secret is None:
             return False
         if is_proof_valid(secret, claim.challenge, node, answer):
@@ -125,7 +125,7 @@ class NodeIdentities:
             "machine's",
         )
 
-    def store_first_secret(self, claim: IdentityClaim) -> None:
+    def try_store_first_secret(self, claim: IdentityClaim) -> None:
         """Try to store the secret of a first contact; a failure is logged: frames matter more."""
         try:
             if claim.proof.secret is not None:

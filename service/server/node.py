@@ -91,7 +91,7 @@ class ServerNode:
         self._problems += self.estimator.problems
         for text in self._problems:
             log.warning("node %s: %s", self.name, text)
-        self.present_stream = self._get_or_create_stream(self.info)
+        self.present_stream = self._get_or_create_stream(self.last_info)
         """Stream to which the node adds frames now."""
 
     @property
@@ -100,14 +100,14 @@ class ServerNode:
         return [f"node {self.name}: {text}" for text in self._problems]
 
     @property
-    def info(self) -> ArrayInfo:
+    def last_info(self) -> ArrayInfo:
         """Description of the present stream's array, from the last hello."""
         return self.hello.array_info
 
     @property
     def stream_id(self) -> str:
         """Id of the present stream."""
-        return self.info.stream_id
+        return self.last_info.stream_id
 
     @property
     def stream_order(self) -> tuple[str, ...]:
@@ -130,7 +130,7 @@ class ServerNode:
         return self.present_stream.clock_offset
 
     @property
-    def missing_frames(self) -> Intervals:
+    def present_stream_missing(self) -> Intervals:
         """Frames of the present stream that are not stored: lost, or still to come."""
         newest = -1 if self.last_seq is None else self.last_seq
         if self.has_connected:
@@ -140,12 +140,12 @@ class ServerNode:
     @property
     def backlog_frames(self) -> int:
         """Number of missing frames that the node can still send."""
-        return (self.missing_frames & self.present_stream.obtainable).count
+        return (self.present_stream_missing & self.present_stream.obtainable).count
 
     @property
-    def lost_by_reason(self) -> dict[str, int]:
+    def present_stream_lost_by_reason(self) -> dict[str, int]:
         """Number of lost frames of the present stream, by reason; unexplained: node_restarted."""
-        unobtainable = self.missing_frames - self.present_stream.obtainable
+        unobtainable = self.present_stream_missing - self.present_stream.obtainable
         named = {
             why: lost.count
             for why, lost in self.present_stream.lost.restricted_to(unobtainable).items()
@@ -169,9 +169,9 @@ class ServerNode:
         """Frames per second over the last second, by the node's clock; 0 if none came."""
         seen_t_ns = self.present_stream.last_seen_t_ns
         silent_ns = None if seen_t_ns is None else server_utc_ns() - seen_t_ns
-        return self._rate_meter.rate_hz(self.info.nominal_rate_hz, silent_ns)
+        return self._rate_meter.rate_hz(self.last_info.nominal_rate_hz, silent_ns)
 
-    def on_hello(self, hello: Hello, now_t_ns: int) -> None:
+    def apply_hello(self, hello: Hello, now_t_ns: int) -> None:
         """Update streams and estimates from hello; the caller sets `is_connected`.
 
         Args:
@@ -188,21 +188,21 @@ class ServerNode:
         for stream in list(self.streams.values()):
             stream.unacked = Intervals()
             if stream.stream_id not in self.stream_order and not hello.has_more:
-                stream.on_unlisted()
+                stream.retire_stream()
                 if stream.journal is None:  # no frame ever came
                     del self.streams[stream.stream_id]
         for earlier in hello.earlier:
-            self._get_or_create_stream(earlier.array_info).on_earlier(earlier)
+            self._get_or_create_stream(earlier.array_info).apply_end_report(earlier)
         self.present_stream = self._get_or_create_stream(hello.array_info)
-        self.present_stream.on_present(hello, now_t_ns)
+        self.present_stream.apply_present_hello(hello, now_t_ns)
         # Acknowledge stored frames again: a link may have broken before their acknowledgement.
         for name in self.stream_order:
             stream = self.streams[name]
             stream.unacked = stream.stored & stream.obtainable
-        self.estimator.on_hello(hello)
+        self.estimator.restart_if_changed(hello)
         self.is_dirty = True
 
-    def missing_ranges(self, needed: Mapping[str, Intervals]) -> tuple[StreamNumbers, ...]:
+    def frames_to_request(self, needed: Mapping[str, Intervals]) -> tuple[StreamNumbers, ...]:
         """Return the frames to request: first those needed by sessions, then the others.
 
         Args:
@@ -244,7 +244,7 @@ class ServerNode:
         """
         try:
             frames = stream.decoder.decode(payload)
-            if ahead := stream.check_frames(frames, now_t_ns):
+            if ahead := stream.check_or_refuse_frames(frames, now_t_ns):
                 self._count_ahead_frames(frames, ahead)
                 return int(frames.seq[0]), int(frames.seq[-1]), []
             stream.append_frames(frames, payload, now_t_ns)
@@ -279,7 +279,7 @@ class ServerNode:
             raise StateError(f"node {self.name!r} is not connected", remedy="Connect it and retry")
         return self.estimator.tare_controller.tare_by_hand(reason)
 
-    def retry_unreadable(self) -> None:
+    def retry_unreadable_journals(self) -> None:
         """Retry opening the journals that could not be read."""
         for name in sorted(self.unreadable_streams):
             stream = self.streams.get(name)
@@ -291,7 +291,7 @@ class ServerNode:
                     else:
                         self.streams[name] = opened
                         if self.has_connected:
-                            opened.on_unlisted()
+                            opened.retire_stream()
             except DamagedFileError as error:
                 self._problems.append(f"a journal is left out: {error}")
             except FootTileError:
@@ -337,7 +337,7 @@ class ServerNode:
                     return True
         return False
 
-    def save(self) -> None:
+    def save_hello(self) -> None:
         """Save hello for after a restart. Runs in any thread.
 
         Raises:
@@ -371,7 +371,7 @@ class ServerNode:
         if self.storage_problem is not None:  # a tare could not be stored
             return
         try:
-            self.estimator.update_tare(self.journal, lambda: self.present_stream.obtainable)
+            self.estimator.tare_if_due(self.journal, lambda: self.present_stream.obtainable)
         except StorageError as error:
             self.storage_problem = str(error)
 

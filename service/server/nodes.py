@@ -123,7 +123,7 @@ class NodeRegistry:
                 raise LinkError(f"stream {announced.stream_id} was announced with another array")
         return node
 
-    def remove(self, name: str) -> None:
+    def remove_from_memory(self, name: str) -> None:
         """Remove a node whose first hello could not be accepted from memory; its files stay."""
         self._nodes.pop(name, None)
 
@@ -163,7 +163,7 @@ def _read_hello(path: Path) -> Hello:
     return hello
 
 
-def is_node_name(name: str) -> bool:
+def is_valid_node_name(name: str) -> bool:
     """Return whether a text is valid as the name of a node and of its folder."""
     return _NODE_NAME.fullmatch(name) is not None
 
@@ -171,7 +171,7 @@ def is_node_name(name: str) -> bool:
 def _check_hello(hello: Hello) -> None:
     streams = [hello.array_info, *(each.array_info for each in hello.earlier)]
     for info in streams:
-        if not is_node_name(info.node) or not BOOT_ID_PATTERN.fullmatch(info.stream_id):
+        if not is_valid_node_name(info.node) or not BOOT_ID_PATTERN.fullmatch(info.stream_id):
             raise LinkError(
                 f"node {info.node[:80]!r} with stream_id {info.stream_id[:80]!r}",
                 expected="a name of letters, digits, '.', '_' and '-', and 32 hex digits",

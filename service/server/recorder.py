@@ -19,7 +19,7 @@ from service.server.node import ServerNode
 from service.server.nodes import NodeRegistry
 from service.server.sealer import SessionSealer
 from service.server.session_parts import current_ledger
-from service.server.session_store import SessionStore, check_revision, session_revision
+from service.server.session_store import SessionStore, check_revision, user_fields_revision
 from service.server_clock import server_utc_ns
 from service.sessions.creation import create_session
 from service.sessions.inputs import SessionInputs
@@ -50,7 +50,7 @@ class Recorder:
         for session in store.list_unsealed():
             store.cache(self._with_clock_offsets(session))
 
-    def on_node_hello(self, node: ServerNode) -> None:
+    def cache_missing_clock_offsets(self, node: ServerNode) -> None:
         """Add missing clock measurements to a node's unsealed sessions, in memory.
 
         Those are missing after a first contact, and for streams into which a session was extended.
@@ -94,9 +94,9 @@ class Recorder:
                 f"node {node_name!r} is {behind_s:.1f} s behind: its link is too slow",
                 remedy="Retry when it has caught up",
             )
-        part = session_parts.initial_part(node, node.last_seq, node.last_t_ns, pre_roll_s)
+        part = session_parts.make_initial_part(node, node.last_seq, node.last_t_ns, pre_roll_s)
         session = create_session(
-            node.info,
+            node.last_info,
             name,
             part,
             scene_content=node.hello.scene,
@@ -108,7 +108,7 @@ class Recorder:
             take=take,
             request=request,
             missed_slots_at_start=node.present_stream.missed_slots,
-            clock=session_parts.clock_offsets_at_start(node, part),
+            clock=session_parts.list_clock_offsets_since(node, part),
         )
         return self._store.save(session)
 
@@ -125,7 +125,7 @@ class Recorder:
         if session.state != "recording":
             return session
         self._store.save(session_parts.mark_stopped(session, self._nodes.find(session.node)))
-        self._sealer.poll()
+        self._sealer.advance_unsealed_sessions()
         return self._store.get_session(session_id)
 
     def abandon_missing(self, session_id: str) -> Session:
@@ -147,14 +147,14 @@ class Recorder:
         if node is not None and session_parts.has_unreadable_journal(session, node):
             # Frames in an unreadable journal are abandoned; later streams have their own journals.
             self._store.save(session.model_copy(update={"given_up": True}))
-            self._sealer.on_node_hello(node)
+            self._sealer.extend_node_sessions(node)
             session = self._store.get_session(session_id)
         self._store.save(session_parts.abandon_missing(session, node))
-        self._sealer.reset_retry(session_id)
-        self._sealer.poll()
+        self._sealer.clear_failure(session_id)
+        self._sealer.advance_unsealed_sessions()
         return self._store.get_session(session_id)
 
-    def delete_session(self, session_id: str, *, if_revision: str | None = None) -> None:
+    def move_to_trash(self, session_id: str, *, if_revision: str | None = None) -> None:
         """Move a session to the trash.
 
         Args:
@@ -168,7 +168,7 @@ class Recorder:
             StorageError: it cannot be moved.
         """
         session = self._store.get_session(session_id)
-        check_revision(if_revision, session_revision(session), f"session {session_id}")
+        check_revision(if_revision, user_fields_revision(session), f"session {session_id}")
         if session.state == "recording":
             raise StateError(f"session {session_id} is being recorded", remedy="Stop it first")
         if self._sealer.is_sealing(session_id):
@@ -176,7 +176,7 @@ class Recorder:
                 f"session {session_id} is being sealed", remedy="Delete it in some seconds"
             )
         self._store.move_to_trash(session)
-        self._sealer.reset_retry(session_id)
+        self._sealer.clear_failure(session_id)
 
     def restore_session(self, session_id: str) -> Session:
         """Restore a session from the trash; a pending one stays pending.
@@ -187,18 +187,20 @@ class Recorder:
         """
         book = self._store
         book.cache(self._with_clock_offsets(book.trash.restore(session_id, book.folder)))
-        self._sealer.poll()
+        self._sealer.advance_unsealed_sessions()
         book.on_change(book.get_session(session_id))
         return book.get_session(session_id)
 
-    def record_clock_offset(self, node: ServerNode, row: ClockSample, now_t_ns: int) -> None:
+    def record_plausible_clock_offset(
+        self, node: ServerNode, row: ClockSample, now_t_ns: int
+    ) -> None:
         """Record a plausible measurement of a node's clock, in its stream and its sessions.
 
         The stream's log has it already; sessions are saved with their next change. A measurement
         whose server time is far from the present time is dropped, as is one that is far from the
         node's clock as hello stated it.
         """
-        stated_t_ns = row.t_mono_ns + node.info.utc_offset_ns + row.server_minus_node_ns
+        stated_t_ns = row.t_mono_ns + node.last_info.utc_offset_ns + row.server_minus_node_ns
         if abs(stated_t_ns - now_t_ns) > CLOCK_ERROR_MAX_NS + row.uncertainty_ns:
             log.warning(
                 "node %s: a measurement of its clock is not kept: it has this server's clock "
@@ -259,7 +261,7 @@ class Recorder:
         seen_t_ns = node.last_seen_t_ns if frame_count else None
         end_t_ns = min(session.stopped_t_ns or NO_END, seen_t_ns or 0)
         lasted_s = (end_t_ns - session.started_t_ns) * 1e-9
-        return max(frame_count / node.info.nominal_rate_hz, lasted_s)
+        return max(frame_count / node.last_info.nominal_rate_hz, lasted_s)
 
     def pending_reason(self, session: Session, ledger: Ledger) -> Literal["frames", "end"] | None:
         """Return the reason why a session is pending: missing frames, or an unknown end."""
@@ -293,7 +295,7 @@ class Recorder:
             for part in session_parts.iterate_needed_parts(session, node)
         )
 
-    def retention_request(self, node_name: str) -> RetentionMessage:
+    def make_retention_request(self, node_name: str) -> RetentionMessage:
         """Return `needed_frames` as the message to the node."""
         streams = tuple(
             StreamNumbers(stream_id=stream_id, numbers=to_open_pairs(numbers))

@@ -21,7 +21,7 @@ from service.server.session_parts import (
     current_inputs,
     current_ledger,
     has_unreadable_journal,
-    is_complete,
+    is_ready_to_seal,
 )
 from service.server.session_store import SessionStore
 from service.sessions.inputs import SessionInputs
@@ -63,7 +63,7 @@ class SessionSealer:
         self._retry_after_s: dict[str, float] = {}
         self._failures: dict[str, str] = {}
 
-    def on_node_hello(self, node: ServerNode) -> None:
+    def extend_node_sessions(self, node: ServerNode) -> None:
         """Extend the unsealed sessions of a node into the streams that its hello lists.
 
         If its tiles have changed, a new session continues the recording: a file describes one
@@ -83,7 +83,7 @@ class SessionSealer:
         """Collect the inputs from which a session can be sealed or exported."""
         return current_inputs(session, self._nodes.get(session.node), exact=self._exact)
 
-    def poll(self) -> None:
+    def advance_unsealed_sessions(self) -> None:
         """Find the ends of stopped sessions, and start to seal those whose frames are all here."""
         for session in self._store.list_unsealed():
             if time.monotonic() < self._retry_after_s.get(session.id, 0.0):
@@ -94,14 +94,14 @@ class SessionSealer:
                 log.warning("session %s: %s", session.id, error)
                 self._retry_after_s[session.id] = time.monotonic() + _RETRY_S
 
-    async def wait_until_sealed(self, session_id: str, timeout_s: float) -> Session:
+    async def wait_until_sealed_or_timeout(self, session_id: str, timeout_s: float) -> Session:
         """Return the session once it is sealed, or its present state after `timeout_s`."""
         end = time.monotonic() + timeout_s
         while self._store.get_session(session_id).state != "sealed" and time.monotonic() < end:
             await asyncio.sleep(0.02)
         return self._store.get_session(session_id)
 
-    async def close(self) -> None:
+    async def wait_for_running_sealing(self) -> None:
         """Wait until the sessions that are being sealed are sealed; none is cancelled."""
         await asyncio.gather(*self._sealing.values(), return_exceptions=True)
 
@@ -109,7 +109,7 @@ class SessionSealer:
         """Return whether a session is being sealed now."""
         return session_id in self._sealing
 
-    def reset_retry(self, session_id: str) -> None:
+    def clear_failure(self, session_id: str) -> None:
         """Drop the record of a failed sealing: retry at once and do not report the failure."""
         self._retry_after_s.pop(session_id, None)
         self._failures.pop(session_id, None)
@@ -121,7 +121,7 @@ class SessionSealer:
     def _advance(self, session: Session) -> None:
         node = self._nodes.find(session.node)
         if node is not None and has_unreadable_journal(session, node):
-            node.retry_unreadable()
+            node.retry_unreadable_journals()
             if has_unreadable_journal(session, node):
                 self._failures[session.id] = _UNREADABLE_JOURNAL
                 self._retry_after_s[session.id] = time.monotonic() + _RETRY_S
@@ -133,7 +133,7 @@ class SessionSealer:
         except DamagedFramesError as error:
             self._invalidate(session, error)
             return
-        if session.state == "pending" and is_complete(session, self._nodes.find(session.node)):
+        if session.state == "pending" and is_ready_to_seal(session, self._nodes.find(session.node)):
             session = self._store.save(session.model_copy(update={"state": "sealing"}))
         if session.state == "sealing" and session.id not in self._sealing:
             self._sealing[session.id] = asyncio.create_task(self._seal(session.id))
@@ -143,7 +143,7 @@ class SessionSealer:
         node = self._nodes.find(session.node)
         if node is None:
             return session
-        followed = session_parts.extend_parts(session, node)
+        followed = session_parts.extend_or_continue_session(session, node)
         # Save the sessions that continue it first: if the server is killed between, none is lost.
         continuations = followed[1:]
         if continuations and not any(
@@ -153,25 +153,29 @@ class SessionSealer:
                 self._store.save(each)
         return session if followed[0] is session else self._store.save(followed[0])
 
-    def invalidate_damaged(self, node: ServerNode, error: DamagedFramesError, reader: str) -> None:
+    def invalidate_and_request_resend(
+        self, node: ServerNode, error: DamagedFramesError, log_prefix: str
+    ) -> None:
         """Invalidate frames that are damaged on disk: request them again, or count them as lost.
 
         Args:
             node: node of the journal.
             error: error with the frames' numbers.
-            reader: reader that found the damage, for the log.
+            log_prefix: reader that found the damage, for the log.
         """
         folder = Path(error.where).parent
         for stream in node.streams.values():
             if stream.folder == folder:
                 damaged = Intervals([(error.seq_first, error.seq_last)])
                 stream.invalidate(damaged, are_corrupt=True)
-                log.warning("%s: %s", reader, error)
+                log.warning("%s: %s", log_prefix, error)
                 if stream.obtainable & damaged:
                     self._request_resend(node)
 
     def _invalidate(self, session: Session, error: DamagedFramesError) -> None:
-        self.invalidate_damaged(self._nodes.get(session.node), error, f"session {session.id}")
+        self.invalidate_and_request_resend(
+            self._nodes.get(session.node), error, f"session {session.id}"
+        )
 
     async def _seal(self, session_id: str) -> None:
         book = self._store
@@ -181,7 +185,7 @@ class SessionSealer:
             session, folder = book.get_session(session_id), book.folder.get_path(session_id)
             node = self._nodes.get(session.node)
             sources, ledger = self.collect_inputs(session), current_ledger(session, node)
-            if not is_complete(session, node):
+            if not is_ready_to_seal(session, node):
                 # The disk lost frames that it had accepted: the node has to send them again.
                 book.save(session.model_copy(update={"state": "pending"}))
                 return

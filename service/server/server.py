@@ -24,7 +24,7 @@ from service.server.node import ServerNode
 from service.server.nodes import NodeRegistry
 from service.server.recorder import Recorder
 from service.server.sealer import SessionSealer
-from service.server.session_store import SessionStore, Trash, delete_files
+from service.server.session_store import SessionStore, Trash, delete_and_count_bytes
 from service.server.streams import ServerStream
 from service.server.takes import TakeRecorder
 from service.server.weighings import Weighings
@@ -131,7 +131,7 @@ class Server:
         self._failures: dict[str, tuple[str, float]] = {}
         """Steps that failed in the last tick, with error and time of the log line."""
 
-    async def run(self) -> None:
+    async def run_ticks(self) -> None:
         """Run the tick until cancelled: sync, acknowledge, seal, delete, notify."""
         slow_s = prune_s = 0.0
         while True:
@@ -146,9 +146,9 @@ class Server:
                 continue
             with self._isolate_errors("guided calibrations"):
                 for node in self.nodes:
-                    self.weighings.check(node, now_s)
+                    self.weighings.end_if_stalled(node, now_s)
             with self._isolate_errors("sessions"):
-                self.sealer.poll()
+                self.sealer.advance_unsealed_sessions()
             for link in list(self.links.values()):
                 self._update_retention(link)
             with self._isolate_errors("counts"):
@@ -184,7 +184,7 @@ class Server:
             StorageError: it is away.
         """
         try:
-            self.data_folder.check_in_place()
+            self.data_folder.check_still_in_place()
         except StorageError as error:
             for node in list(self.nodes):
                 self._on_storage_error(node, error)
@@ -193,7 +193,7 @@ class Server:
                     with suppress(StorageError):
                         await asyncio.to_thread(stream.sync)
             # Not before: frames synced to the former folder must not be acknowledged.
-            self.data_folder.reopen()
+            self.data_folder.relock_same_folder()
 
     async def close(self) -> None:
         """Close the links, cancel the calibration job, wait for running sealing."""
@@ -201,9 +201,9 @@ class Server:
             link.request_close(LinkCloseCode.RESTART, "the server is stopping; reconnect")
         await self.weighings.close()
         await self.calibration_jobs.close()
-        await self.sealer.close()
+        await self.sealer.wait_for_running_sealing()
         for node in self.nodes:
-            keep = [node.save] if node.is_dirty else []
+            keep = [node.save_hello] if node.is_dirty else []
             for write in (*keep, *(stream.close for stream in node.streams.values())):
                 try:
                     write()
@@ -261,8 +261,8 @@ class Server:
         Raises:
             StorageError: a file cannot be deleted.
         """
-        doomed = self.sessions.trash.purge()
-        return len(doomed), await asyncio.to_thread(delete_files, doomed)
+        doomed = self.sessions.trash.rename_all_for_deletion()
+        return len(doomed), await asyncio.to_thread(delete_and_count_bytes, doomed)
 
     def make_node_view(self, node: ServerNode) -> NodeView:
         """Return a node's present state, for answers and subscribers."""
@@ -270,7 +270,7 @@ class Server:
             node, self.recorder, self.identities.refused_machines.get(node.name)
         )
 
-    def make_node_json(self, node: ServerNode) -> dict[str, Any] | None:
+    def try_make_node_json(self, node: ServerNode) -> dict[str, Any] | None:
         """Return a node's present state as JSON; None on an error, which is logged."""
         with self._isolate_errors(f"node {node.name}, as JSON"):
             return self.make_node_view(node).model_dump(mode="json")
@@ -278,15 +278,18 @@ class Server:
 
     def notify_node_changed(self, node: ServerNode) -> None:
         """Send a node's present state to all subscribers."""
-        if self.broadcaster.subscriber_count and (view := self.make_node_json(node)) is not None:
-            self.broadcaster.send_notice({"type": "node", "node": view})
+        if (
+            self.broadcaster.subscriber_count
+            and (view := self.try_make_node_json(node)) is not None
+        ):
+            self.broadcaster.queue_notice({"type": "node", "node": view})
 
     def _update_retention(self, link: NodeLink) -> None:
         """Notify a node if its retention request has changed."""
         with self._isolate_errors(f"node {link.node.name}, retention request"):
             if (
                 link.retention_request is not None
-                and self.recorder.retention_request(link.node.name) != link.retention_request
+                and self.recorder.make_retention_request(link.node.name) != link.retention_request
             ):
                 link.has_outgoing.set()
 
@@ -297,7 +300,9 @@ class Server:
             if session.state in ("recording", "pending"):
                 counted = counts[session.id] = SessionProgress.from_session(session, self.recorder)
                 if counted != self._last_progress.get(session.id):
-                    self.broadcaster.send_progress(session.node, {session.id: counted.model_dump()})
+                    self.broadcaster.queue_progress(
+                        session.node, {session.id: counted.model_dump()}
+                    )
         self._last_progress = counts
 
     @contextmanager
@@ -326,13 +331,13 @@ class Server:
     def _notify_session_changed(self, session: Session) -> None:
         if self.broadcaster.subscriber_count:
             view = SessionView.from_session(session, self.recorder).model_dump(mode="json")
-            self.broadcaster.send_notice({"type": "session", "session": view})
+            self.broadcaster.queue_notice({"type": "session", "session": view})
 
     def _send_heartbeat(self) -> None:
         if not self.broadcaster.subscriber_count:
             return
         last = [node.last_seq for node in self.nodes if node.last_seq is not None]
-        self.broadcaster.send_notice(
+        self.broadcaster.queue_notice(
             {
                 "type": "heartbeat",
                 "t_ns": server_utc_ns(),
@@ -341,7 +346,7 @@ class Server:
                     node.name: {
                         "last_seq": node.last_seq,
                         "rate_hz": node.rate_hz,
-                        "lost_frames": sum(node.lost_by_reason.values()),
+                        "lost_frames": sum(node.present_stream_lost_by_reason.values()),
                         "backlog_frames": node.backlog_frames,
                         "missed_slots": node.present_stream.missed_slots,
                         "connected": node.is_connected,
@@ -361,8 +366,8 @@ class Server:
                 return
             if node.is_dirty:
                 try:
-                    self.data_folder.check_in_place()
-                    await asyncio.to_thread(node.save)
+                    self.data_folder.check_still_in_place()
+                    await asyncio.to_thread(node.save_hello)
                 except StorageError as error:
                     self._on_storage_error(node, error)
                     return
@@ -374,7 +379,7 @@ class Server:
         unacked, stream.unacked = stream.unacked, Intervals()
         try:
             await asyncio.to_thread(stream.sync)
-            self.data_folder.check_in_place()
+            self.data_folder.check_still_in_place()
         except Exception as error:
             self._on_storage_error(node, error)
             # The kernel may drop pages that it could not write: the node has to send them again.

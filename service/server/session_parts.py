@@ -37,7 +37,7 @@ _UNSENT_NS = 1_000_000_000
 """Time after a hello within which frames may come that the hello did not count."""
 
 
-def find_streams(session: Session, node: ServerNode | None) -> dict[str, SessionStream]:
+def make_session_streams(session: Session, node: ServerNode | None) -> dict[str, SessionStream]:
     """Return the facts of a session's streams, by stream id."""
     found = {}
     for stream_id in dict.fromkeys(part.stream_id for part in session.parts):
@@ -52,7 +52,7 @@ def find_streams(session: Session, node: ServerNode | None) -> dict[str, Session
     return found
 
 
-def initial_part(node: ServerNode, last_seq: int, last_t_ns: int, pre_roll_s: float) -> Part:
+def make_initial_part(node: ServerNode, last_seq: int, last_t_ns: int, pre_roll_s: float) -> Part:
     """Return the first part of a session that starts now, or a pre-roll earlier if stored.
 
     Frames that the node still has and will send count as stored.
@@ -64,8 +64,8 @@ def initial_part(node: ServerNode, last_seq: int, last_t_ns: int, pre_roll_s: fl
         seq_first = min(seq_first, reached if reached is not None else seq_first)
         reached_t_ns = journal.find_t_ns_near(seq_first, is_upper=False)
         if reached_t_ns is not None and reached_t_ns > since_t_ns:
-            back = round((reached_t_ns - since_t_ns) * 1e-9 * node.info.nominal_rate_hz)
-            coming = node.missing_frames & node.present_stream.obtainable
+            back = round((reached_t_ns - since_t_ns) * 1e-9 * node.last_info.nominal_rate_hz)
+            coming = node.present_stream_missing & node.present_stream.obtainable
             coming = coming.restricted_to(max(0, seq_first - back), seq_first - 1)
             seq_first = min((first for first, _ in coming), default=seq_first)
     return Part(stream_id=node.stream_id, seq_first=seq_first)
@@ -92,7 +92,7 @@ def mark_stopped(session: Session, node: ServerNode | None) -> Session:
     return close_part(session, session.parts[-1], node.last_seq)
 
 
-def extend_parts(session: Session, node: ServerNode) -> list[Session]:
+def extend_or_continue_session(session: Session, node: ServerNode) -> list[Session]:
     """Extend the session's parts to the present end of its node's streams; nothing is saved.
 
     Returns:
@@ -139,7 +139,7 @@ def reopen_earlier_part(session: Session, node: ServerNode) -> Session:
 def _switch_stream(session: Session, node: ServerNode, part: Part) -> Session:
     """Return the session with its open part closed and another one open."""
     *before, last_part = close_at_stream_end(
-        session, find_streams(session, node), server_utc_ns()
+        session, make_session_streams(session, node), server_utc_ns()
     ).parts
     tails = {name: n for name, n in session.max_lost_tail_frames.items() if name != part.stream_id}
     parts = (
@@ -156,7 +156,7 @@ def abandon_missing(session: Session, node: ServerNode | None) -> Session:
     """Return the session without its missing frames: its open end is closed."""
     if node is not None:
         session = reopen_earlier_part(session, node)
-    closed = close_unfinished(session, find_streams(session, node), server_utc_ns())
+    closed = close_unfinished(session, make_session_streams(session, node), server_utc_ns())
     return closed.model_copy(update={"given_up": True})
 
 
@@ -169,7 +169,7 @@ def iterate_needed_parts(session: Session, node: ServerNode | None) -> Iterator[
             yield Part(stream_id=stream_id, seq_first=0)
 
 
-def clock_offsets_at_start(node: ServerNode, part: Part) -> tuple[ClockOffset, ...]:
+def list_clock_offsets_since(node: ServerNode, part: Part) -> tuple[ClockOffset, ...]:
     """Return the present stream's clock measurements since a part begins, and the last before."""
     begin_t_ns = (
         journal.find_t_ns_near(part.seq_first, is_upper=False)
@@ -179,7 +179,7 @@ def clock_offsets_at_start(node: ServerNode, part: Part) -> tuple[ClockOffset, .
     rows = list(node.present_stream.clock_offsets)
     if begin_t_ns is None:
         return tuple(rows[-1:])
-    begin_ns = begin_t_ns - node.info.utc_offset_ns
+    begin_ns = begin_t_ns - node.last_info.utc_offset_ns
     before = [number for number, row in enumerate(rows) if row.t_mono_ns <= begin_ns]
     return tuple(rows[before[-1] if before else 0 :])
 
@@ -189,8 +189,8 @@ def _extend_once(session: Session, node: ServerNode) -> list[Session]:
     stream_id = session.parts[-1].stream_id
     if stream_id in node.unreadable_streams and not session.given_up:
         return []
-    streams = find_streams(session, node)
-    closed = close_at_stop(session, streams, wait_for_missing=True)
+    streams = make_session_streams(session, node)
+    closed = close_at_stop(session, streams, leave_open_while_missing=True)
     if closed.parts[-1].seq_last is not None:
         return [closed]
     if stream_id == node.stream_id or not node.has_connected:
@@ -210,7 +210,7 @@ def _extend_once(session: Session, node: ServerNode) -> list[Session]:
         part = Part(stream_id=following, seq_first=0)
         return [closed.model_copy(update={"parts": (*closed.parts, part)})]
     begin_t_ns = _stream_begin_t_ns(session, node, following)
-    scene_content = node.hello.scene if info.scene == node.info.scene else {}
+    scene_content = node.hello.scene if info.scene == node.last_info.scene else {}
     return [
         *continue_session(
             closed,
@@ -229,7 +229,9 @@ def _later_streams(session: Session, node: ServerNode) -> Iterable[str]:
     if stream_id in order:
         return order[order.index(stream_id) + 1 :]
     # Hello no longer lists it: streams that began after its last frame are later.
-    newest = find_streams(session, node)[stream_id].t_ns_near(NO_END, newest=True)
+    newest = make_session_streams(session, node)[stream_id].find_t_ns_near(
+        NO_END, at_or_before=True
+    )
 
     def is_later(name: str) -> bool:
         begin = node.streams[name].first_t_ns
@@ -319,7 +321,7 @@ def current_inputs(session: Session, node: ServerNode, *, exact: bool = False) -
         streams,
         load_tares=lambda: node.estimator.tare_history,
         emulated=node.hello.emulated,
-        default_array=node.info,
+        default_array=node.last_info,
         exact=exact,
     )
 
@@ -331,7 +333,7 @@ def has_unreadable_journal(session: Session, node: ServerNode | None) -> bool:
     return any(part.stream_id in node.unreadable_streams for part in session.parts)
 
 
-def is_complete(session: Session, node: ServerNode | None) -> bool:
+def is_ready_to_seal(session: Session, node: ServerNode | None) -> bool:
     """Return whether the end is found, and all obtainable frames are stored and synced."""
     if session.parts[-1].seq_last is None or has_unreadable_journal(session, node):
         return False
@@ -346,7 +348,7 @@ def _with_likely_end(
     session: Session, node: ServerNode | None
 ) -> tuple[Session, dict[str, SessionStream]]:
     """Return a session with its likely end, and its streams."""
-    streams = find_streams(session, node)
+    streams = make_session_streams(session, node)
     with suppress(FootTileError):  # the frames at the stop are damaged
         session = close_at_stop(session, streams)
     return session, streams

@@ -31,7 +31,7 @@ from storage.sessions.verified_file_cache import VerifiedFileCache
 log = logging.getLogger("foottile.book")
 
 
-def load_or_rebuild(folder: SessionsFolder) -> tuple[list[Session], dict[str, str]]:
+def load_or_rebuild_sessions(folder: SessionsFolder) -> tuple[list[Session], dict[str, str]]:
     """Load all sessions, and rebuild damaged ones on the disk; return them, and errors by id."""
     found, unreadable = folder.load_all()
     errors: dict[str, str] = {}
@@ -72,7 +72,7 @@ class Trash:
         self.folder = SessionsFolder(folder)
         for doomed in folder.glob(DELETED_PREFIX + "*"):
             shutil.rmtree(doomed, ignore_errors=True)
-        found, unreadable = load_or_rebuild(self.folder)
+        found, unreadable = load_or_rebuild_sessions(self.folder)
         self.has_unreadable = bool(unreadable)
         """True if a session cannot be read: the frames that it needs are unknown."""
         unreadable |= log_strays(self.folder.find_strays())
@@ -113,8 +113,8 @@ class Trash:
         self.folder.move_to(session_id, target)
         return self._sessions.remove(session_id)
 
-    def purge(self) -> list[Path]:
-        """Rename the folders of all sessions for `delete_files`, which deletes them; return them.
+    def rename_all_for_deletion(self) -> list[Path]:
+        """Rename the folders of all sessions, to be deleted by `delete_and_count_bytes`.
 
         Raises:
             StorageError: a folder cannot be moved; its session and those after it are still in the
@@ -127,7 +127,7 @@ class Trash:
         return doomed
 
 
-def delete_files(folders: list[Path]) -> int:
+def delete_and_count_bytes(folders: list[Path]) -> int:
     """Delete folders with all their files; return the number of bytes freed.
 
     Raises:
@@ -157,7 +157,7 @@ class SessionStore:
         self.folder = folder
         self.trash = trash
         self.on_change = on_change
-        found, self.unreadable = load_or_rebuild(folder)
+        found, self.unreadable = load_or_rebuild_sessions(folder)
         """Errors of the sessions that cannot be read, by id; their files are unchanged."""
         strays = folder.find_strays()
         self.has_unreadable = bool(self.unreadable) or any(each.may_need_frames for each in strays)
@@ -252,7 +252,7 @@ class SessionStore:
         """Replace a session in memory only; its next `save` writes it to the disk."""
         self._sessions.put(session)
 
-    def edit_description(
+    def edit_user_fields(
         self, session_id: str, *, if_revision: str | None = None, **changes: object
     ) -> Session:
         """Edit the user-written fields of a session: name, subject, notes, tags.
@@ -268,7 +268,7 @@ class SessionStore:
             StorageError: it cannot be saved.
         """
         session = self.get_session(session_id)
-        check_revision(if_revision, session_revision(session), f"session {session_id}")
+        check_revision(if_revision, user_fields_revision(session), f"session {session_id}")
         return self.save(session.model_copy(update=changes))
 
     def add_marker(
@@ -296,7 +296,7 @@ class SessionStore:
     def edit_marker(
         self, session_id: str, marker_id: str, *, if_revision: str | None = None, **changes: object
     ) -> Marker:
-        """Rename or move a marker; arguments as for `edit_description`.
+        """Rename or move a marker; arguments as for `edit_user_fields`.
 
         Raises:
             UnknownError: no such session or marker.
@@ -346,7 +346,7 @@ class SessionStore:
         self._sessions.remove(session.id)
 
 
-def session_revision(session: Session) -> str:
+def user_fields_revision(session: Session) -> str:
     """Return the revision of a session's user-written fields, a short hash."""
     return _hash(session.model_dump_json(include={"name", "subject", "notes", "tags"}))
 

@@ -224,14 +224,14 @@ class ServerStream:
             return requested - (self._dropped - needed)
         return requested & needed
 
-    def on_present(self, hello: Hello, now_t_ns: int) -> None:
+    def apply_present_hello(self, hello: Hello, now_t_ns: int) -> None:
         """Apply hello of which this is the present stream: bounds, obtainable frames, losses."""
         self.limit = StreamLimit.from_hello(hello, now_t_ns)
         self.node_ranges = Intervals((*hello.stored, (hello.next_seq, NO_END)))
         self._update_notes(hello.lost, next_seq=None)
         self._extend_start(min((first for first, _ in hello.stored), default=hello.next_seq))
 
-    def on_earlier(self, report: EarlierStream) -> None:
+    def apply_end_report(self, report: EarlierStream) -> None:
         """Apply the node's report of how this stream ended: end, obtainable frames, losses."""
         self.node_ranges = Intervals(report.stored)
         self.first_t_ns = report.t_ns_first
@@ -246,20 +246,20 @@ class ServerStream:
             report.lost, next_seq=report.next_seq + beyond, max_lost_tail_frames=tail
         )
 
-    def on_unlisted(self) -> None:
+    def retire_stream(self) -> None:
         """Retire the stream, which hello lacks: nothing more will come; the next sync closes it."""
         self.node_ranges = Intervals()
         if self.journal is not None:
             self.journal.retire_open_segments()
 
-    def set_losses(self, lost: SeqIntervalsByReason) -> None:
+    def set_node_losses(self, lost: SeqIntervalsByReason) -> None:
         """Replace the losses that the node has reported for this stream."""
         notes = self.notes
         self._update_notes(
             lost, next_seq=notes.next_seq, max_lost_tail_frames=notes.max_lost_tail_frames
         )
 
-    def check_frames(self, frames: FrameBatch, now_t_ns: int) -> str:
+    def check_or_refuse_frames(self, frames: FrameBatch, now_t_ns: int) -> str:
         """Check received frames; those that break a rule are lost as refused: never request them.
 
         Args:
@@ -288,7 +288,7 @@ class ServerStream:
         if wrong:
             refused = Intervals([(first, last)]) - self.stored
             self._refused = self._refused | refused
-            self.set_losses(self.notes.lost)
+            self.set_node_losses(self.notes.lost)
             raise FileFormatError(
                 f"frames {first} to {last} of stream {self.stream_id} are refused: {wrong}",
                 expected="frames as docs/formats.md says",

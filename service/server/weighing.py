@@ -103,7 +103,7 @@ class Weighing:
         self._last_s = np.inf
 
     @property
-    def number(self) -> int:
+    def weight_index(self) -> int:
         """Index in `weights` of the weight that is next, or on the tile."""
         return len(self.held)
 
@@ -130,7 +130,7 @@ class Weighing:
             case "put on" if self._is_loaded(self._newest_kpa):
                 return f"Let go of {tile}: the pressure settles"
             case "put on":
-                weight, _, _ = self.weights[self.number].partition(" +-")
+                weight, _, _ = self.weights[self.weight_index].partition(" +-")
                 return {
                     "weights": f"Put {weight} on {tile}",
                     "scale": f"Press {tile} until the scale reads {weight}, and clamp it",
@@ -139,15 +139,15 @@ class Weighing:
             case _:
                 return f"All weights are done: unload {tile}"
 
-    def push(self, t_ns: npt.NDArray[np.int64], kpa: Floats) -> list[Action]:
+    def feed_pressures(self, t_ns: npt.NDArray[np.int64], absolute_kpa: Floats) -> list[Action]:
         """Feed readings of the tile; return the changes of markers, in order.
 
         Args:
             t_ns: (n,), instants, rising from call to call.
-            kpa: (n,), absolute pressures; NaN without a reading.
+            absolute_kpa: (n,), absolute pressures; NaN without a reading.
         """
         actions: list[Action] = []
-        for at_ns, reading_kpa in zip(t_ns.tolist(), kpa.tolist(), strict=True):
+        for at_ns, reading_kpa in zip(t_ns.tolist(), absolute_kpa.tolist(), strict=True):
             if not np.isfinite(reading_kpa):
                 continue
             at_s = 1e-9 * at_ns
@@ -162,7 +162,7 @@ class Weighing:
             self._sum, self._count = self._sum + reading_kpa, self._count + 1
         return actions
 
-    def repeat(self) -> list[Action]:
+    def repeat_last_weight(self) -> list[Action]:
         """Go back to the weight that is held, or else to the last one, and rest before it.
 
         Returns:
@@ -200,7 +200,7 @@ class Weighing:
                 self.step = "empty"
                 return [Withdraw("the tile was not at rest")]
             case "put on" if self._is_steady(self.rest_kpa) and self._is_loaded(kpa):
-                return self._begin("holding", self.weights[self.number], t_ns)
+                return self._begin("holding", self.weights[self.weight_index], t_ns)
             case "resting" | "holding":
                 return self._watch(kpa, t_ns)
             case _:
@@ -229,7 +229,7 @@ class Weighing:
         if is_weight:
             self.held.append(self.repeatability)
             self._on_kpa = self.repeatability.mean_kpa
-            self.step = "done" if self.number == len(self.weights) else "empty"
+            self.step = "done" if self.weight_index == len(self.weights) else "empty"
         else:
             self.rest_kpa = float(np.mean(self._in_step[-_WINDOW_BINS:]))
             self.step = "put on"

@@ -89,7 +89,7 @@ class NodeWeighing:
     """Seals and fits."""
 
     @property
-    def now(self) -> Weighing:
+    def present_pass(self) -> Weighing:
         """The pass under way, or the last one."""
         return self.passes[self.at]
 
@@ -144,7 +144,7 @@ class Weighings:
         check_revision(session_id, found.session_id, f"the guided calibration of {node!r}")
         return found
 
-    def start(self, node: ServerNode, plan: WeighingPlan) -> NodeWeighing:
+    def start_with_recording(self, node: ServerNode, plan: WeighingPlan) -> NodeWeighing:
         """Start a recording, and the guided calibration of the first tile in it.
 
         Raises:
@@ -158,7 +158,7 @@ class Weighings:
                 f"tiles of node {node.name!r} are being calibrated by somebody",
                 remedy="Follow it on the page /calibrate, or cancel it there",
             )
-        bearing = [tile.serial for tile in node.info.tiles if not tile.reference]
+        bearing = [tile.serial for tile in node.last_info.tiles if not tile.reference]
         for serial in plan.tiles:
             if serial not in bearing:
                 raise UsageError(
@@ -168,7 +168,7 @@ class Weighings:
         if len(set(plan.tiles)) < len(plan.tiles):
             raise UsageError("a tile is named twice", remedy="Name each once")
         lasts_s = _WEIGHT_S * len(plan.tiles) * len(plan.weights)
-        if lasts_s * node.info.nominal_rate_hz > FRAMES_MAX:
+        if lasts_s * node.last_info.nominal_rate_hz > FRAMES_MAX:
             raise UsageError(
                 f"{len(plan.weights)} weights on {len(plan.tiles)} tiles take {lasts_s / 60:.0f} "
                 "minutes or more: their recording is too long for one fit",
@@ -194,17 +194,17 @@ class Weighings:
         )
         return self._of[node.name]
 
-    def push(self, node: ServerNode, due: Sequence[EstimatedBatch]) -> None:
+    def feed_frames(self, node: ServerNode, batches: Sequence[EstimatedBatch]) -> None:
         """Feed the newest frames of a node to its weighing; cheap if there is none."""
         weighing = self._of.get(node.name)
         if weighing is None or node.stream_id != weighing.stream_id:
             return
-        for frames, _ in due:
+        for frames, _ in batches:
             if weighing.state == "weighing" and len(frames):
                 with self._failing(weighing):
                     self._take(weighing, node, frames)
 
-    def repeat(self, node: ServerNode, session_id: str | None = None) -> NodeWeighing:
+    def repeat_last_weight(self, node: ServerNode, session_id: str | None = None) -> NodeWeighing:
         """Go back to the weight that is held, or else to the last one on this tile.
 
         Raises:
@@ -217,10 +217,10 @@ class Weighings:
             raise StateError(
                 f"the guided calibration of {node.name!r} has ended", remedy="Start another one"
             )
-        self._mark(weighing, node, weighing.now.repeat())
+        self._mark(weighing, node, weighing.present_pass.repeat_last_weight())
         return weighing
 
-    async def end(self, node: str, session_id: str | None = None) -> None:
+    async def cancel_or_remove_weighing(self, node: str, session_id: str | None = None) -> None:
         """Cancel the weighing of a node and stop its recording, or remove one that has ended.
 
         Raises:
@@ -230,7 +230,7 @@ class Weighings:
         del self._of[node]
         await self._cancel(weighing)
 
-    def check(self, node: ServerNode, now_s: float) -> None:
+    def end_if_stalled(self, node: ServerNode, now_s: float) -> None:
         """End, as failed, the weighing of a node without progress, frames or recording.
 
         Args:
@@ -266,10 +266,10 @@ class Weighings:
 
     def _take(self, weighing: NodeWeighing, node: ServerNode, frames: FrameBatch) -> None:
         weighing.seen_s = time.monotonic()
-        i = node.info.serials.index(weighing.now.serial)
-        kpa = Compensation(node.info.tiles).compute_usable_kpa(frames)[:, i]
-        self._mark(weighing, node, weighing.now.push(frames.t_ns, kpa))
-        if weighing.now.step != "done":
+        i = node.last_info.serials.index(weighing.present_pass.serial)
+        kpa = Compensation(node.last_info.tiles).compute_usable_kpa(frames)[:, i]
+        self._mark(weighing, node, weighing.present_pass.feed_pressures(frames.t_ns, kpa))
+        if weighing.present_pass.step != "done":
             return
         if weighing.at + 1 < len(weighing.passes):
             weighing.at += 1
@@ -305,7 +305,9 @@ class Weighings:
         """Seal the recording and fit it."""
         with self._failing(weighing):
             self._recorder.stop_session(weighing.session_id)
-            session = await self._settling.wait_until_sealed(weighing.session_id, _SEAL_S)
+            session = await self._settling.wait_until_sealed_or_timeout(
+                weighing.session_id, _SEAL_S
+            )
             if session.state != "sealed":
                 raise StateError(
                     f"the recording is not sealed: {self._why_not(session)}",

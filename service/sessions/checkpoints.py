@@ -73,13 +73,13 @@ class Checkpoints:
         self.distance_frames = CHECKPOINT_FRAMES
         self._scratch = ScratchFile(folder)
 
-    def extend_times(self, t_ns: Array) -> None:
+    def extend_newest_span(self, t_ns: Array) -> None:
         """Extend the time span of the newest checkpoint by estimated frames."""
         newest = self.checkpoints[-1]
         newest.begin_ns = min(newest.begin_ns, int(t_ns.min()))
         newest.end_ns = max(newest.end_ns, int(t_ns.max()))
 
-    def add_checkpoint(self, checkpoint: Checkpoint, state: Columns | None) -> None:
+    def try_add_checkpoint(self, checkpoint: Checkpoint, state: Columns | None) -> None:
         """Try to add a checkpoint; without effect if the disk is full.
 
         Args:
@@ -107,7 +107,7 @@ class Checkpoints:
         newest.begin_ns, newest.end_ns = _EVER_NS, -_EVER_NS
         self.checkpoints = tuple(self.checkpoints[:count])
 
-    def resume_stream(
+    def resume_stream_at_or_before(
         self, checkpoints: Sequence[Checkpoint], index: int, inputs: SessionInputs
     ) -> tuple[int, EstimateStream | None]:
         """Resume estimates from a checkpoint, or from one before it if that cannot be read.

@@ -55,15 +55,15 @@ class ComparisonSeries:
         frames = _make_bins(table, self._gap_ns)
         self._levels = build_levels(merge_bins(frames, FRAMES_PER_FINEST_BIN)) if len(table) else []
 
-    def get_bins(self, begin_ns: int, time_slice: Slice, points: int) -> tuple[Bins, int]:
-        """Return a slice as `points` to four times as many bins.
+    def get_bins(self, begin_ns: int, time_slice: Slice, min_bins: int) -> tuple[Bins, int]:
+        """Return a slice as `min_bins` to four times as many bins.
 
         Fewer where there are fewer frames, and more where gaps split them: no bin spans a gap.
 
         Args:
             begin_ns: time of the session's first frame.
             time_slice: time interval; its columns are ignored.
-            points: least number of bins.
+            min_bins: least number of bins.
 
         Returns:
             `t_first_ns`, `t_last_ns`, `frames`, `missing` (number of gaps in the bin or just before
@@ -77,11 +77,11 @@ class ComparisonSeries:
         bounds_ns = time_slice.compute_bounds_ns(begin_ns)
         for above in reversed(range(len(self._levels))):
             found = _slice_bins(self._levels[above], *bounds_ns)
-            if len(found["frames"]) >= points:
+            if len(found["frames"]) >= min_bins:
                 return found, FRAMES_PER_FINEST_BIN * BINS_PER_COARSER_BIN**above
         bins = _make_bins(read_series_range(self._folder, self._footer, *bounds_ns), self._gap_ns)
         size = 1
-        while len(bins["frames"]) // (size * BINS_PER_COARSER_BIN) >= points:
+        while len(bins["frames"]) // (size * BINS_PER_COARSER_BIN) >= min_bins:
             size *= BINS_PER_COARSER_BIN
         return (bins if size == 1 else merge_bins(bins, size)), size
 
@@ -93,7 +93,7 @@ class ComparisonSeriesCache:
         self._entries: OrderedDict[Path, tuple[tuple[int, ...], ComparisonSeries]] = OrderedDict()
         self._one_at_a_time = threading.Lock()
 
-    def get(self, folder: Path) -> ComparisonSeries | None:
+    def get_or_read(self, folder: Path) -> ComparisonSeries | None:
         """Return the series of a comparison, read if it is not cached; None: it has none.
 
         Raises:

@@ -57,7 +57,11 @@ class SessionFrames:
     def _iterate_estimated(self) -> Iterator[tuple[FrameBatch, Columns]]:
         sources = self._inputs
         with require_extra("server", "the estimator", remedy=_REMEDY):
-            from service.sessions.pipeline import EstimateOptions, EstimateStream, make_notes
+            from service.sessions.pipeline import (
+                EstimateOptions,
+                EstimateStream,
+                make_estimate_metadata,
+            )
         assert sources.calibration is not None  # noqa: S101  # or there is nothing to estimate with
         options = EstimateOptions(
             sources.calibration,
@@ -69,7 +73,7 @@ class SessionFrames:
         stream = EstimateStream(sources.info, options)
         for frames, columns in stream.estimate_batches(self.iterate_raw()):
             if not self.notes and stream.plan is not None:
-                self.notes = make_notes(stream.plan, stream.rounding, sources.tares)
+                self.notes = make_estimate_metadata(stream.plan, stream.rounding, sources.tares)
                 if any(tare.is_lost for tare in sources.tares):
                     self.problem = TARE_LOST
             yield frames, columns

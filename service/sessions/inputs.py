@@ -163,11 +163,11 @@ def _tares_during(
     """
     first, last = session.parts[0], session.parts[-1]
     seq_last = last.seq_last if last.seq_last is not None else NO_END
-    begin_t_ns = streams[first.stream_id].t_ns_near(first.seq_first, newest=False)
-    end_t_ns = streams[last.stream_id].t_ns_near(seq_last, newest=True)
+    begin_t_ns = streams[first.stream_id].find_t_ns_near(first.seq_first, at_or_before=False)
+    end_t_ns = streams[last.stream_id].find_t_ns_near(seq_last, at_or_before=True)
     if begin_t_ns is None or end_t_ns is None:
         return (), None
-    tares = history.tares_between(info, begin_t_ns, end_t_ns)
+    tares = history.tares_in_force_between(info, begin_t_ns, end_t_ns)
     if not tares and not history.is_empty(info):
         return (), "all tares of the node were taken after this session"
     return tares, None

@@ -77,7 +77,7 @@ class OverviewWriter:
             log.exception("overview: this is a bug")
             self.problem = f"{_NOT_WRITTEN}: {error}"
 
-    def write_file(self, folder: Path, frames_sha256: str) -> None:
+    def try_write_file(self, folder: Path, frames_sha256: str) -> None:
         """Try to write `overview.arrow`; a failure is reported in `problem`."""
         if self.problem is not None:
             return
@@ -113,10 +113,10 @@ class BinnedSlice:
     """time axis of the session."""
 
 
-def bin_session(
-    session: SealedFileReader, time_slice: Slice, points: int, *, frames_sha256: str
+def bin_from_overview_or_rebuild(
+    session: SealedFileReader, time_slice: Slice, min_bins: int, *, frames_sha256: str
 ) -> BinnedSlice:
-    """Return a slice of a sealed session as `points` to four times as many bins.
+    """Return a slice of a sealed session as `min_bins` to four times as many bins.
 
     Fewer only where there are fewer frames. A missing, damaged or outdated overview is rebuilt, and
     stored if the folder is writable.
@@ -124,7 +124,7 @@ def bin_session(
     Args:
         session: frames of the session, open for slices.
         time_slice: time interval; its columns are ignored.
-        points: least number of bins.
+        min_bins: least number of bins.
         frames_sha256: hash of the file of frames.
 
     Raises:
@@ -135,12 +135,12 @@ def bin_session(
     bounds = time_slice.compute_bounds_ns(begin_ns)
     try:
         with open_overview(path) as stored:
-            found = _bins_from_levels(stored, frames_sha256, bounds, points, session.time_axis)
+            found = _bins_from_levels(stored, frames_sha256, bounds, min_bins, session.time_axis)
     except (FileNotFoundError, FileFormatError, StorageError):
         with _rebuild(path, session, frames_sha256) as made:
-            found = _bins_from_levels(made, frames_sha256, bounds, points, session.time_axis)
+            found = _bins_from_levels(made, frames_sha256, bounds, min_bins, session.time_axis)
     if isinstance(found, int):
-        found = _bins_from_frames(session, time_slice, begin_ns, points, found)
+        found = _bins_from_frames(session, time_slice, begin_ns, min_bins, found)
     bins, size = found
     return BinnedSlice(bins, size, begin_ns, end_ns, session.time_axis)
 

@@ -53,10 +53,12 @@ class SessionStream(StreamState):
     offset_ns: int | None = None
     last_seen_t_ns: int | None = None
 
-    def t_ns_near(self, seq: int, *, newest: bool) -> int | None:
+    def find_t_ns_near(self, seq: int, *, at_or_before: bool) -> int | None:
         """Return the node's time of the newest frame up to `seq` or the oldest from it, or None."""
         return (
-            self.journal.find_t_ns_near(seq, is_upper=newest) if self.journal is not None else None
+            self.journal.find_t_ns_near(seq, is_upper=at_or_before)
+            if self.journal is not None
+            else None
         )
 
 
@@ -91,20 +93,24 @@ RATE_MAX_HZ = 1000.0
 Streams = Mapping[str, SessionStream]
 
 
-def close_at_stop(session: Session, streams: Streams, *, wait_for_missing: bool = False) -> Session:
+def close_at_stop(
+    session: Session, streams: Streams, *, leave_open_while_missing: bool = False
+) -> Session:
     """Return the session with those open parts closed whose stream has passed the stop.
 
     Args:
         session: the session.
         streams: facts by stream id, for all of its parts.
-        wait_for_missing: keep a part open while frames closer to the stop may come.
+        leave_open_while_missing: keep a part open while frames closer to the stop may come.
 
     Raises:
         DamagedFramesError: the frames at the stop are damaged.
     """
     for part in session.parts:
         if part.seq_last is None:
-            last = _seq_at_stop(session, part, streams[part.stream_id], waiting=wait_for_missing)
+            last = _seq_at_stop(
+                session, part, streams[part.stream_id], waiting=leave_open_while_missing
+            )
             if last is not None:
                 session = close_part(session, part, last)
     return session
@@ -151,7 +157,7 @@ def close_unfinished(session: Session, streams: Streams, now_t_ns: int | None = 
     session = close_at_stream_end(close_at_stop(session, streams), streams, now_t_ns)
     if session.stopped_t_ns is None:
         stream = streams[session.parts[-1].stream_id]
-        newest_t_ns = stream.t_ns_near(session.parts[-1].seq_last or 0, newest=True)
+        newest_t_ns = stream.find_t_ns_near(session.parts[-1].seq_last or 0, at_or_before=True)
         stopped_t_ns = session.started_t_ns
         if newest_t_ns is not None:
             stopped_t_ns = newest_t_ns + (stream.offset_ns or 0)
@@ -172,7 +178,7 @@ def close_part(session: Session, part: Part, seq_last: int, max_lost_tail: int =
     return session.model_copy(update=update)
 
 
-def tail_bound(stream: SessionStream) -> int:
+def bound_lost_tail_frames(stream: SessionStream) -> int:
     """Return the upper bound of frames that a stream had after its newest stored one."""
     if stream.next_seq is not None:
         return stream.max_lost_tail_frames
@@ -195,7 +201,7 @@ def _seq_at_stop(
     if waiting and stream.obtainable & Intervals([(last + 1, after - 1)]):
         return None
     # The stop lies among lost frames: the rate gives the number of those after it.
-    after_t_ns = stream.t_ns_near(after, newest=False) or stop_t_ns
+    after_t_ns = stream.find_t_ns_near(after, at_or_before=False) or stop_t_ns
     late = math.ceil((after_t_ns - stop_t_ns) * 1e-9 * _rate_hz(stream))
     return min(after - 1, max(last, after - late))
 
@@ -207,9 +213,9 @@ def _max_unsent_frames(session: Session, stream: SessionStream, now_t_ns: int | 
     """
     limits_ns = [t_ns for t_ns in (session.stopped_t_ns, now_t_ns) if t_ns is not None]
     if not limits_ns:
-        return tail_bound(stream)
+        return bound_lost_tail_frames(stream)
     # Arrival times of delayed frames are too late.
-    newest_t_ns, seen_t_ns = stream.t_ns_near(NO_END, newest=True), stream.last_seen_t_ns
+    newest_t_ns, seen_t_ns = stream.find_t_ns_near(NO_END, at_or_before=True), stream.last_seen_t_ns
     if newest_t_ns is not None and (stream.offset_ns is not None or seen_t_ns is None):
         seen_t_ns = newest_t_ns + (stream.offset_ns or 0)
     silent_s = (min(limits_ns) - (seen_t_ns or session.started_t_ns)) / 1e9

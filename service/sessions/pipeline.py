@@ -143,7 +143,7 @@ class EstimateStream:
             TareError: no tare can be found.
         """
         for frames, columns in self._estimate(iter(batches), ends=is_final):
-            yield frames, self.rounding.quantize(columns)
+            yield frames, self.rounding.round_to_steps(columns)
 
     def state_dict(self) -> Columns:
         """Return the whole state, to resume from.
@@ -300,15 +300,15 @@ def _join_batches(
     if len(pieces) > 1:
         extra = {name: np.concatenate([extra[name] for _, extra in pieces]) for name in extra}
         frames = FrameBatch.concatenate([frames for frames, _ in pieces])
-    return frames, {**extra, **estimate_columns(estimates)}
+    return frames, {**extra, **make_estimate_columns(estimates)}
 
 
-def estimate_columns(estimates: Estimates) -> dict[str, npt.NDArray[Any]]:
+def make_estimate_columns(estimates: Estimates) -> dict[str, npt.NDArray[Any]]:
     """Return the estimates as columns of a sealed file, without `seq` and `t_ns`."""
     return {name: getattr(estimates, name) for name in _ESTIMATED}
 
 
-def make_notes(
+def make_estimate_metadata(
     plan: EstimationPlan, rounding: Quantization, tares: tuple[Tare, ...] = ()
 ) -> dict[str, object]:
     """Return the file metadata of the estimates; enough to compute them again.
@@ -325,7 +325,7 @@ def make_notes(
         "models": list(plan.models),
         "lag_ms": plan.lag_ns * 1e-6,
         "tare": plan.tare.as_dict(),
-        ROUNDING_STEP_KEY: rounding.steps_by_column(),
+        ROUNDING_STEP_KEY: rounding.collect_flat_column_steps(),
     }
     if tares:
         notes["tares"] = [tare.as_dict() for tare in tares]

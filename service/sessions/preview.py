@@ -80,7 +80,7 @@ class SessionPreview:
         count = bisect_left(checkpoints, True, key=lambda place: not self._is_valid(place, inputs))
         return list(checkpoints[: max(1, count)])
 
-    def update(self, inputs: SessionInputs) -> None:
+    def advance(self, inputs: SessionInputs) -> None:
         """Estimate new frames for `UPDATE_BUDGET_S` at most; `can_use` is true of `inputs`.
 
         Raises:
@@ -110,7 +110,7 @@ class SessionPreview:
         """Return whether frames or tares before the present position have changed."""
         return not self._is_valid(self._position, inputs)
 
-    def rewind_to_checkpoint(self, inputs: SessionInputs) -> None:
+    def rewind_to_valid_checkpoint(self, inputs: SessionInputs) -> None:
         """Drop everything after the last valid checkpoint."""
         all_, true = self.checkpoints.checkpoints, self.valid_checkpoints(inputs)
         kept_frames = self._bins.truncate(true[-1].estimated_frames)
@@ -118,10 +118,10 @@ class SessionPreview:
         index = max(
             0, bisect_left(true, max(kept_frames, 1), key=lambda place: place.estimated_frames) - 1
         )
-        index, self._stream = self.checkpoints.resume_stream(all_, index, inputs)
+        index, self._stream = self.checkpoints.resume_stream_at_or_before(all_, index, inputs)
         self.checkpoints.truncate(index + 1)
         place = all_[index]
-        self.start_repeated_work(self)
+        self.start_repeat_timer(self)
         self._position = Checkpoint(
             place.part,
             place.seq,
@@ -133,7 +133,7 @@ class SessionPreview:
         self._repeated_frames = kept_frames - place.estimated_frames
         self._inputs = inputs
 
-    def start_repeated_work(self, previous: SessionPreview) -> None:
+    def start_repeat_timer(self, previous: SessionPreview) -> None:
         """Reset the time of repeated work, which is measured up to another preview's position."""
         self._fed_before_rewind, self.repeated_work_s = previous._position.fed_frames, 0.0
 
@@ -172,7 +172,7 @@ class SessionPreview:
             self._repeated_frames -= self._bins.add_frames(
                 fields, already_added=self._repeated_frames
             )
-            self.checkpoints.extend_times(estimated.t_ns)
+            self.checkpoints.extend_newest_span(estimated.t_ns)
             position.estimated_frames += len(estimated)
             position.last_estimated = int(columns["part"][-1]), int(estimated.t_ns[-1])
         position.part, position.seq = int(extra["part"][-1]), int(frames.seq[-1]) + 1
@@ -190,7 +190,7 @@ class SessionPreview:
                 position.newest_ns,
                 position.last_estimated,
             )
-            self.checkpoints.add_checkpoint(
+            self.checkpoints.try_add_checkpoint(
                 place, None if self._stream is None else self._stream.state_dict()
             )
 
@@ -232,7 +232,7 @@ class SessionPreviews:
         with self._one_at_a_time:
             return self._advance_preview(inputs)
 
-    def get_quickly(self, inputs: SessionInputs) -> SessionPreview:
+    def advance_unless_catching_up(self, inputs: SessionInputs) -> SessionPreview:
         """Return a session's preview; it is advanced first unless it is catching up.
 
         Raises:
@@ -257,16 +257,16 @@ class SessionPreviews:
             if time.monotonic() < self._retry_after_s.get(name, 0.0):
                 return preview
             if preview.can_use(inputs):
-                preview.rewind_to_checkpoint(inputs)
+                preview.rewind_to_valid_checkpoint(inputs)
             else:
                 before, preview = preview, SessionPreview(inputs, self._folder)
-                preview.start_repeated_work(before)
+                preview.start_repeat_timer(before)
                 self._previews[name] = preview
         self._previews.move_to_end(name)
         while len(self._previews) > _PREVIEWS_KEPT:
             self.discard(next(iter(self._previews)))
         try:
-            preview.update(inputs)
+            preview.advance(inputs)
         except FootTileError:
             self.discard(name)
             raise

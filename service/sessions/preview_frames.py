@@ -15,7 +15,7 @@ from devices.frames import FrameBatch
 from service.sessions.frames import Columns, iterate_raw_frames
 from service.sessions.inputs import SessionInputs
 from service.sessions.preview import SessionPreview
-from storage.formats.export import FrameSource, make_frame_source
+from storage.formats.export import FrameSource, make_one_pass_frame_source
 from storage.formats.slice import Slice
 from storage.intervals import NO_END
 from storage.schema import ROUNDING_STEP_KEY
@@ -61,7 +61,7 @@ class PreviewFrames:
         some = next(pieces, None)
         if some is None:  # no frame in the interval: use the columns of the first ones
             some = next(self._iterate_range(0, 1, None))
-        return make_frame_source(chain((some,), pieces), span_ns, self._axis)
+        return make_one_pass_frame_source(chain((some,), pieces), span_ns, self._axis)
 
     def _find_ranges(self, begin_ns: int | None, end_ns: int | None) -> list[tuple[int, int]]:
         """Return the ranges of checkpoints with frames of an interval; the last one is open."""
@@ -86,7 +86,7 @@ class PreviewFrames:
         """Yield the frames between two checkpoints, with estimates, up to an end time."""
         places = self._valid_checkpoints
         end_count = places[end].estimated_frames if end < len(places) else NO_END
-        start, stream = self._checkpoints.resume_stream(places, begin, self._inputs)
+        start, stream = self._checkpoints.resume_stream_at_or_before(places, begin, self._inputs)
         ahead, count = (
             places[begin].estimated_frames - places[start].estimated_frames,
             end_count - places[start].estimated_frames,
@@ -96,7 +96,7 @@ class PreviewFrames:
             pieces = stream.estimate_batches(pieces)
         for frames, columns in pieces:
             if stream is not None and not self.notes:
-                self.notes = {ROUNDING_STEP_KEY: stream.rounding.steps_by_column()}
+                self.notes = {ROUNDING_STEP_KEY: stream.rounding.collect_flat_column_steps()}
             rows = slice(ahead, min(count, len(frames)))
             ahead, count = max(0, ahead - len(frames)), count - len(frames)
             if rows.start < rows.stop:

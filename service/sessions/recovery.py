@@ -19,8 +19,17 @@ from typing import Literal
 from devices.errors import DamagedFileError, DamagedFramesError, FootTileError, StorageError
 from service.sessions.creation import create_session
 from service.sessions.inputs import make_inputs
-from service.sessions.part_end import SessionStream, close_at_stop, close_unfinished, tail_bound
-from service.sessions.recovery_streams import OpenedStream, open_streams, read_hello
+from service.sessions.part_end import (
+    SessionStream,
+    bound_lost_tail_frames,
+    close_at_stop,
+    close_unfinished,
+)
+from service.sessions.recovery_streams import (
+    OpenedStream,
+    open_and_mend_streams,
+    read_hello_or_empty,
+)
 from service.sessions.sealing import seal_session
 from service.sessions.session_rebuild import rebuild_session
 from service.sessions.tares import TareHistory
@@ -127,7 +136,7 @@ def recover_folder(
     before = _find_cut_files(data)
     if _is_node_folder(data):
         recover_node_journals(data)  # frames in flight of a killed node
-    opened, recovery.problems = open_streams(
+    opened, recovery.problems = open_and_mend_streams(
         data, report_step, is_node_folder=_is_node_folder(data)
     )
     for path in sorted(_find_cut_files(data) - before):
@@ -185,8 +194,8 @@ def _seal_if_possible(
     for part in session.parts:
         stream = own_streams[part.stream_id]
         if stream is not None and part.seq_last is not None:
-            stream.invalidate_damaged(part.seq_first, part.seq_last)
-            stream.save_losses()
+            stream.read_and_invalidate_damaged(part.seq_first, part.seq_last)
+            stream.save_damage()
     streams = _find_streams(session, own_streams, is_local=is_local)
     ledger = compute_ledger(
         session.parts, adjust_states_to_session(session, streams), is_finished=True
@@ -202,7 +211,7 @@ def _seal_if_possible(
             session,
             streams,
             load_tares=lambda: TareHistory(data / "nodes" / session.node / "tares.json"),
-            emulated=read_hello(data, session.node).get("emulated"),
+            emulated=read_hello_or_empty(data, session.node).get("emulated"),
         )
         sealed = seal_session(sources, folder, ledger)
         problems = verify_session(folder, expected_session=sealed).problems
@@ -228,7 +237,7 @@ def _close_parts(
             if is_local or abandon_missing:
                 closed = close_unfinished(session, streams)
                 return closed.model_copy(update={"given_up": not is_local})
-            return close_at_stop(session, streams, wait_for_missing=True)
+            return close_at_stop(session, streams, leave_open_while_missing=True)
         except DamagedFramesError as error:  # at the stop: retry without these frames
             _invalidate(own.values(), error)
 
@@ -242,7 +251,7 @@ def _invalidate(streams: Iterable[OpenedStream | None], error: DamagedFramesErro
     for stream in streams:
         if stream is not None and stream.journal.folder == Path(error.where).parent:
             before = stream.journal.stored.count
-            stream.invalidate_damaged(error.seq_first, error.seq_last)
+            stream.read_and_invalidate_damaged(error.seq_first, error.seq_last)
             if stream.journal.stored.count < before:
                 return
     raise error
@@ -274,7 +283,7 @@ def _make_sessions(
     for (node, stream_id), stream in streams.items():
         parts = (part for session in known if session.node == node for part in session.parts)
         used = group_numbers_by_stream(parts).get(stream_id, Intervals())
-        journal, hello = stream.journal, read_hello(data, node)
+        journal, hello = stream.journal, read_hello_or_empty(data, node)
         # Lost frames do not split a run; frames that belong to a session do.
         unused = (journal.stored | stream.lost.numbers | stream.damaged) - used
         for run in unused:
@@ -296,7 +305,7 @@ def _make_sessions(
             )
             session = session.model_copy(update={"calibration": hello.get("calibration")})
             if last == journal.stored.last and (
-                tail := tail_bound(stream.make_session_stream(session))
+                tail := bound_lost_tail_frames(stream.make_session_stream(session))
             ):
                 session = session.model_copy(update={"max_lost_tail_frames": {stream_id: tail}})
             found.append(session)

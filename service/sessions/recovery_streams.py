@@ -66,7 +66,7 @@ class OpenedStream:
             offset_ns=0 if self.is_node_folder else measured_ns,  # a node stops by its own clock
         )
 
-    def save_losses(self) -> None:
+    def save_damage(self) -> None:
         """Save the damage found: once cut off, no other record exists.
 
         On a server's folder these frames are not lost yet: the node may have them. Unreadable notes
@@ -88,16 +88,16 @@ class OpenedStream:
             self.notes = now
             self.notes.save(self.journal.folder)
 
-    def invalidate_damaged(self, first: int, last: int) -> None:
+    def read_and_invalidate_damaged(self, first_seq: int, last_seq: int) -> None:
         """Read the stored frames from `first_seq` to `last_seq`, and invalidate damaged ones.
 
         Raises:
             StorageError: it cannot be read.
         """
-        seq = first
-        while seq <= last:
+        seq = first_seq
+        while seq <= last_seq:
             try:
-                for _ in self.journal.read_messages(seq, last):
+                for _ in self.journal.read_messages(seq, last_seq):
                     pass
             except DamagedFramesError as error:
                 damaged = Intervals([(error.seq_first, error.seq_last)])
@@ -108,7 +108,7 @@ class OpenedStream:
                 return
 
 
-def open_streams(
+def open_and_mend_streams(
     data: Path, report_step: Callable[[str], None], *, is_node_folder: bool
 ) -> tuple[dict[tuple[str, str], OpenedStream], list[str]]:
     """Open and mend every journal of a data folder: cut off partial batches, sync the rest.
@@ -143,12 +143,12 @@ def open_streams(
             )
             continue
         stream = OpenedStream(journal, notes, journal.lost.numbers, is_node_folder)
-        stream.save_losses()
+        stream.save_damage()
         streams[(folder.parent.name, folder.name)] = stream
     return streams, problems
 
 
-def read_hello(data: Path, node: str) -> dict[str, Any]:
+def read_hello_or_empty(data: Path, node: str) -> dict[str, Any]:
     """Read the node's last hello on the server's disk; empty if it is missing or unreadable."""
     try:
         content = json.loads(read_checksummed_json(data / "nodes" / node / "hello.json"))

@@ -63,8 +63,8 @@ def seal_session(inputs: SessionInputs, folder: Path, ledger: Ledger) -> Session
     write_markers(session, folder)
     write_clock_file(folder / CLOCK_NAME, session.clock, inputs.stream_facts)
     sha256 = compute_sha256(path)
-    stances.write_file(folder, sha256)
-    overview.write_file(folder, sha256)
+    stances.try_write_or_delete_file(folder, sha256)
+    overview.try_write_file(folder, sha256)
     problems = session.problem, frames.problem, stances.problem, overview.problem
     return session.model_copy(
         update={

@@ -63,7 +63,7 @@ class StancesWriter:
         if self._waiting_frames >= _ROWS:
             self._analyse_waiting()
 
-    def write_file(self, folder: Path, frames_sha256: str) -> None:
+    def try_write_or_delete_file(self, folder: Path, frames_sha256: str) -> None:
         """Try to write `stances.parquet`; without estimates, delete that of an earlier attempt."""
         path = folder / STANCES_NAME
         if not self._has_estimates:

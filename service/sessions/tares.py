@@ -70,7 +70,7 @@ class TareHistory:
         self.problem = f"{self._path}: {problem}; {done}"
 
     @property
-    def tares(self) -> list[RecordedTare]:
+    def all_tares(self) -> list[RecordedTare]:
         """All intact tares, of any array and undone ones too, oldest first."""
         return [entry for entry in self._entries if isinstance(entry, RecordedTare)]
 
@@ -93,18 +93,18 @@ class TareHistory:
         lost = any(isinstance(entry, LostTares) for entry in self._entries)
         return lost and not self._valid_since_lost(info)
 
-    def may_be_lost(self, t_ns: int) -> bool:
+    def may_have_lost_tare(self, t_ns: int) -> bool:
         """Return whether a lost tare may have this time."""
         return any(first <= t_ns <= last for first, last in self._lost_intervals())
 
-    def tare_for_estimates(self, info: ArrayInfo) -> Tare | None:
+    def tare_in_force_or_lost(self, info: ArrayInfo) -> Tare | None:
         """Return the tare in force, else `Tare.make_lost` for a lost one, else None."""
         in_force = self.tare_in_force(info)
         if in_force is not None:
             return in_force.tare
         return Tare.make_lost(tiles=len(info.tiles), t_ns=0) if self.is_tare_lost(info) else None
 
-    def automatic_reference(self, info: ArrayInfo) -> RecordedTare | None:
+    def last_non_automatic_or_oldest(self, info: ArrayInfo) -> RecordedTare | None:
         """Return the reference of automatic tares: the last other one, else the oldest.
 
         Tares before a lost one do not count: the lost one may have been the last other tare.
@@ -114,7 +114,7 @@ class TareHistory:
 
     def is_automatic_paused(self, info: ArrayInfo) -> bool:
         """Return whether an automatic tare was undone, with no other kind of tare since."""
-        for recorded in reversed(self.tares):
+        for recorded in reversed(self.all_tares):
             if not recorded.is_of_array(info):
                 continue
             if recorded.is_automatic and recorded.undone:
@@ -127,7 +127,9 @@ class TareHistory:
         """Return all tares that were not undone, in their order of time."""
         return tuple(recorded.tare for recorded in self._valid_tares(info))
 
-    def tares_between(self, info: ArrayInfo, begin_t_ns: int, end_t_ns: int) -> tuple[Tare, ...]:
+    def tares_in_force_between(
+        self, info: ArrayInfo, begin_t_ns: int, end_t_ns: int
+    ) -> tuple[Tare, ...]:
         """Return the tares in force at some time of an interval, oldest first.
 
         Those are the last one before it and all within; without one before, the first within is
@@ -166,7 +168,7 @@ class TareHistory:
         entry = self._entries[at] if 0 <= at < len(self._entries) else None
         return entry.tare.t_ns if isinstance(entry, RecordedTare) else otherwise
 
-    def add_tare(self, tare: Tare, info: ArrayInfo, reason: str = "") -> RecordedTare:
+    def store_tare(self, tare: Tare, info: ArrayInfo, reason: str = "") -> RecordedTare:
         """Store a tare, which puts it in force.
 
         Args:
@@ -191,7 +193,7 @@ class TareHistory:
             UnknownError: no such tare, or it was undone already.
             StorageError: that cannot be stored; nothing has changed then.
         """
-        if not any(tare.id == tare_id and not tare.undone for tare in self.tares):
+        if not any(tare.id == tare_id and not tare.undone for tare in self.all_tares):
             raise UnknownError(f"no tare {tare_id!r} that could be undone")
         self._store(
             tuple(
@@ -203,7 +205,7 @@ class TareHistory:
         )
 
     def _valid_tares(self, info: ArrayInfo) -> list[RecordedTare]:
-        return [t for t in self.tares if t.is_of_array(info) and not t.undone]
+        return [t for t in self.all_tares if t.is_of_array(info) and not t.undone]
 
     def _valid_since_lost(self, info: ArrayInfo) -> list[RecordedTare]:
         """Return the valid tares after the last lost one."""

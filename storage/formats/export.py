@@ -19,7 +19,7 @@ from devices.arrays import Times
 from devices.errors import UsageError
 from devices.frames import ArrayInfo, FrameBatch
 from storage.clock.table import ClockTable
-from storage.formats.export_facts import make_export_facts
+from storage.formats.export_facts import describe_completeness_and_axes
 from storage.formats.markers import PlacedMarkers
 from storage.formats.options import NO_OPTIONS, FormatOptions
 from storage.formats.slice import Slice
@@ -74,7 +74,7 @@ class FrameSource:
     axis: TimeAxis = NODE_AXIS
 
 
-def make_frame_source(
+def make_one_pass_frame_source(
     frame_chunks: Iterable[tuple[FrameBatch, Mapping[str, Array]]],
     span_ns: tuple[int, int] | None = None,
     axis: TimeAxis = NODE_AXIS,
@@ -149,17 +149,19 @@ class Export:
         if self.frame_source.axis.is_shifted:
             chosen[TIME_AXIS_NOTE] = self.frame_source.axis.to_json_list()
         has_server_time = self.clock is not None
-        facts = make_export_facts(self.notes, self.provenance, has_server_time=has_server_time)
+        facts = describe_completeness_and_axes(
+            self.notes, self.provenance, has_server_time=has_server_time
+        )
         return {**self.provenance, "node": self.array_info.node, **chosen, **facts}
 
     @property
-    def full_notes(self) -> dict[str, object]:
+    def notes_with_clock_and_markers(self) -> dict[str, object]:
         """Notes of the session as JSON, with the clock's summary and the markers if included."""
         notes = dict(self.notes)
         if self.clock is not None:
             notes["clock"] = self.clock.summarize().model_dump(mode="json")
         if self.markers is not None:
-            notes["markers"] = [marker.as_dict() for marker in self.markers.markers]
+            notes["markers"] = [marker.to_json_dict() for marker in self.markers.markers]
         return notes
 
     @property
@@ -167,7 +169,7 @@ class Export:
         """True if the session has estimates."""
         return "grf_n" in self.frame_source.quantity_names
 
-    def select_columns(self, columns: Sequence[str] = ()) -> dict[str, str]:
+    def map_columns_to_quantities(self, columns: Sequence[str] = ()) -> dict[str, str]:
         """Return the quantity of each given, selected, or else any column by flat name, in order.
 
         Args:
@@ -196,7 +198,7 @@ class Export:
         """Read the flat columns of the slice's frames in chunks of some thousand rows.
 
         Args:
-            columns: as for `select_columns`.
+            columns: as for `map_columns_to_quantities`.
 
         Yields:
             At least one chunk; it has no rows if the slice has no frames, else all chunks have
@@ -207,7 +209,7 @@ class Export:
                 raised before the first chunk.
         """
         chosen, made, content = (
-            self.select_columns(columns),
+            self.map_columns_to_quantities(columns),
             self._derived_column_names,
             self.frame_source,
         )
@@ -248,7 +250,7 @@ class Export:
 
     def read_tables(self) -> Iterator[pa.Table]:
         """Read the slice's frames as Arrow tables, with units, array and notes as metadata."""
-        chosen, notes = self.select_columns(), self.full_notes
+        chosen, notes = self.map_columns_to_quantities(), self.notes_with_clock_and_markers
         metadata: dict[bytes | str, bytes | str] = {
             ARRAY_INFO_KEY: self.array_info.model_dump_json().encode(),
             NOTES_KEY: json.dumps(notes, sort_keys=True).encode(),
@@ -267,7 +269,7 @@ class Export:
         """Read all frames of the slice at once, for a format that cannot be written in chunks.
 
         Args:
-            columns: as for `select_columns`, including `t_ns`.
+            columns: as for `map_columns_to_quantities`, including `t_ns`.
             frames_max: limit of the format.
 
         Raises:

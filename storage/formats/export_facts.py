@@ -27,7 +27,7 @@ _SERVER_TIME_BASE = (
 )
 
 
-def make_export_facts(
+def describe_completeness_and_axes(
     notes: Mapping[str, object], provenance: Mapping[str, object], *, has_server_time: bool
 ) -> dict[str, object]:
     """Return completeness, losses, time base and axes of an export of unmodified frames, as JSON.
@@ -37,7 +37,7 @@ def make_export_facts(
         provenance: session and hashes; has `state` if the session is not sealed.
         has_server_time: True if the export has the server's time.
     """
-    complete, lost = read_completeness(notes, provenance)
+    complete, lost = read_completeness_and_losses(notes, provenance)
     return {
         "complete": complete,
         "lost": lost,
@@ -49,7 +49,7 @@ def make_export_facts(
     }
 
 
-def read_completeness(
+def read_completeness_and_losses(
     notes: Mapping[str, object], provenance: Mapping[str, object]
 ) -> tuple[Completeness, dict[str, int]]:
     """Return the completeness of a session, and its number of lost frames by reason."""

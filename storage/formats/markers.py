@@ -48,7 +48,7 @@ class PlacedMarker:
     uncertainty_ns: int | None = None
     exclusion_reason: str = ""
 
-    def as_dict(self) -> dict[str, object]:
+    def to_json_dict(self) -> dict[str, object]:
         """Return the marker as JSON, for the notes of a file."""
         part, seq = self.frame or (None, None)
         return {

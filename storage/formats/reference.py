@@ -17,8 +17,8 @@ import numpy as np
 from devices.arrays import Floats
 from devices.errors import FileFormatError, UsageError
 from storage.formats.readers.registry import read_table, refuse_text_options
-from storage.formats.readers.sample_times import respace_repeated_times
-from storage.formats.readers.session import read_session_table
+from storage.formats.readers.sample_times import respace_rounded_times_evenly
+from storage.formats.readers.session import read_sealed_session_table
 from storage.formats.readers.table import SOLE_UNITS, STANDARD_UNITS, ForceTable
 from storage.formats.readers.text_options import TextOptions
 
@@ -119,7 +119,7 @@ def read_reference(path: Path, options: ReferenceOptions) -> ReferenceData:
         UsageError: neither user nor file states a unit or the sign, or they contradict each other.
     """
     named = options.source_columns
-    table = read_session_table(path, named)
+    table = read_sealed_session_table(path, named)
     if table is not None:
         refuse_text_options(path, options.text)
     else:
@@ -158,7 +158,7 @@ def table_to_reference(table: ForceTable, options: ReferenceOptions) -> Referenc
         time_s, grf_n, cop = time_s[timed], grf_n[timed], [column[timed] for column in cop]
     if len(time_s) < 2:
         raise FileFormatError(f"{len(time_s)} samples", where=where, expected="at least two")
-    time_s, spread_note = respace_repeated_times(time_s)
+    time_s, spread_note = respace_rounded_times_evenly(time_s)
     notes += filter(None, [spread_note])
     _check_time(time_s, where)
     if abs(time_s[0]) >= PLAUSIBLE_MAX:

@@ -27,7 +27,7 @@ SESSION_COLUMN_PATTERN = re.compile(
 _TOTAL_FORCE_COLUMNS = ("grf_n", "cop_x_m", "cop_y_m")
 
 
-def session_to_load_columns(
+def session_to_load_trace_columns(
     columns: Mapping[str, Column],
     schema: pa.Schema | None,
     *,

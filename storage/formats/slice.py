@@ -45,7 +45,7 @@ class Slice:
             )
 
     @property
-    def is_whole_session(self) -> bool:
+    def is_unrestricted(self) -> bool:
         """True for the whole session with all columns."""
         return self == Slice()
 

@@ -21,11 +21,15 @@ from storage.journal.segment_format import INDEX_SUFFIX
 from storage.journal.stream_notes import NOTES_FILE
 from storage.sessions.folder import FRAMES_NAME, SESSION_ID, Ledger, SessionsFolder
 from storage.sessions.metadata import SESSION_NAME
-from storage.verify.export import ExportReport, read_export
+from storage.verify.export import ExportReport, verify_export
 from storage.verify.journal import StreamReport, verify_journal
-from storage.verify.other_files import OtherFilesReport, verify_json_file, verify_other_files
+from storage.verify.other_files import (
+    OtherFilesReport,
+    verify_checksummed_json,
+    verify_json_and_server_id,
+)
 from storage.verify.segment import SegmentReport, verify_segment
-from storage.verify.session import SessionReport, verify_file_without_session, verify_session
+from storage.verify.session import SessionReport, verify_lone_sealed_file, verify_session
 
 Verdict = Literal["complete", "unproven", "lossy", "pending", "damaged", "export"]
 
@@ -101,9 +105,9 @@ def verify_path(path: Path, *, data_folder: Path | None = None) -> Report:
             return verify_journal(path.absolute().parent)
         if path.suffix == ".json":
             others = OtherFilesReport()
-            verify_json_file(path, path.name, others)
+            verify_checksummed_json(path, path.name, others)
             return DataFolderReport(path, problems=others.problems)
-        return read_export(path) or verify_file_without_session(path)
+        return verify_export(path) or verify_lone_sealed_file(path)
     if not path.exists():
         raise FileFormatError("no such file or folder", where=str(path))
     if (path / "sessions").is_dir() or (path / "journal").is_dir():
@@ -156,7 +160,7 @@ def verify_data_folder(path: Path) -> DataFolderReport:
                 )
                 session.problems.append(f"{place}/{stray.name}: {stray.error.what}")
                 report.sessions.append(session)
-    others = verify_other_files(data, proven)
+    others = verify_json_and_server_id(data, proven)
     report.problems += others.problems
     report.set_aside = others.set_aside
     return report

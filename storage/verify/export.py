@@ -51,7 +51,7 @@ class ExportReport:
         }
 
 
-def read_export(path: Path) -> ExportReport | None:
+def verify_export(path: Path) -> ExportReport | None:
     """Recognise an export; read Parquet and Arrow to their end, and both ends of CSV.
 
     Returns:

@@ -69,7 +69,7 @@ class StreamReport:
         )
 
     @property
-    def missing(self) -> Intervals:
+    def absent_not_lost(self) -> Intervals:
         """Numbers up to the stream's end that are neither stored nor lost.
 
         They were deleted when no session needed them any more, or are still to come.
@@ -92,7 +92,7 @@ class StreamReport:
             "frames": self.stored.count,
             "held": list(self.stored),
             "lost": {reason: numbers.count for reason, numbers in lost if numbers},
-            "missing": self.missing.count,
+            "missing": self.absent_not_lost.count,
             "unsynced": self.unsynced.count,
             "next_seq": self.notes.next_seq if self.notes is not None else None,
             "max_lost_tail_frames": self.notes.max_lost_tail_frames

@@ -30,7 +30,7 @@ class OtherFilesReport:
     set_aside: list[str] = field(default_factory=list)
 
 
-def verify_other_files(data_folder: Path, verified_folders: set[Path]) -> OtherFilesReport:
+def verify_json_and_server_id(data_folder: Path, verified_folders: set[Path]) -> OtherFilesReport:
     """Verify `server_id` and every JSON file of a data folder, except in folders done elsewhere.
 
     Token, locks and other files have no checksum.
@@ -57,7 +57,7 @@ def verify_other_files(data_folder: Path, verified_folders: set[Path]) -> OtherF
             elif path == data_folder / SERVER_ID_NAME:
                 _verify_with(path, name, read_server_id, found)
             elif name.endswith(".json") and not name.startswith(".") and not is_verified:
-                verify_json_file(path, _relative_path(path, data_folder), found)
+                verify_checksummed_json(path, _relative_path(path, data_folder), found)
         # A folder that was set aside, or that has the name of a file, is skipped.
         folders[:] = [
             name for name in folders if ASIDE_SUFFIX not in name and not name.endswith(".json")
@@ -67,7 +67,7 @@ def verify_other_files(data_folder: Path, verified_folders: set[Path]) -> OtherF
     return found
 
 
-def verify_json_file(path: Path, name: str, report: OtherFilesReport) -> None:
+def verify_checksummed_json(path: Path, name: str, report: OtherFilesReport) -> None:
     """Verify one JSON file, and add any finding under `name`."""
     _verify_with(path, name, read_checksummed_json, report)
 

@@ -90,7 +90,7 @@ class SessionReport:
         }
 
 
-def verify_file_without_session(path: Path) -> SessionReport:
+def verify_lone_sealed_file(path: Path) -> SessionReport:
     """Verify a sealed file without `session.json` beside it.
 
     Raises:

@@ -22,7 +22,7 @@ def denoised(
     look_ns: int,
     noise_left: Floats,
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Averages of `denoise.average_sample` for every value, (n, tiles); NaN where there is none.
+    """Averages of `denoise.denoise_sample` for every value, (n, tiles); NaN where there is none.
 
     Args:
         values: (n, tiles), NaN where there is none.
@@ -38,10 +38,10 @@ def denoised(
     out = np.full((4, n, tiles), math.nan)
     columns, scratch, rows = (values, sigmas, t_ns, run), denoise.allocate_scratch(), (0, 0)
     for i in range(n):
-        rows = denoise.find_window_limits(frame_t_ns, i, 0, n, rows, look_ns)
+        rows = denoise.find_window_rows(frame_t_ns, i, 0, n, rows, look_ns)
         for j in range(tiles):
             if not math.isnan(values[i, j]):
-                found, _ = denoise.average_sample(
+                found, _ = denoise.denoise_sample(
                     columns, i, j, at_ns[i, j], rows, noise_left[j], denoise.ALL_ROWS, scratch
                 )
                 for part in range(4):

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 from devices.frames import FrameBatch
 from storage.clock.bounds import OffsetRows
 from storage.clock.table import ClockTable, StreamClockFacts
-from storage.formats.export import make_frame_source
+from storage.formats.export import make_one_pass_frame_source
 from storage.formats.markers import LABEL_SEPARATOR, PLACEMENT_COLUMNS, PlacedMarkers, place_markers
 from storage.formats.slice import Slice
 from storage.schema import Array
@@ -110,7 +110,9 @@ def _written(to: str, frames: FrameBatch, extra: dict[str, Array], marks: Placed
         )
         for a in (0, half)
     ]
-    return b"".join(export(make_frame_source(pieces), make_array(), {}, to, Slice(), None, marks))
+    return b"".join(
+        export(make_one_pass_frame_source(pieces), make_array(), {}, to, Slice(), None, marks)
+    )
 
 
 def _wrong(written: dict[str, bytes], marks: PlacedMarkers, frames: FrameBatch) -> str | None:

@@ -346,7 +346,7 @@ async def assign_calibration(
     calibration = await run_in_threadpool(server.calibrations.load, body.id)
     _check_calibration_in_use(the_node, if_match)
     check_fits(the_node, calibration)
-    the_node.estimator.assign_calibration(calibration, server_utc_ns())
+    the_node.estimator.store_and_apply_calibration(calibration, server_utc_ns())
     server.notify_node_changed(the_node)
     return NodeCalibrationView.from_node(the_node)
 
@@ -368,7 +368,7 @@ async def unassign_calibration(
     the_node = server.nodes.get(node)
     _check_calibration_in_use(the_node, if_match)
     if the_node.estimator.calibration_source == "server":
-        the_node.estimator.assign_calibration(None, server_utc_ns())
+        the_node.estimator.store_and_apply_calibration(None, server_utc_ns())
         server.notify_node_changed(the_node)
     return NodeCalibrationView.from_node(the_node)
 
@@ -399,7 +399,9 @@ def check_fits(node: ServerNode, calibration: Calibration) -> None:
         UsageError: a tile is not in it, has another chip, or a model lacks parameters.
     """
     try:
-        EstimateStream(node.info, EstimateOptions(calibration, node.info.models, LIVE_LAG_MS))
+        EstimateStream(
+            node.last_info, EstimateOptions(calibration, node.last_info.models, LIVE_LAG_MS)
+        )
     except FootTileError as error:
         raise UsageError(
             f"calibration {calibration.name} does not fit node {node.name!r}: {error}"

@@ -108,7 +108,7 @@ InForce = Annotated[
 
 
 def _check_tare_in_force(node: ServerNode, if_match: str | None) -> None:
-    recorded = node.estimator.tare_history.tare_in_force(node.info)
+    recorded = node.estimator.tare_history.tare_in_force(node.last_info)
     in_force = "none" if recorded is None else recorded.id
     check_revision(parse_if_match(if_match), in_force, f"the tare of {node.name!r}")
 
@@ -148,7 +148,9 @@ async def get_history(
     came since the server was started; where frames are missing, numbers are missing.
     """
     the_node = server.nodes.get(node)
-    rows = server.broadcaster.force_history(the_node).get_spans(query.seconds, query.before_seq)
+    rows = server.broadcaster.get_present_force_history(the_node).get_newest_spans(
+        query.seconds, query.before_seq
+    )
     age_ms = server.broadcaster.newest_frame_age_ms(the_node)
     numbers = {name: rows[name].tolist() for name in ("seq_first", "seq", "n", "t_ns")}
     forces = {
@@ -168,8 +170,8 @@ async def get_history(
 def _make_tiles_view(
     node: ServerNode, query: RecentQuery, unit: str, server: Server
 ) -> RecentTilesView:
-    recent = server.broadcaster.tile_history(node)
-    rows, *extremes = recent.get_spans(query.seconds, unit, query.before_seq)
+    recent = server.broadcaster.get_present_tile_history(node)
+    rows, *extremes = recent.get_newest_spans(query.seconds, unit, query.before_seq)
     least, greatest = ([_round_four_digits(row) for row in values.tolist()] for values in extremes)
     numbers = {name: rows[name].tolist() for name in ("seq_first", "seq", "n", "t_ns")}
     return RecentTilesView(min=least, max=greatest, **numbers)
@@ -217,7 +219,7 @@ async def tare_node(
 async def list_tares(node: str, server: ServerState) -> TaresPage:
     """Return the tares, newest first; the first valid one of the present tiles is in force."""
     the_node = server.nodes.get(node)
-    items = [TareView.from_recorded(t) for t in reversed(the_node.estimator.tare_history.tares)]
+    items = [TareView.from_recorded(t) for t in reversed(the_node.estimator.tare_history.all_tares)]
     return TaresPage(items=items, drift=DriftView.from_node(the_node))
 
 

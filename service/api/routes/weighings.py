@@ -13,7 +13,7 @@ from devices.errors import UsageError
 from service.api.routes.calibrations import Line, check_fits
 from service.api.routes.common import FULL, ServerState, parse_if_match, problem_responses
 from service.estimation.calibration import Calibration, TileCalibration
-from service.estimation.dead_weights import TOLERANCE_PERCENT, make_weight_labels
+from service.estimation.dead_weights import TOLERANCE_PERCENT, check_and_label_weights
 from service.private_paths import PublicText
 from service.server.broadcast.views import View
 from service.server.node import ServerNode
@@ -74,7 +74,7 @@ class StartWeighing(BaseModel):
         reference = self.reference or _REFERENCES[self.method]
         return WeighingPlan(
             tiles=self.tiles,
-            weights=make_weight_labels(self.weights, self.within_percent),
+            weights=check_and_label_weights(self.weights, self.within_percent),
             method=self.method,
             reference=reference,
             name=self.name or f"{', '.join(self.tiles)}, {reference}"[:200],
@@ -137,7 +137,8 @@ class TileResultView(View):
             serial=tile.serial,
             weights=[
                 WeightResultView(
-                    **step.model_dump(), half_width_n=facts.interpolate_half_width_n(step.gauge_kpa)
+                    **step.model_dump(),
+                    half_width_n=facts.interpolate_half_width_95_n(step.gauge_kpa),
                 )
                 for step in steps
                 if facts is not None
@@ -169,7 +170,7 @@ class WeighingResultView(View):
     def of(cls, calibration: Calibration, node: ServerNode) -> WeighingResultView:
         """Return the result of a calibration for the tiles of a node."""
         misfit = None
-        bearing = [tile.serial for tile in node.info.tiles if not tile.reference]
+        bearing = [tile.serial for tile in node.last_info.tiles if not tile.reference]
         if lacking := [serial for serial in bearing if calibration.find_tile(serial) is None]:
             misfit = f"It has no curve of {', '.join(lacking)}: calibrate all tiles in one go"
         else:
@@ -218,7 +219,7 @@ class WeighingView(View):
     @classmethod
     def of(cls, weighing: NodeWeighing, node: ServerNode) -> WeighingView:
         """Make the view of a weighing in its present state."""
-        now, plan, found = weighing.now, weighing.plan, weighing.calibration
+        now, plan, found = weighing.present_pass, weighing.plan, weighing.calibration
         rest_kpa = now.rest_kpa if isfinite(now.rest_kpa) else None
         recent_kpa = [round(kpa, 3) for kpa in now.recent_kpa]
         seen = now.repeatability
@@ -297,7 +298,7 @@ async def start(node: str, body: StartWeighing, server: ServerState) -> Weighing
     disconnects or no step is completed for ten minutes.
     """
     the_node = server.nodes.get(node)
-    return WeighingView.of(server.weighings.start(the_node, body.plan()), the_node)
+    return WeighingView.of(server.weighings.start_with_recording(the_node, body.plan()), the_node)
 
 
 @router.post(
@@ -309,7 +310,9 @@ async def start(node: str, body: StartWeighing, server: ServerState) -> Weighing
 async def repeat(node: str, server: ServerState, if_match: ThisOne = None) -> WeighingView:
     """Go back to the weight that is held, or else to the last one on this tile."""
     the_node = server.nodes.get(node)
-    return WeighingView.of(server.weighings.repeat(the_node, parse_if_match(if_match)), the_node)
+    return WeighingView.of(
+        server.weighings.repeat_last_weight(the_node, parse_if_match(if_match)), the_node
+    )
 
 
 @router.delete(
@@ -322,4 +325,4 @@ async def repeat(node: str, server: ServerState, if_match: ThisOne = None) -> We
 )
 async def end(node: str, server: ServerState, if_match: ThisOne = None) -> None:
     """Cancel a running calibration without a fit, or close an ended one; its recording stays."""
-    await server.weighings.end(node, parse_if_match(if_match))
+    await server.weighings.cancel_or_remove_weighing(node, parse_if_match(if_match))

@@ -50,11 +50,11 @@ def calibrate_live(
     """
     import foottile
     from service.cli.calibration_report import calibration_to_json, make_calibration_tables
-    from service.estimation.dead_weights import make_weight_labels
+    from service.estimation.dead_weights import check_and_label_weights
     from service.sessions.calibration_file import parse_calibration
     from storage.durable_files import write_atomically
 
-    weights = make_weight_labels(request.weights.split(","), request.within_percent)
+    weights = check_and_label_weights(request.weights.split(","), request.within_percent)
     with foottile.connect(server, ca=ca) as source:
         node = _select_node(source, request.node)
         _check_assignable(node, request)

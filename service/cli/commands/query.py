@@ -77,10 +77,10 @@ def query_command(
     elif as_json:
         print_json({"rows": _to_rows(table), "left_out": archive.left_out_reasons})
     elif as_csv:
-        from storage.formats.writers.csv_text import write_csv_table
+        from storage.formats.writers.csv_text import write_spreadsheet_safe_csv
 
         with _explain_unwritable("the answer"):
-            write_csv_table(sys.stdout.buffer, table)
+            write_spreadsheet_safe_csv(sys.stdout.buffer, table)
     else:
         _print_table(table)
     for place, reason in archive.left_out_reasons.items():

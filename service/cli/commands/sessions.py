@@ -175,7 +175,7 @@ def pull_command(
         if session is None:
             pulled = pull_take_export(source, str(take), out, part, writer, options)
         elif (
-            part.is_whole_session
+            part.is_unrestricted
             and writer is PARQUET
             and not options.specified_names
             and clock_name == "node"

@@ -64,7 +64,7 @@ def simulate_command(
     slow for the scene's frame rate.
     """
     # Imported here: the physics imports numba, which would slow down `--help`.
-    from service.estimation.pipeline.model_set import validate_model_names
+    from service.estimation.pipeline.model_set import check_model_selection
     from service.offline.calibration_lookup import find_calibration, replace_tiles
     from service.offline.simulation import SimulationOptions, run_simulation
     from service.rig.plate_files import make_injected_path
@@ -85,7 +85,7 @@ def simulate_command(
     )
     has_estimates = not no_estimates and the_scene.calibration != "none"
     if has_estimates:
-        validate_model_names(the_scene.models)
+        check_model_selection(the_scene.models)
 
     def estimate() -> EstimateOptions:
         calibration = find_calibration(

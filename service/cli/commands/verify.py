@@ -204,5 +204,5 @@ def _format_stream(report: StreamReport) -> str:
         f"journal {report.node}/{report.stream_id}: {report.stored.count} frames in "
         f"{report.segment_count} segments"
         + (f", {lost} lost" if lost else "")
-        + (f", {report.missing.count} not here" if report.missing else "")
+        + (f", {report.absent_not_lost.count} not here" if report.absent_not_lost else "")
     )

@@ -62,7 +62,7 @@ def initial_state(tiles: int) -> RecordArray[BaselineLossState]:
 
 
 @jit_cached
-def update_baseline_error(
+def update_baseline_error_bound_kpa(
     state: BaselineLossState,
     asymmetry: float,
     gauge_kpa: float,
@@ -70,7 +70,7 @@ def update_baseline_error(
     thermal_drift_kpa: float,
     t_ns: int,
 ) -> float:
-    """Return the bound of the baseline's error since the tare, in kPa; 0: no evidence of any.
+    """Update the state; return the bound of the baseline's error in kPa, 0 without evidence.
 
     Args:
         state: after the tile's readings before; updated.

@@ -22,7 +22,7 @@ import math
 import numpy as np
 
 from devices.jit import jit_cached
-from service.estimation.records import Record, Records, record_type, records
+from service.estimation.records import Record, Records, make_record_dtype, make_records
 
 ENOUGH = 11.0
 """Evidence of a clip, natural logarithm: after a healthy loading with a flat top the chance of as
@@ -72,7 +72,7 @@ FOLLOW = 0.5
 SMOOTH = 8.0
 """Readings over which the first loading's highest level is averaged."""
 
-STATE = record_type(
+STATE = make_record_dtype(
     [
         ("inside", np.int64),  # is it loaded?
         ("turning", np.int64),  # readings in a row that say otherwise
@@ -104,32 +104,32 @@ STATE = record_type(
 """State of one tile's detector."""
 
 
-def at_rest(tiles: int) -> Records:
-    """Return the state before the first reading."""
-    return records(STATE, tiles, most_kpa=np.inf, edge_kpa=np.nan, end_kpa=np.inf)
+def initial_clipping_state(tiles: int) -> Records:
+    """Make the detectors' states before the first reading, (tiles,)."""
+    return make_records(STATE, tiles, most_kpa=np.inf, edge_kpa=np.nan, end_kpa=np.inf)
 
 
 @jit_cached
-def end_of_range(
+def update_clipping_limit_kpa(
     tile: Record,
     kpa: float,
     t_ns: int,
     baseline_kpa: float,
-    unloaded_kpa: float,
+    unloaded_band_kpa: float,
     noise_kpa: float,
-    noise_left: float,
+    variance_inflation: float,
     others_kpa: float,
 ) -> float:
-    """Return the pressure from which on a reading may be clipped; infinite where nothing shows it.
+    """Update the state; return the pressure from which readings may be clipped, or infinity.
 
     Args:
         tile: state from its readings before; becomes that after this one.
         kpa: absolute pressure; NaN without a reading.
         t_ns: its instant.
         baseline_kpa: absolute, unloaded.
-        unloaded_kpa: distance from the baseline within which no load is seen.
+        unloaded_band_kpa: distance from the baseline within which no load is seen.
         noise_kpa: standard deviation of a reading.
-        noise_left: variance of a mean of many readings, relative to that of white noise.
+        variance_inflation: variance of a mean of many readings, relative to that of white noise.
         others_kpa: sum of the other tiles' pressures above their baselines; NaN if one is missing:
             the last known sum is used.
     """
@@ -137,9 +137,9 @@ def end_of_range(
     if not math.isnan(above):
         if math.isnan(others_kpa):
             others_kpa = tile.others_kpa
-        is_unloaded = above < unloaded_kpa
+        is_unloaded = above < unloaded_band_kpa
         # A single outlier does not part a loading in two.
-        turns = is_unloaded if tile.inside == 1 else above > 2.0 * unloaded_kpa
+        turns = is_unloaded if tile.inside == 1 else above > 2.0 * unloaded_band_kpa
         tile.turning = tile.turning + 1 if turns else 0
         felt_kpa = min(above, tile.most_kpa)
         if tile.inside == 0 and is_unloaded:
@@ -152,7 +152,7 @@ def end_of_range(
         if tile.turning == 2:
             tile.inside, tile.turning = 1 - tile.inside, 0
             if tile.inside == 0:
-                _end_of_loading(tile, baseline_kpa, noise_kpa, math.sqrt(noise_left))
+                _end_of_loading(tile, baseline_kpa, noise_kpa, math.sqrt(variance_inflation))
                 _begin(tile, kpa)
     end_kpa: float = tile.end_kpa
     return end_kpa

@@ -31,7 +31,7 @@ class FaultLimits:
         stuck_check_max_kpa: absolute pressure above which a healthy chip may stand still.
         unloaded_band_kpa: distance from the baseline within which a tile counts as unloaded.
         stuck: limits of equal counts in a row.
-        asymmetry: asymmetry for `baseline_loss.update_baseline_error`.
+        asymmetry: asymmetry for `baseline_loss.update_baseline_error_bound_kpa`.
         thermal_kpa_per_count: shift of the baseline for a raw temperature count; None if a model
             corrects it.
     """

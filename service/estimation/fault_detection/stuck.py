@@ -80,8 +80,8 @@ def initial_state(tiles: int) -> RecordArray[StuckState]:
     return StuckState.array(tiles, pressure_raw=-1)
 
 
-def compute_run_limits(rate_hz: float, tiles: int) -> tuple[Ints, Ints]:
-    """Compute the limits of equal counts in a row.
+def _compute_run_limit_tables(rate_hz: float, tiles: int) -> tuple[Ints, Ints]:
+    """Compute tables of the limits of equal counts in a row, by the shares of steps 0 and 2.
 
     Neighbours whose difference has the standard deviation d, in counts, are equal or two counts
     apart with chances that are solved for d. Noise of d / sqrt(2) then repeats with erf(1 / 2d) at
@@ -103,8 +103,8 @@ def _compute_repeat_chances() -> tuple[Floats, Floats]:
     """Compute the largest chance of a repeat, by either share (see `StuckLimits`)."""
     shares = np.arange(SHARE_STEPS + 1) / SHARE_STEPS
     steps = np.geomspace(_STEP_MAX, _STEP_MIN, 2000)
-    by_repeats = np.interp(shares, compute_share_apart(steps, 0), steps)
-    twos = compute_share_apart(steps, 2)
+    by_repeats = np.interp(shares, compute_step_share(steps, 0), steps)
+    twos = compute_step_share(steps, 2)
     rising = slice(int(np.argmax(twos)), None)  # with much noise they are few again
     by_twos = np.interp(shares, twos[rising][::-1], steps[rising][::-1])
     by_twos[0] = _STEP_MIN
@@ -112,22 +112,22 @@ def _compute_repeat_chances() -> tuple[Floats, Floats]:
     return at_most[0], at_most[1]
 
 
-def compute_share_apart(step_sigma_counts: Floats, counts: int) -> Floats:
-    """Compute the share of neighbours `counts` apart by the standard deviation of their difference.
+def compute_step_share(step_sigma_counts: Floats, step_counts: int) -> Floats:
+    """Compute the share of steps of `step_counts` from the unrounded steps' standard deviation.
 
     Rounding makes a difference of d counts one of n with the chance 1 - |d - n|.
     """
-    ends = (counts + np.array([[-1.0], [0.0], [1.0]])) / step_sigma_counts
+    ends = (step_counts + np.array([[-1.0], [0.0], [1.0]])) / step_sigma_counts
     below = 0.5 * (1.0 + np.array([[math.erf(e / math.sqrt(2.0)) for e in row] for row in ends]))
     density = np.exp(-0.5 * ends**2) / math.sqrt(2.0 * math.pi)
     low, high = np.diff(below, axis=0)
     mean_low, mean_high = -np.diff(density, axis=0) * step_sigma_counts
-    one_side = (1 - counts) * low + mean_low + (1 + counts) * high - mean_high
-    return np.asarray(one_side if counts == 0 else 2.0 * one_side)
+    one_side = (1 - step_counts) * low + mean_low + (1 + step_counts) * high - mean_high
+    return np.asarray(one_side if step_counts == 0 else 2.0 * one_side)
 
 
-def compute_step_sigma(noise_counts: Floats, correlation: float) -> Floats:
-    """Compute the standard deviation of steps from noise and neighbours' correlation."""
+def _compute_unrounded_step_sigma_counts(noise_counts: Floats, correlation: float) -> Floats:
+    """Compute the standard deviation of unrounded steps without outliers, from the noise."""
     # Rounding adds noise, but no change of the count.
     latent = np.sqrt(np.maximum(noise_counts**2 - 1.0 / 12.0, 0.0))
     return np.maximum(
@@ -165,14 +165,16 @@ class StuckLimits:
 
 def make_stuck_limits(noise_counts: Floats, rate_hz: float) -> StuckLimits:
     """Compute the limits from the noise at the tare, in counts with outliers and rounding."""
-    by_equal, by_double_step = compute_run_limits(rate_hz, len(noise_counts))
-    supposed = compute_step_sigma(noise_counts, math.exp(-1.0 / (rate_hz * PRIOR_CORRELATION_S)))
+    by_equal, by_double_step = _compute_run_limit_tables(rate_hz, len(noise_counts))
+    supposed = _compute_unrounded_step_sigma_counts(
+        noise_counts, math.exp(-1.0 / (rate_hz * PRIOR_CORRELATION_S))
+    )
     white = np.ceil(
-        compute_share_apart(compute_step_sigma(noise_counts, 0.0), 0) * SHARE_STEPS
+        compute_step_share(_compute_unrounded_step_sigma_counts(noise_counts, 0.0), 0) * SHARE_STEPS
     ).astype(np.int64)
     return StuckLimits(
-        equal_share=compute_share_apart(supposed, 0),
-        double_step_share=compute_share_apart(supposed, 2),
+        equal_share=compute_step_share(supposed, 0),
+        double_step_share=compute_step_share(supposed, 2),
         run_max=by_equal[np.minimum(white, SHARE_STEPS)],
         run_max_by_equal=by_equal,
         run_max_by_double_step=by_double_step,
@@ -180,7 +182,7 @@ def make_stuck_limits(noise_counts: Floats, rate_hz: float) -> StuckLimits:
 
 
 @jit_cached
-def update_stuck(
+def update_stuck_and_toggles(
     limits: RunLimits,
     params: StuckParams,
     state: StuckState,
@@ -190,7 +192,7 @@ def update_stuck(
     load_toggles: int,
     tiles: int,
 ) -> tuple[bool, int]:
-    """Return whether a reading is a repeat that noise does not explain, and the new toggle count.
+    """Update the state; return whether noise does not explain a repeat, and the new toggle count.
 
     Args:
         limits: of the array.

@@ -39,7 +39,7 @@ def update_thermal_drift_kpa(
     kpa_per_count: float,
     t_ns: int,
 ) -> float:
-    """Return the signed shift of the baseline by warmth since the tare; 0 where unknown.
+    """Update the state; return the baseline's signed drift by warmth in kPa, 0 where unknown.
 
     Args:
         state: after the tile's readings before; updated.

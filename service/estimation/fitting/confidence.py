@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from devices.arrays import Bools, Floats
-from service.estimation.calibration import CUBIC_TERMS, TileCalibration, compute_loop_share
+from service.estimation.calibration import CUBIC_TERMS, TileCalibration, compute_relative_loop_width
 
 _UPPER_95 = 0.975
 
@@ -33,13 +33,13 @@ def compute_fit_covariance(jacobian: Any, prior_sigma: Floats) -> Floats:
     )
 
 
-def compute_bound_excess(
+def compute_step_beyond_bound(
     jacobian: Any, residual: Floats, prior_sigma: Floats, at_bound: Bools
 ) -> Floats:
-    """Compute the step beyond their bounds of the parameters at a bound, to first order.
+    """Compute how far parameters at a bound would step beyond it, to first order; 0 for the others.
 
     A better fit beyond a bound shows an error of the model, and adds to the uncertainty. At most
-    `known`; zero for the other parameters.
+    `prior_sigma`; zero for the other parameters.
     """
     if not at_bound.any():
         return np.zeros(len(prior_sigma))
@@ -60,18 +60,18 @@ def compute_student_t_95(repeats: int) -> float:
 
 
 def compute_curve_n(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
-    """Compute the force of the cubic at gauge pressures (m,), zero at zero pressure."""
+    """Compute the cubic's force at gauge pressures (m,), zero at zero for any `zero_mode`."""
     coefficients = np.array(tile.coefficients[1:]) * tile.f_scale_n
     return np.asarray(_compute_tile_basis(tile, gauge_kpa) @ coefficients)
 
 
-def compute_mean_band_n(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
+def compute_mean_half_width_95_n(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
     """Compute the half width of the mean curve's 95 % band, from the covariance over repeats."""
     return compute_student_t_95(tile.repeats) * np.sqrt(_compute_mean_variance(tile, gauge_kpa))
 
 
-def compute_new_loading_band_n(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
-    """Compute the half width of the 95 % band of a reading in a new loading.
+def compute_new_loading_half_width_95_n(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
+    """Compute the half width of the 95 % interval of a reading in a new loading, in N.
 
     It consists of the mean's uncertainty, the gain of a new loading, and its hysteresis loop.
     """
@@ -79,7 +79,7 @@ def compute_new_loading_band_n(tile: TileCalibration, gauge_kpa: Floats) -> Floa
     variance = (
         _compute_mean_variance(tile, gauge_kpa)
         + (tile.relative_misfit * force_n) ** 2
-        + (tile.loop_misfit_n * compute_loop_share(force_n)) ** 2
+        + (tile.loop_misfit_n * compute_relative_loop_width(force_n)) ** 2
     )
     return compute_student_t_95(tile.repeats) * np.sqrt(variance)
 
@@ -91,10 +91,12 @@ def _compute_mean_variance(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
 
 
 def _compute_tile_basis(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
-    return compute_cubic_basis(gauge_kpa, tile.p_offset_kpa, tile.p_scale_kpa)
+    return compute_cubic_basis_through_zero(gauge_kpa, tile.p_offset_kpa, tile.p_scale_kpa)
 
 
-def compute_cubic_basis(gauge_kpa: Floats, offset_kpa: float, scale_kpa: float) -> Floats:
+def compute_cubic_basis_through_zero(
+    gauge_kpa: Floats, offset_kpa: float, scale_kpa: float
+) -> Floats:
     """Compute the basis u^k - u0^k of a cubic, (m, 3), zero at zero pressure by construction."""
     u = (gauge_kpa - offset_kpa) / scale_kpa
     u0 = -offset_kpa / scale_kpa

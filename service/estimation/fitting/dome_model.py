@@ -48,7 +48,8 @@ class DomeModel:
         flow_n: force on it during a slow stroke.
         flow_power: exponent of its flow over that force.
         late_s: delay of the tile's samples behind their instants. Forces passed to
-            `compute_pressures` have to be those at the delayed instants, from `interpolate_force`.
+            `compute_pressures_and_force_lag` have to be those at the delayed instants, from
+            `make_clamped_pchip_force`.
     """
 
     curve: Floats
@@ -65,9 +66,9 @@ class DomeModel:
     flow_power: float = 4.0
     late_s: float = 0.0
 
-    def compute_pressures(self, t_s: Floats, force_n: Floats) -> Floats:
-        """Compute pressures with these parameters; see the function `compute_pressures`."""
-        return compute_pressures(
+    def compute_pressures_and_force_lag(self, t_s: Floats, force_n: Floats) -> Floats:
+        """Compute absolute pressures and force lag, (n, 3), as the function of this name."""
+        return compute_pressures_and_force_lag(
             t_s,
             force_n,
             self.curve,
@@ -86,8 +87,8 @@ class DomeModel:
         )
 
 
-def interpolate_force(t_s: Floats, force_n: Floats) -> Callable[[Floats], Floats]:
-    """Make a smooth, monotone interpolator of a reference's readings, constant beyond them.
+def make_clamped_pchip_force(t_s: Floats, force_n: Floats) -> Callable[[Floats], Floats]:
+    """Make a PCHIP interpolator of a reference's readings, constant beyond them.
 
     Along straight lines a fit of the delay would stop at every reading, where they have a corner.
     """
@@ -133,7 +134,7 @@ def _solve_heated_pressure(
 
 
 @jit_cached
-def compute_pressures(
+def compute_pressures_and_force_lag(
     t_s: Floats,
     force_n: Floats,
     curve: Floats,
@@ -141,16 +142,16 @@ def compute_pressures(
     baseline_kpa: float,
     gamma: float,
     tau_s: float,
-    wall: float,
-    part: Floats,
+    wall_per_kpa: float,
+    creep_fraction: Floats,
     creep_s: Floats,
-    loop: Floats,
-    widths: Floats,
+    play_weights: Floats,
+    play_widths_n: Floats,
     flow_part: float,
     flow_n: float,
     flow_power: float,
 ) -> Floats:
-    """Compute the pressures of one tile under forces that are linear between instants.
+    """Compute a tile's pressures and force lag under forces that are linear between instants.
 
     Args:
         t_s: (n,) instants.
@@ -160,11 +161,11 @@ def compute_pressures(
         baseline_kpa: pressure unloaded.
         gamma: ratio of heat capacities.
         tau_s: the gas' time constant.
-        wall: compliance of the wall.
-        part: fractions of the creep.
+        wall_per_kpa: compliance of the wall.
+        creep_fraction: fractions of the creep.
         creep_s: its time constants.
-        loop: weights of the plays.
-        widths: their half widths.
+        play_weights: weights of the plays.
+        play_widths_n: their half widths.
         flow_part: fraction of the viscous branch.
         flow_n: force on it during a slow stroke.
         flow_power: exponent of its flow.
@@ -174,8 +175,8 @@ def compute_pressures(
     """
     n = len(t_s)
     out = np.empty((n, 3))
-    crept = np.zeros(len(part))
-    plays = np.zeros(len(loop))
+    crept = np.zeros(len(creep_fraction))
+    plays = np.zeros(len(play_weights))
     c1, c2, c3 = curve[0], curve[1], curve[2]
     flattest = _FLATTEST * c1
     k = (gamma - 1.0) / gamma
@@ -185,14 +186,14 @@ def compute_pressures(
     for i in range(n):
         dt = t_s[i] - time
         apparent = force_n[i]
-        for m in range(len(part)):
+        for m in range(len(creep_fraction)):
             decay, of_before, of_now = compute_creep_weights(dt / creep_s[m])
             crept[m] = decay * crept[m] + of_before * force + of_now * force_n[i]
-            apparent -= part[m] * (force_n[i] - crept[m])
+            apparent -= creep_fraction[m] * (force_n[i] - crept[m])
         lag = 0.0
-        for m in range(len(loop)):
-            plays[m] = step_play(apparent, widths[m], plays[m])
-            lag += loop[m] * (plays[m] - apparent)
+        for m in range(len(play_weights)):
+            plays[m] = step_play(apparent, play_widths_n[m], plays[m])
+            lag += play_weights[m] * (plays[m] - apparent)
         apparent += lag
         if flow_part > 0.0:
             stress = step_branch_stress(
@@ -212,7 +213,7 @@ def compute_pressures(
         p = static * warm
         if gamma > 1.0:
             p, warm = _solve_heated_pressure(
-                static, baseline_kpa, ln_p, warm, dt / (gamma * tau_s), k, wall
+                static, baseline_kpa, ln_p, warm, dt / (gamma * tau_s), k, wall_per_kpa
             )
         out[i, 0], out[i, 1], out[i, 2] = p, static, force_n[i] - apparent
         ln_p, force, time = math.log(p), force_n[i], t_s[i]

@@ -55,7 +55,7 @@ def fit_significant_effects(
         initial_curve: start values of c1, c2, c3 of the curve over gauge / `scale_kpa`.
         temperature_effect: effect of the thermal soak, whose wall compliance is used; or the reason
             for none.
-        reference_delay: of the reference; `residual_lag_s` of the answer contains it.
+        reference_delay: of the reference; `late_s` of the answer contains it.
     """
     refused: dict[EffectName, str] = {}
     temperature = None
@@ -63,7 +63,7 @@ def fit_significant_effects(
         refused["temperature"] = refused["ambient"] = temperature_effect
     else:
         temperature = temperature_effect
-    wall_per_kpa = Effects(temperature=temperature).wall_per_kpa
+    wall_per_kpa = Effects(temperature=temperature).wall_compliance_per_kpa
     static = DomeModel(initial_curve, scale_kpa, baseline_kpa, wall_per_kpa)
     problem = OutputErrorProblem(points, static)
     parts = FittedEffects(
@@ -82,7 +82,7 @@ def fit_significant_effects(
         if name != "flow":
             refused[name] = why
     if parts.terms:
-        fit = select_creep_terms(problem, parts, fit)
+        fit = _select_creep_terms(problem, parts, fit)
     misfits, model, sigma = problem.compute_misfits(fit), fit.model, fit.sigma
     gas = rubber = hysteresis = None
     if "gamma" in sigma:
@@ -122,7 +122,7 @@ def fit_significant_effects(
     )
 
 
-def select_creep_terms(
+def _select_creep_terms(
     problem: OutputErrorProblem, parts: FittedEffects, full_fit: DomeFit
 ) -> DomeFit:
     """Return the fit with the number of creep terms that best predicts a left-out loading.
@@ -209,7 +209,7 @@ def _measure_effect(problem: OutputErrorProblem, fit: DomeFit, name: _Effect) ->
     if name == "gas" and "gamma" in sigma:
         words = f"gamma {model.gamma:.3f} +- {sigma['gamma']:.3f}"
         return _EffectSize(
-            words, (model.gamma - 1.0) / sigma["gamma"], problem.compute_max_heat_force_n(fit)
+            words, (model.gamma - 1.0) / sigma["gamma"], problem.compute_max_heat_effect_n(fit)
         )
     return None
 
@@ -220,7 +220,7 @@ _WITHOUT: Mapping[_Effect, Mapping[str, Any]] = {
     "rubber": {"terms": 0},
     "gas": {"gas": False},
 }
-"""Changes of `Parts` that omit an effect."""
+"""Changes of `FittedEffects` that omit an effect."""
 
 
 def _make_parameters(values: Iterable[float], sigmas: Floats) -> tuple[Parameter, ...]:

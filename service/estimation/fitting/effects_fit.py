@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from devices.arrays import Bools, Floats, Ints
-from service.estimation.calibration import TileCalibration, is_monotonic
+from service.estimation.calibration import TileCalibration, is_increasing_cubic
 from service.estimation.effects import (
     MISFIT_MIN,
     Effects,
@@ -18,13 +18,13 @@ from service.estimation.effects import (
     TemperatureEffect,
     parameter_values,
 )
-from service.estimation.fitting.dome_model import DomeModel, interpolate_force
+from service.estimation.fitting.dome_model import DomeModel, make_clamped_pchip_force
 from service.estimation.fitting.effect_selection import fit_significant_effects
 from service.estimation.fitting.rig.indentation import (
     Indentation,
     ThermalSoak,
     extract_soak,
-    measure_unloaded,
+    measure_initial_unloaded,
     select_loaded,
 )
 from service.estimation.fitting.rig.loading import (
@@ -49,12 +49,12 @@ def fit_effects(
     Args:
         recordings: of the tile in the rig, all of one chip.
         tile: its static curve, from the same recordings.
-        reference_delay: of the reference; `residual_lag_s` of the answer contains it (see
-            `resolved`).
+        reference_delay: of the reference; `late_s` of the answer contains it (see
+            `separate_delays`).
     """
-    points, baseline_kpa = collect_loadings(recordings)
+    points, baseline_kpa = collect_loadings_and_baseline_kpa(recordings)
     noise_kpa = float(
-        np.mean([measure_unloaded(each).noise_kpa for each in select_loaded(recordings)])
+        np.mean([measure_initial_unloaded(each).noise_kpa for each in select_loaded(recordings)])
     )
     soaked = _select_best_soak(
         [fit_temperature_effect(extract_soak(recording, noise_kpa)) for recording in recordings]
@@ -63,7 +63,7 @@ def fit_effects(
         points,
         scale_kpa=tile.range_kpa[1],
         baseline_kpa=baseline_kpa,
-        initial_curve=convert_curve_to_range(tile.coefficients),
+        initial_curve=convert_centred_cubic_to_unit(tile.coefficients),
         temperature_effect=soaked,
         reference_delay=reference_delay,
     )
@@ -71,7 +71,7 @@ def fit_effects(
     if not isinstance(soaked, TemperatureEffect):
         return effects
     # Recovery from the loads before a soak is no effect of temperature.
-    model = make_dome_model(effects, tile, baseline_kpa)
+    model = _make_dome_model(effects, tile, baseline_kpa)
     pressed = select_loaded(recordings)
     soaks = [_subtract_recovery(each, pressed, noise_kpa, model) for each in recordings]
     again = _select_best_soak([fit_temperature_effect(each) for each in soaks])
@@ -95,11 +95,14 @@ def _subtract_recovery(
     if not before:
         return soaking
     last = max(before, key=lambda i: ends_ns[i])
-    points = extract_loading_points(pressed[last], measure_unloaded(pressed[last]))
+    points = extract_loading_points(pressed[last], measure_initial_unloaded(pressed[last]))
     since_s = (soak_ns - ends_ns[last]) * 1e-9
     t_s = np.concatenate([points.t_s, points.t_s[-1] + since_s])
     force_n = np.concatenate([points.force_n, np.zeros(len(since_s))])
-    left_kpa = model.compute_pressures(t_s, force_n)[len(points.t_s) :, 0] - model.baseline_kpa
+    left_kpa = (
+        model.compute_pressures_and_force_lag(t_s, force_n)[len(points.t_s) :, 0]
+        - model.baseline_kpa
+    )
     return replace(soaking, kpa=soaking.kpa - left_kpa)
 
 
@@ -124,8 +127,8 @@ def _add_recovery_uncertainty(
     )
 
 
-def make_dome_model(effects: Effects, tile: TileCalibration, baseline_kpa: float) -> DomeModel:
-    """Make the forward model of a tile.
+def _make_dome_model(effects: Effects, tile: TileCalibration, baseline_kpa: float) -> DomeModel:
+    """Make the forward model of a tile, without its sample delay.
 
     Args:
         effects: with the curve in the tile's variable.
@@ -133,8 +136,10 @@ def make_dome_model(effects: Effects, tile: TileCalibration, baseline_kpa: float
         baseline_kpa: absolute pressure unloaded.
     """
     gas, rubber, loop = effects.gas, effects.rubber, effects.hysteresis
-    curve = convert_curve_to_range(tile.coefficients if rubber is None else rubber.coefficients)
-    model = DomeModel(curve, tile.range_kpa[1], baseline_kpa, effects.wall_per_kpa)
+    curve = convert_centred_cubic_to_unit(
+        tile.coefficients if rubber is None else rubber.coefficients
+    )
+    model = DomeModel(curve, tile.range_kpa[1], baseline_kpa, effects.wall_compliance_per_kpa)
     if gas is not None:
         model = replace(model, gamma=gas.gamma.value, tau_s=gas.tau_s.value)
     if rubber is not None:
@@ -156,7 +161,7 @@ def _center_curve(effects: Effects) -> Effects:
         return effects
     curve = _U_OF_X @ np.array(rubber.coefficients[1:])
     polynomial = (0.0, float(curve[0]), float(curve[1]), float(curve[2]))
-    if not is_monotonic(polynomial, (-1.0, 1.0)):
+    if not is_increasing_cubic(polynomial, (-1.0, 1.0)):
         reason = "the curve of settled forces is not monotonic"
         return effects.model_copy(
             update={"rubber": None, "refused": {**effects.refused, "rubber": reason}}
@@ -171,10 +176,12 @@ def _center_curve(effects: Effects) -> Effects:
     return effects.model_copy(update={"rubber": in_u})
 
 
-def collect_loadings(recordings: Sequence[Indentation]) -> tuple[LoadingPoints, float]:
-    """Return every loading of a tile above one common baseline in kPa, and that baseline."""
+def collect_loadings_and_baseline_kpa(
+    recordings: Sequence[Indentation],
+) -> tuple[LoadingPoints, float]:
+    """Collect every loading of a tile, shifted to one common baseline, and that baseline in kPa."""
     recordings = select_loaded(recordings)
-    zeros = [measure_unloaded(recording) for recording in recordings]
+    zeros = [measure_initial_unloaded(recording) for recording in recordings]
     baseline_kpa = float(np.mean([zero.baseline_kpa for zero in zeros]))
     parts = []
     for recording, zero in zip(recordings, zeros, strict=True):
@@ -183,8 +190,8 @@ def collect_loadings(recordings: Sequence[Indentation]) -> tuple[LoadingPoints, 
     return join_loading_points(parts), baseline_kpa
 
 
-def convert_curve_to_range(coefficients: Sequence[float]) -> Floats:
-    """Convert a curve in the centred variable to c1, c2, c3 over x = gauge / range."""
+def convert_centred_cubic_to_unit(coefficients: Sequence[float]) -> Floats:
+    """Convert a cubic in u = 2 x - 1 to c1, c2, c3 in x = gauge / range."""
     return np.asarray(np.linalg.solve(_U_OF_X, np.array(coefficients[1:])))
 
 
@@ -215,30 +222,31 @@ class ReplaySection:
     modelled_kpa: Floats
 
 
-def extract_replays(
+def replay_release_and_tap(
     recordings: Sequence[Indentation], tile: TileCalibration
 ) -> dict[str, ReplaySection]:
-    """Extract a "release" and a "tap" of the tile, if there are any, with their models.
+    """Replay a "release" and a "tap" of the tile with its models; empty without any.
 
     The second of several, because the dome has settled by then.
     """
     if not any(np.isin(recording.phase, ("release", "tap")).any() for recording in recordings):
         return {}
-    points, baseline_kpa = collect_loadings(recordings)
+    points, baseline_kpa = collect_loadings_and_baseline_kpa(recordings)
     effects = tile.effects
     # The mean curve of slow strokes contains creep and loop.
     static = DomeModel(
-        convert_curve_to_range(tile.coefficients),
+        convert_centred_cubic_to_unit(tile.coefficients),
         tile.range_kpa[1],
         baseline_kpa,
-        effects.wall_per_kpa,
+        effects.wall_compliance_per_kpa,
     )
-    model = make_dome_model(effects, tile, baseline_kpa)
+    model = _make_dome_model(effects, tile, baseline_kpa)
     late_s = effects.reference_late_s
     late_s += 0.0 if effects.late_s is None else effects.late_s.value
-    force_n = interpolate_force(points.t_s, points.force_n)(points.t_s + late_s)
+    force_n = make_clamped_pchip_force(points.t_s, points.force_n)(points.t_s + late_s)
     static_kpa, modelled_kpa = (
-        each.compute_pressures(points.t_s, force_n)[:, 0] - baseline_kpa for each in (static, model)
+        each.compute_pressures_and_force_lag(points.t_s, force_n)[:, 0] - baseline_kpa
+        for each in (static, model)
     )
     measured_kpa = points.kpa - baseline_kpa
     found: dict[str, ReplaySection] = {}

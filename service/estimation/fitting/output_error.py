@@ -14,8 +14,8 @@ import numpy as np
 from scipy.optimize import nnls
 
 from devices.arrays import Bools, Floats
-from service.estimation.fitting.confidence import compute_bound_excess, compute_fit_covariance
-from service.estimation.fitting.dome_model import DomeModel, interpolate_force
+from service.estimation.fitting.confidence import compute_fit_covariance, compute_step_beyond_bound
+from service.estimation.fitting.dome_model import DomeModel, make_clamped_pchip_force
 from service.estimation.fitting.least_squares import (
     COST_TOLERANCE,
     LeastSquaresResult,
@@ -46,7 +46,7 @@ class DomeFit:
         model: fitted parameters.
         gains: (loadings,), gain of each loading.
         scatter: standard deviation of the gains.
-        modelled: (m, 3), answer of `compute_pressures`.
+        modelled: (m, 3), answer of `compute_pressures_and_force_lag`.
         sigma: standard uncertainties by the name of the unknown: "late_s", "gamma", "ln_tau",
             "part", "ln_creep", "loop", "flow_part", "ln_flow_n", "flow_power", if fitted; and of
             sums over neighbouring terms, which are correlated: "part_sum", "loop_n".
@@ -98,7 +98,7 @@ class OutputErrorProblem:
         noise_kpa = 1.0 / np.where(self._usable, points.weight, 1.0)
         weight = 1.0 / np.hypot(noise_kpa, _MODEL * self._gauge_kpa)
         self._weight = np.where(self._usable, weight, 0.0)
-        between = interpolate_force(points.t_s, points.force_n)
+        between = make_clamped_pchip_force(points.t_s, points.force_n)
         # Depends on one unknown only, and interpolation costs as much as the smaller models.
         self._force_n = lru_cache(maxsize=2)(lambda late_s: between(points.t_s + late_s))
         self._told_s = compute_creep_range_s(points)
@@ -126,7 +126,7 @@ class OutputErrorProblem:
         for enough in (COST_TOLERANCE,) if known else (_ROUGHLY, COST_TOLERANCE):
 
             def residual(x: Floats, scatter: float = scatter) -> Floats:
-                off = self.compute_residual(self._make_model(x, at), scatter)
+                off = self.compute_pressure_and_gain_residuals(self._make_model(x, at), scatter)
                 return np.concatenate([off, (x - likely) / within])
 
             found = minimize_squares(residual, x, low, high, within, enough)
@@ -141,7 +141,7 @@ class OutputErrorProblem:
         covariance = compute_fit_covariance(jacobian, within)
         every = np.hypot(
             np.sqrt(np.maximum(np.diag(covariance), 0.0)),
-            compute_bound_excess(jacobian, off, within, found.at_bound),
+            compute_step_beyond_bound(jacobian, off, within, found.at_bound),
         )
         sigma = {name: every[where] for name, where in at.items()}
         for name, total, weights in (
@@ -194,7 +194,7 @@ class OutputErrorProblem:
         model: DomeModel,
         at: dict[str, slice],
     ) -> dict[str, float]:
-        """Return `DomeFit.unsure`."""
+        """Compute `DomeFit.correction_uncertainty`."""
         x = (modelled[:, 1] - model.baseline_kpa) / model.scale_kpa
         corrected = {
             "gas": (("gamma", "ln_tau"), modelled[:, 0] - modelled[:, 1]),
@@ -253,7 +253,7 @@ class OutputErrorProblem:
     def _fit_gains(self, model: DomeModel, scatter: float) -> tuple[Floats, Floats]:
         """Compute the gain of each loading, with a prior of one, and the modelled pressures."""
         points = self._points
-        modelled = model.compute_pressures(points.t_s, self._force_n(model.late_s))
+        modelled = model.compute_pressures_and_force_lag(points.t_s, self._force_n(model.late_s))
         gauge_kpa = modelled[:, 0] - model.baseline_kpa
         n = points.n_loadings
         prior = 1.0 / scatter**2
@@ -261,7 +261,7 @@ class OutputErrorProblem:
         product = np.bincount(points.loading, self._weight**2 * gauge_kpa * self._gauge_kpa, n)
         return (product + prior) / (square + prior), modelled
 
-    def compute_residual(self, model: DomeModel, scatter: float) -> Floats:
+    def compute_pressure_and_gain_residuals(self, model: DomeModel, scatter: float) -> Floats:
         """Compute the residuals of pressures and gains in their standard uncertainties."""
         gains, modelled = self._fit_gains(model, scatter)
         gauge_kpa = modelled[:, 0] - model.baseline_kpa
@@ -273,7 +273,7 @@ class OutputErrorProblem:
         """Largest reference force."""
         return float(self._points.force_n.max())
 
-    def compute_max_heat_force_n(self, fit: DomeFit) -> float:
+    def compute_max_heat_effect_n(self, fit: DomeFit) -> float:
         """Return the largest effect of the gas' heat on a force."""
         model, rows = fit.model, self._usable
         heated_kpa, settled_kpa = fit.modelled[rows, 0], fit.modelled[rows, 1]
@@ -284,7 +284,7 @@ class OutputErrorProblem:
 
     def compute_cost(self, model: DomeModel, scatter: float) -> float:
         """Compute the sum of squared residuals."""
-        off = self.compute_residual(model, scatter)
+        off = self.compute_pressure_and_gain_residuals(model, scatter)
         return float(off @ off)
 
 

@@ -25,7 +25,7 @@ def separate_delays(effects: Sequence[Effects], reference_delay: Parameter) -> l
     remaining uncertainty is common to all tiles.
 
     Args:
-        effects: of the tiles, with `residual_lag_s` as measured against the reference.
+        effects: of the tiles, with `late_s` as measured against the reference.
         reference_delay: of the reference.
     """
     seen = [each.late_s.value for each in effects if each.late_s is not None]

@@ -19,30 +19,30 @@ from service.estimation.calibration import (
     BandPoint,
     RigFacts,
     TileCalibration,
-    compute_loop_share,
-    is_monotonic,
+    compute_relative_loop_width,
+    is_increasing_cubic,
 )
 from service.estimation.fitting.confidence import (
-    compute_cubic_basis,
+    compute_cubic_basis_through_zero,
     compute_curve_n,
-    compute_mean_band_n,
-    compute_new_loading_band_n,
+    compute_mean_half_width_95_n,
+    compute_new_loading_half_width_95_n,
 )
 from service.estimation.fitting.rig.checks import (
-    compute_baseline_drift_kpa,
+    check_baseline_drift_kpa,
     reject_contradictions,
+    reject_insufficient_strokes,
     reject_poor_fit,
     reject_saturated_reference,
-    reject_unloaded,
     select_before_saturation,
 )
 from service.estimation.fitting.rig.indentation import (
     Indentation,
     Strokes,
-    average_strokes,
-    find_stroke_rows,
+    average_stroke_blocks,
+    find_slow_stroke_rows,
     format_origin,
-    measure_unloaded,
+    measure_initial_unloaded,
 )
 
 BAND_STEPS = 10  # of the band in the file
@@ -50,13 +50,13 @@ MEAN_STEPS = 30  # of the mean curve, fine enough for a cubic
 
 
 class _Cubic:
-    """Least squares with `compute_cubic_basis` over a range that is centred."""
+    """Least squares with `compute_cubic_basis_through_zero` over a range that is centred."""
 
     def __init__(self, high_kpa: float) -> None:
         self.offset_kpa = self.scale_kpa = high_kpa / 2
 
     def design_matrix(self, gauge_kpa: Floats) -> Floats:
-        return compute_cubic_basis(gauge_kpa, self.offset_kpa, self.scale_kpa)
+        return compute_cubic_basis_through_zero(gauge_kpa, self.offset_kpa, self.scale_kpa)
 
     def solve(self, blocks: Strokes) -> Floats:
         solution, *_ = np.linalg.lstsq(
@@ -75,13 +75,13 @@ def fit_static_curve(*recordings: Indentation) -> TileCalibration:
         CalibrationError: the recordings give no valid curve (see `rig.checks`).
     """
     where = ", ".join(format_origin(recording) for recording in recordings)
-    zeros = [measure_unloaded(recording) for recording in recordings]
+    zeros = [measure_initial_unloaded(recording) for recording in recordings]
     noise_kpa = _compute_rms(np.array([zero.noise_kpa for zero in zeros]))
-    blocks = average_strokes(*recordings)
+    blocks = average_stroke_blocks(*recordings)
     reject_saturated_reference(recordings, blocks)
     blocks, by_chip = select_before_saturation(recordings, blocks, noise_kpa)
-    reject_unloaded(blocks, where)
-    drift_kpa = compute_baseline_drift_kpa(recordings)
+    reject_insufficient_strokes(blocks, where)
+    drift_kpa = check_baseline_drift_kpa(recordings)
     # The mean end of the repeats: beyond it there is little data.
     high_kpa = float(np.mean(_repeat_maxima(blocks, blocks.gauge_kpa)))
     cubic = _Cubic(high_kpa)
@@ -91,7 +91,7 @@ def fit_static_curve(*recordings: Indentation) -> TileCalibration:
     residual_n = cubic.compute_residual_n(blocks, coefficients)
     gains = _compute_repeat_gains(blocks, blocks.force_n - residual_n)
     reject_contradictions(gains, where)
-    if not is_monotonic(polynomial, (-1.0, 1.0)):
+    if not is_increasing_cubic(polynomial, (-1.0, 1.0)):
         raise CalibrationError(
             "the fitted curve is not monotonic: force would fall while pressure rises",
             where=where,
@@ -134,7 +134,7 @@ def fit_static_curve(*recordings: Indentation) -> TileCalibration:
     ]
     temperature_raw_counts = float(np.mean(temperature_raw)) if temperature_raw else None
     facts = RigFacts(
-        recordings=sum(bool(find_stroke_rows(recording)) for recording in recordings),
+        recordings=sum(bool(find_slow_stroke_rows(recording)) for recording in recordings),
         end_n=float(np.mean(_repeat_maxima(blocks, blocks.force_n))),
         end_absolute_kpa=baseline_kpa + high_kpa,
         spare_kpa=PRESSURE_MAX_KPA - baseline_kpa - high_kpa,
@@ -194,8 +194,8 @@ def _make_band(tile: TileCalibration) -> tuple[BandPoint, ...]:
     columns = (
         gauge_kpa,
         compute_curve_n(tile, gauge_kpa),
-        compute_mean_band_n(tile, gauge_kpa),
-        compute_new_loading_band_n(tile, gauge_kpa),
+        compute_mean_half_width_95_n(tile, gauge_kpa),
+        compute_new_loading_half_width_95_n(tile, gauge_kpa),
     )
     return tuple(
         BandPoint(gauge_kpa=p, force_n=f, mean_n=mean, new_loading_n=new)
@@ -221,7 +221,7 @@ def _fit_misfit(force_n: Floats, residual_n: Floats) -> tuple[float, float]:
     so that small loads count as much as large ones.
     """
     weight = 1.0 / (force_n**2 + LOOP_HALF_WIDTH_FORCE_N**2)
-    parts = np.stack([force_n**2, compute_loop_share(force_n) ** 2], axis=1)
+    parts = np.stack([force_n**2, compute_relative_loop_width(force_n) ** 2], axis=1)
     variances, _ = nnls(parts * weight[:, None], residual_n**2 * weight)
     relative, loop = np.sqrt(variances)
     return float(relative), float(loop)

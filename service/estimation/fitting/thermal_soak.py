@@ -15,10 +15,10 @@ import numpy as np
 from devices.arrays import Bools, Floats, Ints
 from devices.chips.mpl115a2 import TADC_PER_KELVIN, estimate_degc
 from service.estimation.effects import Parameter, TemperatureEffect
-from service.estimation.fitting.confidence import compute_bound_excess, compute_fit_covariance
+from service.estimation.fitting.confidence import compute_fit_covariance, compute_step_beyond_bound
 from service.estimation.fitting.least_squares import minimize_squares
 from service.estimation.fitting.rig.indentation import ThermalSoak
-from service.estimation.models.temperature import compute_gas_temperatures
+from service.estimation.models.temperature import compute_gas_temperature_and_rise
 
 STEP_MIN_K = 1.0
 LAG_RANGE_S = (-10.0, 30.0)
@@ -51,7 +51,7 @@ def fit_temperature_effect(soak: ThermalSoak) -> TemperatureEffect | str:
 
     def gas_k(lag_s: float) -> tuple[Floats, Floats]:
         """Return the gas' temperature above the chip's first one, and its rise in K/s."""
-        counts, rise = compute_gas_temperatures(
+        counts, rise = compute_gas_temperature_and_rise(
             soak.temperature_raw[:, None], t_ns, np.array([lag_s])
         )
         return (
@@ -78,7 +78,7 @@ def fit_temperature_effect(soak: ThermalSoak) -> TemperatureEffect | str:
     # Where readings scatter more than their noise says, so do the parameters.
     covariance = compute_fit_covariance(found.jacobian, known)
     wide = max(1.0, float(np.sqrt(np.mean(found.residual**2))))
-    beyond = compute_bound_excess(found.jacobian, found.residual, known, found.at_bound)
+    beyond = compute_step_beyond_bound(found.jacobian, found.residual, known, found.at_bound)
     sigma = np.hypot(np.sqrt(np.diag(covariance)) * wide, beyond)
     base_kpa, kpa_per_k, lag_s = (float(x) for x in found.x)
     if not kpa_per_k > 0.0 or sigma[1] > _SIGMA_MAX * kpa_per_k:

@@ -98,16 +98,16 @@ def _make_creep_unknowns(terms: int, creep_range_s: tuple[float, float]) -> tupl
 
 
 def list_unknowns(
-    parts: FittedEffects, curve: Floats, creep_range_s: tuple[float, float]
+    parts: FittedEffects, initial_curve: Floats, creep_range_s: tuple[float, float]
 ) -> list[PriorGroup]:
     """List the unknowns of a fit, the curve first.
 
     Args:
         parts: effects to fit.
-        curve: start values of c1, c2, c3.
+        initial_curve: start values of c1, c2, c3.
         creep_range_s: shortest and longest observable time constant of creep.
     """
-    first = tuple(curve.tolist())
+    first = tuple(initial_curve.tolist())
     # The slope at zero is at least a hundredth of the force at the end of the range.
     least = (0.01 * sum(first), -_NO_LIMIT, -_NO_LIMIT)
     unknowns = [PriorGroup("curve", first, _NO_LIMIT, least, (_NO_LIMIT,) * 3)]

@@ -23,10 +23,10 @@ from service.estimation.calibration import (
     WeightFacts,
     WeightStep,
 )
-from service.estimation.dead_weights import check_weight_count
+from service.estimation.dead_weights import check_enough_distinct_weights
 from service.estimation.effects import EffectName, Effects
 from service.estimation.estimates import SIGMAS_95
-from service.estimation.fitting.confidence import compute_cubic_basis, compute_curve_n
+from service.estimation.fitting.confidence import compute_cubic_basis_through_zero, compute_curve_n
 from service.estimation.fitting.rig.indentation import Indentation, format_origin
 from service.estimation.fitting.rig.weight_holds import WeightHold, measure_holds
 from service.estimation.models.static import StaticCurves
@@ -58,7 +58,7 @@ def fit_dead_weights(recordings: Sequence[Indentation]) -> TileCalibration:
     where = ", ".join(format_origin(recording) for recording in recordings)
     per_file = [measure_holds(recording) for recording in recordings]
     steps = [step for found in per_file for step in found]
-    check_weight_count([step.weight.force_n for step in steps], where)
+    check_enough_distinct_weights([step.weight.force_n for step in steps], where)
     drift_kpa = max(
         max(abs(step.baseline_kpa - found[0].baseline_kpa) for step in found)
         for found in per_file
@@ -76,7 +76,7 @@ def fit_dead_weights(recordings: Sequence[Indentation]) -> TileCalibration:
     gauge_kpa = np.array([step.gauge_kpa for step in steps])
     high_kpa = float(gauge_kpa.max())
     _reject_no_rise(force_n, gauge_kpa, steps, where)
-    basis = compute_cubic_basis(gauge_kpa, 0.0, high_kpa)[:, :TERMS]
+    basis = compute_cubic_basis_through_zero(gauge_kpa, 0.0, high_kpa)[:, :TERMS]
     weight = 1.0 / np.hypot(force_n, SMALL_FORCE_N)
     design = basis * weight[:, None]
     (c1, c2), *_ = np.linalg.lstsq(design, force_n * weight, rcond=None)
@@ -149,7 +149,7 @@ def _make_band(tile: TileCalibration) -> tuple[BandPoint, ...]:
     """Return the curve with the half widths that an estimate of a settled load states."""
     gauge_kpa = np.linspace(0.0, tile.range_kpa[1], _BAND_STEPS + 1)
     found = StaticCurves([tile]).compute_forces(gauge_kpa[:, None])
-    basis = compute_cubic_basis(gauge_kpa, tile.p_offset_kpa, tile.p_scale_kpa)
+    basis = compute_cubic_basis_through_zero(gauge_kpa, tile.p_offset_kpa, tile.p_scale_kpa)
     mean_n = SIGMAS_95 * np.sqrt(
         np.maximum(((basis @ np.array(tile.covariance)) * basis).sum(1), 0.0)
     )

@@ -17,7 +17,7 @@ from devices.jit import jit_cached
 _PARABOLA_POSITIONS_MIN = 3  # least positions along x that determine a parabola
 
 
-def compute_hull(positions_m: Floats) -> tuple[Floats, Floats]:
+def compute_hull_half_planes(positions_m: Floats) -> tuple[Floats, Floats]:
     """Compute half-planes `normals @ p <= offsets` whose intersection is the hull of (tiles, 2).
 
     Tiles in a line, or a single one, have a hull without area: two half-planes across every
@@ -55,8 +55,8 @@ def compute_grid_indices(
     return x.astype(np.float64) + 1.0, y.astype(np.float64) + 1.0
 
 
-def compute_tile_axes_rad(positions_m: Floats) -> Floats:
-    """Compute the angle of each tile's axis to the segment, (tiles,).
+def fit_tile_axis_angles_rad(positions_m: Floats) -> Floats:
+    """Fit the sole, and return the angle of each tile's axis to the segment, (tiles,).
 
     Tiles stand upright on their sole, whose shape along x is a parabola through their positions
     (tiles, 3). Zero if these do not determine it. As the segment rolls, tiles are vertical in turn.
@@ -69,13 +69,13 @@ def compute_tile_axes_rad(positions_m: Floats) -> Floats:
     return np.asarray(np.arctan(slope + 2.0 * bend * x_m))
 
 
-def compute_tilt_loss(axes_rad: Floats) -> Floats:
+def compute_tilt_loss(axis_rad: Floats) -> Floats:
     """Return the part of a force along each tile's axis that is not along the segment: 1 - cos."""
-    return np.asarray(1.0 - np.cos(axes_rad))
+    return np.asarray(1.0 - np.cos(axis_rad))
 
 
-def compute_rad_per_count(servo: ServoInfo) -> float:
-    """Return the segment's angle for a count of the servo; signed."""
+def compute_segment_rad_per_count(servo: ServoInfo) -> float:
+    """Return the segment's angle in rad for one count of the servo, signed."""
     return servo.sign * servo.ratio * 2.0 * math.pi / servo.counts_per_turn
 
 

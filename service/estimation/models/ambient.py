@@ -58,20 +58,22 @@ class AmbientModel:
 
 
 @jit_cached
-def update_ambient_pressure(state: AmbientState, kpa: float, t_ns: int) -> float:
-    """Return the low-passed surrounding pressure above the tare's; NaN where unknown.
+def low_pass_ambient_kpa(state: AmbientState, above_tare_kpa: float, t_ns: int) -> float:
+    """Update the low-pass; return the surrounding pressure above the tare's, NaN where unknown.
 
     Args:
         state: after the frames before; updated.
-        kpa: mean of the bare tiles above their tare. NaN if none was readable: the last value then
-            holds for `HELD_S`.
+        above_tare_kpa: mean of the bare tiles above their tare. NaN if none was readable: the last
+            value then holds for `HELD_S`.
         t_ns: instant.
     """
-    if math.isfinite(kpa):
+    if math.isfinite(above_tare_kpa):
         if math.isnan(state.pressure_kpa):
-            state.pressure_kpa = kpa
+            state.pressure_kpa = above_tare_kpa
         else:
             passed_s = max(0.0, (t_ns - state.t_ns) * 1e-9)
-            state.pressure_kpa -= math.expm1(-passed_s / SMOOTHING_S) * (kpa - state.pressure_kpa)
+            state.pressure_kpa -= math.expm1(-passed_s / SMOOTHING_S) * (
+                above_tare_kpa - state.pressure_kpa
+            )
         state.t_ns = t_ns
     return state.pressure_kpa if t_ns - state.t_ns <= HELD_S * 1e9 else math.nan

@@ -42,7 +42,7 @@ SampleColumns = tuple[Floats, Floats, Times, Ints]
 """Values (n, columns), NaN where there is none; standard deviation of each and its instant, both
 (n, columns); and (n,) the number of the gapless run that a frame belongs to."""
 WindowScratch = tuple[Floats, Floats, Floats]
-"""Work arrays of `average_sample`, from `allocate_scratch`: values of all smaller windows, their
+"""Work arrays of `denoise_sample`, from `allocate_scratch`: values of all smaller windows, their
 variances, and 1 for a parabola."""
 WINDOWS_MAX = 4 * len(WINDOW_REACHES) + 1
 """Largest number of windows around a sample."""
@@ -64,13 +64,18 @@ class WindowDifference(Protocol):
 
 @jit_cached
 def allocate_scratch() -> WindowScratch:
-    """Allocate the work arrays of `average_sample`."""
+    """Allocate the work arrays of `denoise_sample`."""
     return np.empty(WINDOWS_MAX), np.empty(WINDOWS_MAX), np.empty(WINDOWS_MAX)
 
 
 @jit_inlined
-def find_window_limits(
-    frame_t_ns: Times, i: int, first: int, end: int, rows: tuple[int, int], look_ns: int
+def find_window_rows(
+    frame_t_ns: Times,
+    i: int,
+    first: int,
+    end: int,
+    previous_rows: tuple[int, int],
+    lookahead_ns: int,
 ) -> tuple[int, int]:
     """Return the oldest and the newest row that windows of row `i` may reach.
 
@@ -79,22 +84,22 @@ def find_window_limits(
         i: row.
         first: first row that is stored.
         end: row after the last that is stored.
-        rows: answer for the row before, or any row twice.
-        look_ns: look-ahead; no more frames arrive within it.
+        previous_rows: answer for the row before, or any row twice.
+        lookahead_ns: look-ahead; no more frames arrive within it.
     """
-    oldest, newest = rows
+    oldest, newest = previous_rows
     while oldest > first and frame_t_ns[oldest - 1] >= frame_t_ns[i] - PAST_NS:
         oldest -= 1
     while frame_t_ns[oldest] < frame_t_ns[i] - PAST_NS:
         oldest += 1
     newest = max(newest, i)
-    while newest + 1 < end and frame_t_ns[newest + 1] <= frame_t_ns[i] + look_ns:
+    while newest + 1 < end and frame_t_ns[newest + 1] <= frame_t_ns[i] + lookahead_ns:
         newest += 1
     return oldest, newest
 
 
 @jit_cached
-def average_sample(
+def denoise_sample(
     columns: SampleColumns,
     i: int,
     j: int,
@@ -104,14 +109,14 @@ def average_sample(
     within: WindowRows,
     scratch: WindowScratch,
 ) -> tuple[tuple[float, float, float, float], WindowRows]:
-    """Average the value of row `i`, column `j`, which must exist.
+    """Denoise the value of row `i`, column `j`, which must exist.
 
     Args:
         columns: values with their noise, instants and runs.
         i: row.
         j: column.
         at_ns: instant at which the fitted curve is evaluated.
-        rows: oldest and newest that windows may reach, from `find_window_limits`.
+        rows: oldest and newest that windows may reach, from `find_window_rows`.
         variance_inflation: (`WINDOW_READINGS_MAX` + 1,), variance of a mean of n readings over that
             of white noise.
         within: rows that windows may reach: `ALL_ROWS`, or those of the sum of tiles.

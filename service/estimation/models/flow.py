@@ -71,25 +71,25 @@ class FlowModel:
 
 
 @jit_cached
-def compensate(
+def compensate_flow(
     params: FlowParams,
     state: FlowState,
     apparent_n: float,
     t_ns: int,
-    state_force_n: float,
-    gap_force_n: float,
+    state_override_n: float,
+    possible_gap_force_n: float,
 ) -> float:
-    """Return the force behind an apparent one; NaN gives NaN and leaves the state unchanged.
+    """Correct an apparent force for flow; update the state. NaN changes nothing.
 
     Args:
         params: of the tile.
         state: after the tile's readings before; updated.
         apparent_n: apparent force.
         t_ns: instant.
-        state_force_n: force that updates the state instead of the returned one; NaN: that one.
-        gap_force_n: force that the dome may have borne during more than `LONG_GAP_NS` without a
-            reading: the farther of this force and none from a straight line; NaN: the straight
-            line.
+        state_override_n: force that updates the state instead of the returned one; NaN: that one.
+        possible_gap_force_n: force that the dome may have borne during more than `LONG_GAP_NS`
+            without a reading: the farther of this force and none from a straight line; NaN: the
+            straight line.
     """
     if not math.isfinite(apparent_n):
         return math.nan
@@ -97,12 +97,12 @@ def compensate(
         state.force_n, state.t_ns = 0.0, t_ns
     before, stress, passed_ns = state.force_n, state.stress_n, t_ns - state.t_ns
     dt = max(0.0, passed_ns * 1e-9)
-    if gap_force_n > 0.0 and passed_ns > LONG_GAP_NS:  # until just now
-        before = gap_force_n if before + apparent_n < gap_force_n else 0.0
+    if possible_gap_force_n > 0.0 and passed_ns > LONG_GAP_NS:  # until just now
+        before = possible_gap_force_n if before + apparent_n < possible_gap_force_n else 0.0
         stress, dt = 0.0, 0.0
     g, scale_n, n = params.fraction, params.stress_scale_n, params.exponent
     found = _solve_force(apparent_n, before, stress, g, scale_n, n, dt)
-    now = found if math.isnan(state_force_n) else state_force_n
+    now = found if math.isnan(state_override_n) else state_override_n
     state.stress_n = step_branch_stress(stress, g, scale_n, n, now - before, dt)
     state.force_n, state.t_ns = now, t_ns
     return found
@@ -110,12 +110,17 @@ def compensate(
 
 @jit_cached
 def step_branch_stress(
-    stress: float, fraction: float, stress_scale_n: float, exponent: float, rise: float, dt: float
+    stress_n: float,
+    fraction: float,
+    stress_scale_n: float,
+    exponent: float,
+    force_rise_n: float,
+    dt_s: float,
 ) -> float:
-    """Return the force on the branch after the dome's force has risen by `rise` within `dt`."""
-    half = 0.5 * fraction * rise
-    between = stress + half
-    decay = _compute_flow_decay(between, fraction, stress_scale_n, exponent, dt)
+    """Return the force on the branch after the dome's has risen by `force_rise_n` within `dt_s`."""
+    half = 0.5 * fraction * force_rise_n
+    between = stress_n + half
+    decay = _compute_flow_decay(between, fraction, stress_scale_n, exponent, dt_s)
     return float(between * decay ** (1.0 / (1.0 - exponent)) + half)
 
 

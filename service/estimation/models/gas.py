@@ -74,18 +74,18 @@ class GasModel:
 
 @jit_cached
 def compute_isothermal_pressure(
-    params: GasParams, state: GasState, kpa: float, t_ns: int, gap_kpa: float
+    params: GasParams, state: GasState, kpa: float, t_ns: int, possible_gap_kpa: float
 ) -> float:
-    """Return the pressure after cooling; NaN gives NaN and leaves the state unchanged.
+    """Update the state; return the absolute pressure after cooling. NaN changes nothing.
 
     Args:
         params: of the tile.
         state: after the tile's readings before; updated.
         kpa: absolute pressure.
         t_ns: instant of the reading.
-        gap_kpa: pressure that the gas may have had until just now, after more than `LONG_GAP_NS`
-            without a reading: the farther of this pressure and the baseline; NaN: a straight line
-            in between, or cooled gas.
+        possible_gap_kpa: pressure that the gas may have had until just now, after more than
+            `LONG_GAP_NS` without a reading: the farther of this pressure and the baseline; NaN: a
+            straight line in between, or cooled gas.
     """
     if not 0.0 < kpa < math.inf:
         return math.nan
@@ -94,11 +94,11 @@ def compute_isothermal_pressure(
     ln_p, passed_ns = math.log(kpa), t_ns - state.t_ns
     h = passed_ns / (params.gamma * params.tau_s * 1e9)
     has_reading = not math.isnan(state.ln_kpa)
-    if has_reading and gap_kpa > p0 and passed_ns > LONG_GAP_NS:
-        farther = gap_kpa if gap_kpa * p0 > kpa * kpa else p0
+    if has_reading and possible_gap_kpa > p0 and passed_ns > LONG_GAP_NS:
+        farther = possible_gap_kpa if possible_gap_kpa * p0 > kpa * kpa else p0
         state.temperature_ratio = (kpa / farther) ** k
     elif has_reading and 0.0 <= h <= RESTART_TIME_CONSTANTS:
-        state.temperature_ratio = step_temperature_ratio(
+        state.temperature_ratio = _step_temperature_ratio(
             state.temperature_ratio, ln_p - state.ln_kpa, h, k
         )
     else:
@@ -123,7 +123,7 @@ def is_same_state(one: GasState, other: GasState) -> bool:
 
 
 @jit_cached
-def bound_isothermal_pressure(params: GasParams, kpa: float) -> float:
+def compute_isothermal_lower_bound_kpa(params: GasParams, kpa: float) -> float:
     """Return the lower bound of the pressure after cooling from `kpa`, or from more.
 
     None of its heat has gone: p (p0/p)^k. Heat that has gone before only leaves the gas colder.
@@ -139,7 +139,7 @@ def bound_isothermal_pressure(params: GasParams, kpa: float) -> float:
 
 
 @jit_cached
-def step_temperature_ratio(before: float, change_ln_p: float, h: float, k: float) -> float:
+def _step_temperature_ratio(before: float, change_ln_p: float, h: float, k: float) -> float:
     """Return the temperature over the wall's after a step of `h` gamma tau, ln p linear in it."""
     x = h - k * change_ln_p
     # (1 - exp(-x))/x, which is 1 at x = 0

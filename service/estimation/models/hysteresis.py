@@ -59,31 +59,31 @@ class HysteresisModel:
 
 
 @jit_cached
-def compensate(
-    params: HysteresisParams, state: HysteresisState, apparent_n: float, state_force_n: float
+def compensate_hysteresis(
+    params: HysteresisParams, state: HysteresisState, apparent_n: float, state_override_n: float
 ) -> float:
-    """Return the force behind an apparent one; NaN gives NaN and leaves the state unchanged.
+    """Correct an apparent force for hysteresis; update the state. NaN changes nothing.
 
     Args:
         params: of the tile.
         state: plays before; updated.
         apparent_n: apparent force.
-        state_force_n: force that moves the plays instead of the returned one; NaN: that one.
+        state_override_n: force that moves the plays instead of the returned one; NaN: that one.
     """
     if not math.isfinite(apparent_n):
         return math.nan
     found = _solve_force(apparent_n, params.play_weights, state.plays_n)
-    force = found if math.isnan(state_force_n) else state_force_n
+    force = found if math.isnan(state_override_n) else state_override_n
     for m in range(PLAYS):
         state.plays_n[m] = step_play(force, WIDTHS_N[m], state.plays_n[m])
     return found
 
 
 @jit_cached
-def step_play(force: float, width: float, before: float) -> float:
+def step_play(force_n: float, half_width_n: float, before: float) -> float:
     """Return a play after a force; it lags behind by no more than its width allows."""
-    half = min(width, LOOP_OPENING * max(force, 0.0))
-    return min(max(before, force - half), force + half)
+    half = min(half_width_n, LOOP_OPENING * max(force_n, 0.0))
+    return min(max(before, force_n - half), force_n + half)
 
 
 @jit_cached

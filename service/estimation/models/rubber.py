@@ -63,33 +63,33 @@ class CreepModel:
 
 
 @jit_cached
-def compensate(
+def compensate_creep(
     params: RubberParams,
     state: RubberState,
     apparent_n: float,
     t_ns: int,
-    state_force_n: float,
-    gap_force_n: float,
+    state_override_n: float,
+    possible_gap_force_n: float,
 ) -> float:
-    """Return the force behind an apparent one; NaN gives NaN and leaves the state unchanged.
+    """Correct an apparent force for creep; update the state. NaN changes nothing.
 
     Args:
         params: of the tile.
         state: after the tile's readings before; updated.
         apparent_n: apparent force.
         t_ns: instant.
-        state_force_n: force that updates the state instead of the returned one; NaN: that one.
-        gap_force_n: force that the dome may have borne during more than `LONG_GAP_NS` without a
-            reading: the farther of this force and none from a straight line; NaN: the straight
-            line.
+        state_override_n: force that updates the state instead of the returned one; NaN: that one.
+        possible_gap_force_n: force that the dome may have borne during more than `LONG_GAP_NS`
+            without a reading: the farther of this force and none from a straight line; NaN: the
+            straight line.
     """
     if not math.isfinite(apparent_n):
         return math.nan
     if math.isnan(state.force_n):  # the first reading: at rest without a force
         state.force_n, state.t_ns = 0.0, t_ns
     before, passed_ns = state.force_n, t_ns - state.t_ns
-    after_gap = gap_force_n > 0.0 and passed_ns > LONG_GAP_NS
-    meanwhile_n = gap_force_n if before + apparent_n < gap_force_n else 0.0
+    after_gap = possible_gap_force_n > 0.0 and passed_ns > LONG_GAP_NS
+    meanwhile_n = possible_gap_force_n if before + apparent_n < possible_gap_force_n else 0.0
     divisor, known = 1.0, apparent_n
     for m in range(params.n_terms):
         decay, of_before, of_now = compute_creep_weights(
@@ -103,7 +103,7 @@ def compensate(
         known -= params.creep_fraction[m] * carried
         state.crept_n[m], state.force_share[m] = carried, share
     found = known / divisor
-    now = found if math.isnan(state_force_n) else state_force_n
+    now = found if math.isnan(state_override_n) else state_override_n
     for m in range(params.n_terms):
         state.crept_n[m] += state.force_share[m] * now
     state.force_n, state.t_ns = now, t_ns
@@ -111,11 +111,15 @@ def compensate(
 
 
 @jit_cached
-def compute_creep_weights(h: float) -> tuple[float, float, float]:
-    """Return the weights of z, of the previous and of the present force after `h` time constants.
+def compute_creep_weights(step_time_constants: float) -> tuple[float, float, float]:
+    """Return the weights of z, of the previous and of the present force after a step.
 
     Their sum is the crept part z at the end of a step in which the force is linear.
     """
-    decay = math.exp(-h)
-    mean = -math.expm1(-h) / h if h > 0.0 else 1.0
+    decay = math.exp(-step_time_constants)
+    mean = (
+        -math.expm1(-step_time_constants) / step_time_constants
+        if step_time_constants > 0.0
+        else 1.0
+    )
     return decay, mean - decay, 1.0 - mean

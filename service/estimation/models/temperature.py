@@ -95,43 +95,45 @@ class TemperatureModel:
         return TemperatureParams.array(
             len(self.lag_s),
             **given,
-            smoothing_s=compute_smoothing_s(self.lag_s),
-            noise_counts=compute_gas_noise_counts(self.lag_s, self.step_s),
+            smoothing_s=_compute_smoothing_s(self.lag_s),
+            noise_counts=compute_gas_temperature_noise_counts(self.lag_s, self.step_s),
         )
 
 
-def compute_smoothing_s(lag_s: Floats) -> Floats:
-    """Return the smoothing time of the chip by the lag: the lag itself if the gas lags."""
+def _compute_smoothing_s(lag_s: Floats) -> Floats:
+    """Return the smoothing time of the chip's temperature: the lag, or an eighth of a lead."""
     time_s = np.where(lag_s >= 0.0, lag_s, -SMOOTHING_PER_LAG * lag_s)
     return np.asarray(np.maximum(time_s, SMOOTHING_MIN_S))
 
 
-def compute_gas_noise_counts(lag_s: Floats, step_s: float) -> Floats:
+def compute_gas_temperature_noise_counts(gas_lag_s: Floats, step_s: float) -> Floats:
     """Return the noise of the gas' counts by that of the raw temperature; 0 where the gas lags."""
-    time_s = compute_smoothing_s(lag_s)
-    lead = np.where(lag_s < 0.0, 1.0 - lag_s / time_s, 0.0)
+    time_s = _compute_smoothing_s(gas_lag_s)
+    lead = np.where(gas_lag_s < 0.0, 1.0 - gas_lag_s / time_s, 0.0)
     # (1 + (1 + lead) S s)/(1 + S s)^2 of white noise; the low-pass of a lag removes nearly all.
     power = step_s * (1.0 + (1.0 + lead) ** 2) / (4.0 * time_s)
     return np.asarray(
-        np.where(lag_s < 0.0, READING_NOISE_COUNTS * np.sqrt(np.minimum(power, 4.0)), 0.0)
+        np.where(gas_lag_s < 0.0, READING_NOISE_COUNTS * np.sqrt(np.minimum(power, 4.0)), 0.0)
     )
 
 
-def compute_gas_temperatures(
-    temperature_raw: Floats, t_ns: Times, lag_s: Floats
+def compute_gas_temperature_and_rise(
+    temperature_raw: Floats, t_ns: Times, gas_lag_s: Floats
 ) -> tuple[Floats, Floats]:
     """Compute every tile's gas temperature in counts, and its rise in counts a second, from rest.
 
     Args:
         temperature_raw: (n, tiles), raw temperatures of the chips, NaN where there are none.
         t_ns: (n, tiles), instants.
-        lag_s: (tiles,), negative where the chip lags.
+        gas_lag_s: (tiles,), negative where the chip lags.
     """
     gas, rise = np.empty(temperature_raw.shape), np.empty(temperature_raw.shape)
     params = TemperatureParams.array(
-        len(lag_s), lag_s=lag_s, smoothing_s=compute_smoothing_s(lag_s)
+        len(gas_lag_s), lag_s=gas_lag_s, smoothing_s=_compute_smoothing_s(gas_lag_s)
     )
-    _update_gas_temperatures(params, initial_state(len(lag_s)), temperature_raw, t_ns, gas, rise)
+    _update_gas_temperatures(
+        params, initial_state(len(gas_lag_s)), temperature_raw, t_ns, gas, rise
+    )
     return gas, rise
 
 
@@ -152,7 +154,7 @@ def refer_to_tare_temperature(
         temperature_raw: counts, NaN if there are none.
         t_ns: instant.
     """
-    update_gas_temperature(params, state, temperature_raw, t_ns)
+    _update_gas_temperature(params, state, temperature_raw, t_ns)
     # A chip that starts away from the tare's temperature says nothing of its gas: all of the
     # distance is uncertain, and less so with every lag that passes.
     start_counts = state.first_counts - params.tare_counts
@@ -173,7 +175,7 @@ def refer_to_tare_temperature(
 
 
 @jit_cached
-def update_gas_temperature(
+def _update_gas_temperature(
     params: TemperatureParams, state: TemperatureState, temperature_raw: float, t_ns: int
 ) -> None:
     """Update the gas' temperature with a reading of the chip, or without one (NaN)."""
@@ -222,5 +224,5 @@ def _update_gas_temperatures(
     n, tiles = temperature_raw.shape
     for i in range(n):
         for j in range(tiles):
-            update_gas_temperature(params[j], states[j], temperature_raw[i, j], t_ns[i, j])
+            _update_gas_temperature(params[j], states[j], temperature_raw[i, j], t_ns[i, j])
             gas[i, j], rise[i, j] = states[j].gas_counts, states[j].rise_counts_per_s

@@ -28,7 +28,7 @@ _kpa_per_count_of = jit_cached(mpl115a2.compute_kpa_per_padc_jit)
 
 
 @jit_inlined
-def load_frames(
+def append_frames_to_buffer(
     params: KernelParams,
     foot_state: FootState,
     tile_states: RecordArray[TileState],
@@ -44,7 +44,7 @@ def load_frames(
     tile_flags: npt.NDArray[np.uint8],
     frame_flags: npt.NDArray[np.uint8],
 ) -> None:
-    """Append n frames to the buffer, columns as in `FrameBatch`."""
+    """Convert n frames to pressures and append them to the buffer; columns as in `FrameBatch`."""
     foot_params = params.foot[0]
     for k in range(len(seq)):
         i = foot_state.end_row

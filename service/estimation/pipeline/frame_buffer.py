@@ -1,4 +1,4 @@
-"""Ring buffer of the frames that wait for their look-ahead, or that windows reach back to: columns.
+"""Column buffer of the frames that wait for their look-ahead, or that windows reach back to.
 
 Rows are written once and stay in place until the columns are full; then the rows that are still
 needed move to the front. So a step costs what its own frames cost, however many wait.
@@ -79,23 +79,23 @@ class FrameBuffer(NamedTuple):
     sampled_ns: Times
 
 
-def make_frame_buffer(n: int, tiles: int) -> FrameBuffer:
+def make_frame_buffer(n_rows: int, tiles: int) -> FrameBuffer:
     """Allocate columns for n frames."""
     return FrameBuffer(
-        rows=np.zeros(n, FrameRow.dtype()),
-        samples=np.zeros((n, tiles), TileSample.dtype()),
-        readings=np.zeros(n, ServoReading.dtype()),
-        t_mono_ns=np.zeros(n, np.int64),
-        run=np.zeros(n, np.int64),
-        since_ns=np.zeros(n, np.int64),
-        usable_n=np.zeros((n, tiles + 1)),
-        noise_n=np.zeros((n, tiles + 1)),
-        sampled_ns=np.zeros((n, tiles + 1), np.int64),
+        rows=np.zeros(n_rows, FrameRow.dtype()),
+        samples=np.zeros((n_rows, tiles), TileSample.dtype()),
+        readings=np.zeros(n_rows, ServoReading.dtype()),
+        t_mono_ns=np.zeros(n_rows, np.int64),
+        run=np.zeros(n_rows, np.int64),
+        since_ns=np.zeros(n_rows, np.int64),
+        usable_n=np.zeros((n_rows, tiles + 1)),
+        noise_n=np.zeros((n_rows, tiles + 1)),
+        sampled_ns=np.zeros((n_rows, tiles + 1), np.int64),
     )
 
 
-def compact(buffer: FrameBuffer, first: int, end: int, new_rows: int) -> FrameBuffer:
-    """Move rows `first` to `end` to the front of a buffer with space for `more` rows after them.
+def compact_or_grow_buffer(buffer: FrameBuffer, first: int, end: int, new_rows: int) -> FrameBuffer:
+    """Move rows `first` to `end` to the front, in a larger buffer if `new_rows` more would not fit.
 
     Returns:
         The same buffer, or a larger one.

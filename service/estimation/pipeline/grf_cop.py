@@ -121,7 +121,7 @@ def compute_grf_cop(params: KernelParams, forces: RecordArray[TileForce], out: F
 
 
 @jit_inlined
-def is_cop_masked(params: KernelParams, out: Floats) -> bool:
+def is_cop_unreliable(params: KernelParams, out: Floats) -> bool:
     """Return whether the COP is too uncertain, or farther outside the hull than noise explains."""
     foot_params = params.foot[0]
     x_m, y_m, sigma_x_m, sigma_y_m = out[COP_X], out[COP_Y], out[COP_SIGMA_X], out[COP_SIGMA_Y]

@@ -92,7 +92,7 @@ def make_model_set(
         UsageError: an unknown model, no `static`, or `ambient` without a bare tile.
         CalibrationError: a bearing tile is not calibrated, or not for one of the models.
     """
-    validate_model_names(models)
+    check_model_selection(models)
     bearing = [tile for tile in info.tiles if not tile.reference]
     tiles = [calibration.get_tile(tile.serial) for tile in bearing]
     columns = np.array([i for i, tile in enumerate(info.tiles) if not tile.reference])
@@ -125,8 +125,8 @@ def make_model_set(
     )
 
 
-def validate_model_names(models: Sequence[str]) -> None:
-    """Reject unknown models, and a model set without forces.
+def check_model_selection(models: Sequence[str]) -> None:
+    """Reject unknown models, and a selection without `static`.
 
     Raises:
         UsageError: an unknown model, or no `static`.
@@ -200,7 +200,7 @@ def _make_gas(tiles: Sequence[TileCalibration], baseline_kpa: Floats) -> GasMode
     return GasModel(
         gamma=np.array([gamma if effect is None else effect.gamma.value for effect in found]),
         tau_s=np.array([tau_s if effect is None else effect.tau_s.value for effect in found]),
-        wall_per_kpa=np.array([tile.effects.wall_per_kpa for tile in tiles]),
+        wall_per_kpa=np.array([tile.effects.wall_compliance_per_kpa for tile in tiles]),
         baseline_kpa=baseline_kpa,
     )
 
@@ -243,7 +243,7 @@ def _collect_misfits(
 
 
 def _make_ambient(tiles: Sequence[TileCalibration], baseline_kpa: Floats) -> AmbientModel:
-    give = np.array([tile.effects.wall_per_kpa for tile in tiles]) * baseline_kpa
+    give = np.array([tile.effects.wall_compliance_per_kpa for tile in tiles]) * baseline_kpa
     found = [effect for tile in tiles if (effect := tile.effects.temperature) is not None]
     wall = [e.wall_per_kpa for e in found]
     relative = max((w.sigma / w.value if w.value > 0.0 else 1.0 for w in wall), default=1.0)

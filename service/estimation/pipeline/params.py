@@ -8,7 +8,7 @@ import numpy as np
 
 from devices.arrays import Floats, Ints
 from service.estimation.fault_detection.stuck import SHARE_STEPS, StuckParams
-from service.estimation.foot.geometry import compute_rad_per_count
+from service.estimation.foot.geometry import compute_segment_rad_per_count
 from service.estimation.models.ambient import AmbientModel, AmbientParams
 from service.estimation.models.denoise import WINDOW_READINGS_MAX
 from service.estimation.models.flow import FlowModel, FlowParams
@@ -64,7 +64,7 @@ class FootParams(KernelRecord):
     is_shear_known: int
     shear: float
     shear_sigma: float
-    # As in `repeats.StuckLimits`.
+    # As in `stuck.StuckLimits`.
     run_max_by_equal: Annotated[Ints, (SHARE_STEPS + 1,)]
     run_max_by_double_step: Annotated[Ints, (SHARE_STEPS + 1,)]
     variance_inflation: Annotated[Floats, (WINDOW_READINGS_MAX + 1,)]  # of the sum of tiles
@@ -181,7 +181,7 @@ def _make_foot_params(plan: EstimationPlan) -> RecordArray[FootParams]:
             "has_servo": 1,
             "counts_per_turn": servo.counts_per_turn,
             "zero_counts": servo.zero_counts,
-            "rad_per_count": compute_rad_per_count(servo),
+            "rad_per_count": compute_segment_rad_per_count(servo),
             "travel_m_per_rad": np.nan if travel is None else travel,
         }
     return FootParams.array(1, **columns)

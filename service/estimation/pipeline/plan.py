@@ -22,9 +22,9 @@ from service.estimation.fault_detection.fault_limits import FaultLimits, make_fa
 from service.estimation.foot.contact import ContactThresholds
 from service.estimation.foot.geometry import (
     compute_grid_indices,
-    compute_hull,
-    compute_tile_axes_rad,
+    compute_hull_half_planes,
     compute_tilt_loss,
+    fit_tile_axis_angles_rad,
 )
 from service.estimation.models import denoise
 from service.estimation.pipeline.model_set import MODEL_NAMES, ModelSet, make_model_set
@@ -166,7 +166,7 @@ def make_plan(
         np.sqrt(((model_set.static_curves.slope_at_zero_n_per_kpa * still_kpa) ** 2).sum())
     )
     gains = [calibration.find_mount_gain(info.tiles[i].serial) for i in bearing]
-    axis_rad = compute_tile_axes_rad(positions_m[bearing])
+    axis_rad = fit_tile_axis_angles_rad(positions_m[bearing])
     return EstimationPlan(
         info=info,
         calibration=calibration,
@@ -212,7 +212,7 @@ def make_plan(
         axis_rad=axis_rad,
         tilt_loss=compute_tilt_loss(axis_rad),
         shear=None if calibration.mounted is None else calibration.mounted.shear,
-        hull=compute_hull(positions_m[bearing, :2]),
+        hull=compute_hull_half_planes(positions_m[bearing, :2]),
         grid=compute_grid_indices(positions_m[bearing, :2]),
         contact=ContactThresholds(
             on_n=CONTACT_ON_SIGMA * unloaded_n,

@@ -12,26 +12,29 @@ from devices.chips.mpl115a2 import PRESSURE_MAX_KPA
 from devices.frames import NOT_READ
 from devices.jit import jit_cached, jit_inlined
 from service.estimation.estimates import EstimateFlag
-from service.estimation.fault_detection.baseline_loss import ERROR_MIN_KPA, update_baseline_error
-from service.estimation.fault_detection.clipping import end_of_range
-from service.estimation.fault_detection.stuck import update_stuck
+from service.estimation.fault_detection.baseline_loss import (
+    ERROR_MIN_KPA,
+    update_baseline_error_bound_kpa,
+)
+from service.estimation.fault_detection.clipping import update_clipping_limit_kpa
+from service.estimation.fault_detection.stuck import update_stuck_and_toggles
 from service.estimation.fault_detection.thermal_drift import update_thermal_drift_kpa
 from service.estimation.foot.contact import update_candidate
 from service.estimation.models import gas
-from service.estimation.models.ambient import update_ambient_pressure
+from service.estimation.models.ambient import low_pass_ambient_kpa
 from service.estimation.models.denoise import WINDOW_READINGS_MAX
 from service.estimation.models.outliers import is_outlier
 from service.estimation.models.skew import interpolate_to_frame
-from service.estimation.models.static import evaluate_curve
+from service.estimation.models.static import compute_force_slope_sigma
 from service.estimation.models.temperature import refer_to_tare_temperature
 from service.estimation.pipeline.frame_buffer import FrameBuffer, FrameRow, TileSample
 from service.estimation.pipeline.params import FootParams, KernelParams, TileParams
 from service.estimation.pipeline.plan import SUCTION_MAX_KPA, TARE_OLD_NS
 from service.estimation.pipeline.saturation import (
     UNIFORM_SIGMA,
-    extrapolate_force,
+    extrapolate_capped_force_n,
     is_after_long_gap,
-    worst_case,
+    select_farther_bound,
 )
 from service.estimation.pipeline.state import FootState, TileState
 from service.estimation.records import RecordArray
@@ -52,14 +55,14 @@ _BASELINE_LOST = int(EstimateFlag.BASELINE_LOST)
 
 
 @jit_inlined
-def compute_apparent_forces(
+def compute_apparent_forces_and_contact(
     params: KernelParams,
     foot_state: FootState,
     tile_states: RecordArray[TileState],
     buffer: FrameBuffer,
     i: int,
 ) -> None:
-    """Compute the apparent forces of row `i` and update contact, in the buffer.
+    """Compute apparent forces, contact candidate and flags of row `i`, in the buffer.
 
     Args:
         params: of the estimate.
@@ -82,7 +85,7 @@ def compute_apparent_forces(
             foot_kpa += buffer.samples[i, j].pressure_kpa - params.tiles[j].baseline_kpa
     for j in range(n):
         tile_params, sample = params.tiles[j], buffer.samples[i, j]
-        if checks_warmth and _has_warmed(tile_params, sample):
+        if checks_warmth and _has_temperature_changed(tile_params, sample):
             row.flags |= _TARE_OLD
         after_kpa = buffer.samples[i + 1, j].pressure_kpa if has_after else math.nan
         _detect_faults(
@@ -97,7 +100,7 @@ def compute_apparent_forces(
             bare_count += 1
     if foot_params.has_ambient == 1:
         mean_kpa = bare_sum_kpa / bare_count if bare_count > 0 else math.nan
-        ambient_kpa = update_ambient_pressure(foot_state.ambient, mean_kpa, t_ns)
+        ambient_kpa = low_pass_ambient_kpa(foot_state.ambient, mean_kpa, t_ns)
     total_n = known_n = noise_n2 = usable_n = 0.0
     offset_sum_ns = 0
     for j in range(n):
@@ -140,7 +143,7 @@ def _frame_flags(foot_params: FootParams, row: FrameRow) -> int:
 
 
 @jit_cached
-def _has_warmed(tile_params: TileParams, sample: TileSample) -> bool:
+def _has_temperature_changed(tile_params: TileParams, sample: TileSample) -> bool:
     """Return whether the temperature since the tare has changed by more than a baseline allows."""
     moved_counts = abs(sample.temperature_raw - tile_params.tare_counts)
     is_load_bearing = tile_params.is_load_bearing == 1
@@ -169,14 +172,14 @@ def _detect_faults(
     if foot_params.has_fault_detection == 1:
         unloaded_band_kpa = tile_params.unloaded_band_kpa
         if tile_params.is_load_bearing == 1:
-            end_of_range(
+            update_clipping_limit_kpa(
                 tile_state.clipping, as_read_kpa, row.t_ns, baseline_kpa, unloaded_band_kpa,
                 noise_kpa, tile_params.variance_inflation[WINDOW_READINGS_MAX],
                 foot_kpa - (as_read_kpa - baseline_kpa),
             )  # fmt: skip
         may_stand_still = as_read_kpa >= tile_params.stuck_check_max_kpa
         above_kpa = math.nan if may_stand_still else as_read_kpa - baseline_kpa
-        stuck, foot_state.load_toggles = update_stuck(
+        stuck, foot_state.load_toggles = update_stuck_and_toggles(
             foot_params, tile_params.stuck, tile_state.stuck, sample.pressure_raw, above_kpa,
             unloaded_band_kpa, foot_state.load_toggles, tiles,
         )  # fmt: skip
@@ -236,7 +239,7 @@ def _compute_apparent_force(
         gas_kpa = found_kpa - kpa
         # A tile whose rig recording does not determine its gas has no correction, but this sigma.
         cooled_kpa = found_kpa if tile_params.is_gas_known == 1 else kpa
-        least_kpa = gas.bound_isothermal_pressure(tile_params.gas, least_kpa)
+        least_kpa = gas.compute_isothermal_lower_bound_kpa(tile_params.gas, least_kpa)
     static_kpa = (least_kpa if is_hidden else cooled_kpa) - tile_params.baseline_kpa
     drift_kpa = baseline_error_kpa = 0.0
     if foot_params.has_fault_detection == 1:
@@ -246,13 +249,13 @@ def _compute_apparent_force(
                 tile_params.thermal_kpa_per_count, t_ns,
             )  # fmt: skip
         seen_kpa = math.nan if is_hidden else static_kpa
-        baseline_error_kpa = update_baseline_error(
+        baseline_error_kpa = update_baseline_error_bound_kpa(
             tile_state.baseline_loss, tile_params.asymmetry, seen_kpa, variance, drift_kpa, t_ns
         )
         if baseline_error_kpa > 0.0 or abs(drift_kpa) > ERROR_MIN_KPA:
             flags |= _BASELINE_LOST
     variance += baseline_error_kpa**2
-    force_n, slope, fit_sigma_n = evaluate_curve(tile_params.static, static_kpa)
+    force_n, slope, fit_sigma_n = compute_force_slope_sigma(tile_params.static, static_kpa)
     if math.isnan(sample.pressure_kpa if foot_params.is_tare_lost == 1 else force_n):
         flags |= _TILE_MISSING
     is_saturated = is_hidden or static_kpa > tile_params.static.range_high_kpa
@@ -260,8 +263,10 @@ def _compute_apparent_force(
     if is_saturated:
         flags |= _SATURATED
         gauge_kpa = cooled_kpa - tile_params.baseline_kpa
-        curve_n, _, _ = evaluate_curve(tile_params.static, gauge_kpa)
-        sample.extrapolated_n = extrapolate_force(tile_params.saturation, curve_n, gauge_kpa)
+        curve_n, _, _ = compute_force_slope_sigma(tile_params.static, gauge_kpa)
+        sample.extrapolated_n = extrapolate_capped_force_n(
+            tile_params.saturation, curve_n, gauge_kpa
+        )
     elif sample.pressure_kpa > PRESSURE_MAX_KPA:
         flags |= _OVER_RATED
     if static_kpa < tile_params.range_low_kpa:
@@ -304,7 +309,7 @@ def _isothermal_pressure(
     found = gas.compute_isothermal_pressure(
         tile_params.gas, tile_state.gas, used_kpa, t_ns, math.nan
     )
-    alt_kpa = worst_case(used_kpa, least_kpa, most_kpa) if is_hidden else kpa
+    alt_kpa = select_farther_bound(used_kpa, least_kpa, most_kpa) if is_hidden else kpa
     gap_kpa = tile_params.saturation.range_end_hot_kpa
     other = gas.compute_isothermal_pressure(
         tile_params.gas, tile_state.gas_alt, alt_kpa, t_ns, gap_kpa

@@ -66,7 +66,7 @@ class SaturationBounds:
 
 
 @jit_cached
-def extrapolate_force(params: SaturationParams, curve_n: float, gauge_kpa: float) -> float:
+def extrapolate_capped_force_n(params: SaturationParams, curve_n: float, gauge_kpa: float) -> float:
     """Extrapolate the static curve beyond its range, up to the largest load; NaN stays NaN.
 
     Args:
@@ -108,8 +108,8 @@ def make_saturation_bounds(
 
 
 @jit_cached
-def worst_case(value: float, lower_bound: float, upper_bound: float) -> float:
-    """Return the bound farther from `of`."""
+def select_farther_bound(value: float, lower_bound: float, upper_bound: float) -> float:
+    """Return the bound farther from `value`; the lower one if both are as far."""
     return upper_bound if upper_bound - value > value - lower_bound else lower_bound
 
 

@@ -15,7 +15,11 @@ from devices.jit import jit_cached, jit_inlined
 from service.estimation.models import denoise, flow, hysteresis, rubber
 from service.estimation.pipeline.frame_buffer import FrameBuffer, TileSample
 from service.estimation.pipeline.params import FootParams, KernelParams, TileParams
-from service.estimation.pipeline.saturation import UNIFORM_SIGMA, is_after_long_gap, worst_case
+from service.estimation.pipeline.saturation import (
+    UNIFORM_SIGMA,
+    is_after_long_gap,
+    select_farther_bound,
+)
 from service.estimation.pipeline.state import DomeState, TileState
 from service.estimation.records import KernelRecord, RecordArray
 
@@ -48,7 +52,7 @@ TILE_FORCE = TileForce.dtype()
 
 
 @jit_inlined
-def compute_tile_forces(
+def compute_forces_and_after_saturation(
     params: KernelParams,
     tile_states: RecordArray[TileState],
     buffer: FrameBuffer,
@@ -57,7 +61,7 @@ def compute_tile_forces(
     windows: denoise.WindowScratch,
     forces: RecordArray[TileForce],
 ) -> bool:
-    """Compute the forces on the tiles in row `i`.
+    """Compute the tiles' forces in row `i`, into `forces`; return whether AFTER_SATURATION applies.
 
     Args:
         params: of the estimate.
@@ -174,7 +178,7 @@ def denoise_forces(
     at_frame, frame_ns = _is_at_frame_instant(foot_params), buffer.t_mono_ns[i]
     if foot_params.n_load_bearing > 1 and not math.isnan(buffer.usable_n[i, n]):
         at_ns = frame_ns if at_frame else buffer.sampled_ns[i, n]
-        _, within = denoise.average_sample(
+        _, within = denoise.denoise_sample(
             columns, i, n, at_ns, rows, foot_params.variance_inflation, within, windows
         )
     for j in range(n):
@@ -185,7 +189,7 @@ def denoise_forces(
         at_ns = frame_ns if at_frame else buffer.sampled_ns[i, j]
         inflation = tile_params.variance_inflation
         (force.force_n, variance, force.window_difference_n, difference_variance), _ = (
-            denoise.average_sample(columns, i, j, at_ns, rows, inflation, within, windows)
+            denoise.denoise_sample(columns, i, j, at_ns, rows, inflation, within, windows)
         )
         force.window_difference_sigma_n = force.noise_n * math.sqrt(difference_variance)
         force.noise_n *= math.sqrt(variance)
@@ -225,7 +229,9 @@ def _remove_hysteresis_and_creep(
     )
     bounds = tile_params.saturation
     if is_saturated:
-        state_force_n = worst_case(sample.extrapolated_n, sample.apparent_n, bounds.force_max_n)
+        state_force_n = select_farther_bound(
+            sample.extrapolated_n, sample.apparent_n, bounds.force_max_n
+        )
     alt_n = _invert_dome_models(
         foot_params, tile_params, tile_state.dome_alt, force_n, at_ns, state_force_n,
         bounds.range_end_n,
@@ -248,15 +254,15 @@ def _invert_dome_models(
     gap_force_n: float,
 ) -> float:
     if foot_params.has_flow == 1:
-        force_n = flow.compensate(
+        force_n = flow.compensate_flow(
             tile_params.flow, dome_state.flow, force_n, at_ns, state_force_n, gap_force_n
         )
     if foot_params.has_hysteresis == 1:
-        force_n = hysteresis.compensate(
+        force_n = hysteresis.compensate_hysteresis(
             tile_params.hysteresis, dome_state.hysteresis, force_n, state_force_n
         )
     if foot_params.has_rubber == 1:
-        force_n = rubber.compensate(
+        force_n = rubber.compensate_creep(
             tile_params.rubber, dome_state.rubber, force_n, at_ns, state_force_n, gap_force_n
         )
     return force_n
@@ -316,7 +322,7 @@ def compute_weighted_sum_sigma(forces: RecordArray[TileForce]) -> float:
     unknown.
     """
     variance = 0.0
-    shared = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # `PARTS`, in registers
+    shared = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # `N_COMMON`, in registers
     for j in range(len(forces)):
         weight, common_n = forces[j].weight, forces[j].sigma_common_n
         if weight != 0.0:

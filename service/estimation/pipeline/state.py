@@ -87,7 +87,7 @@ def initial_state(tiles: int) -> tuple[RecordArray[FootState], RecordArray[TileS
         temperature_raw=NOT_READ,
         previous_kpa=np.nan,
         stuck=stuck.initial_state(tiles),
-        clipping=clipping.at_rest(tiles),
+        clipping=clipping.initial_clipping_state(tiles),
         baseline_loss=baseline_loss.initial_state(tiles),
         thermal_drift=thermal_drift.initial_state(tiles),
         temperature=temperature.initial_state(tiles),

@@ -23,7 +23,7 @@ from service.estimation.tare.unloaded_windows import (
     LOADED_KPA,
     NEAR_BASELINE_KPA,
     TareFrames,
-    compute_window_starts,
+    compute_nonempty_window_starts,
     select_lowest_windows,
 )
 
@@ -70,7 +70,7 @@ def compute_newest_unloaded_tare(
     usual_kpa = np.where(np.isnan(usual_kpa), steps_kpa, usual_kpa)
     window_ns = _compute_window_ns(since_ns)
     last_ns = int(since_ns[-1]) - window_ns
-    begins_ns = compute_window_starts(since_ns, last_ns, -(-window_ns // 4), window_ns)
+    begins_ns = compute_nonempty_window_starts(since_ns, last_ns, -(-window_ns // 4), window_ns)
     begins_ns = begins_ns[begins_ns <= last_ns][::-1]
     firsts = np.searchsorted(since_ns, begins_ns)
     ends = np.searchsorted(since_ns, begins_ns + window_ns, side="right")
@@ -178,7 +178,7 @@ class FlightTareResult:
 NO_TARE = FlightTareResult()
 
 
-def compute_flight_tare(
+def propose_flight_tare(
     recent: TareFrames,
     *,
     present: Tare,
@@ -186,7 +186,7 @@ def compute_flight_tare(
     no_contact_since_t_ns: int,
     is_load_bearing: Bools | None = None,
 ) -> FlightTareResult:
-    """Check whether a foot in the air needs a new tare.
+    """Propose a tare for a foot in the air, or none, with the reason.
 
     Args:
         recent: the last `HISTORY_NS` of the stream, in order.
@@ -244,8 +244,8 @@ def compute_flight_tare(
     return FlightTareResult(replace(tare, source="flight"), reason)
 
 
-def compute_first_flight_tare(recent: TareFrames) -> FlightTareResult:
-    """Make a first tare without a request, if the foot has certainly been lifted.
+def propose_first_flight_tare(recent: TareFrames) -> FlightTareResult:
+    """Propose the first tare of a stream, if the foot has certainly been lifted.
 
     It has to have been loaded in these seconds and to be off the ground at their end, every tile
     near its rig baseline: a lightly loaded foot is quiet and near its baseline as well.

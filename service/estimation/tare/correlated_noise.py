@@ -24,7 +24,7 @@ _CHANCE = 3.5
 _TIMES = np.geomspace(1.0, _LAGS, 25)
 
 
-def fit_correlated_noise(kpa: Floats) -> tuple[Floats, Floats]:
+def fit_correlated_fraction_and_decay(kpa: Floats) -> tuple[Floats, Floats]:
     """Fit the correlated part of the variance of unloaded readings, and its time constant.
 
     Args:
@@ -65,16 +65,16 @@ def _fit_decay(rho: Floats, n: int) -> tuple[float, float]:
 
 
 def compute_variance_inflation(
-    correlated_fraction: Floats, decay_readings: Floats, n: npt.ArrayLike
+    correlated_fraction: Floats, decay_readings: Floats, n_readings: npt.ArrayLike
 ) -> Floats:
     """Return the variance of a mean of n readings over that of white noise.
 
     Args:
         correlated_fraction: (tiles,), correlated part of the variance.
         decay_readings: (tiles,), time constant in readings; 0 for white noise.
-        n: 1 or more, broadcast with (tiles,).
+        n_readings: 1 or more, broadcast with (tiles,).
     """
-    count = np.asarray(n, dtype=np.float64)
+    count = np.asarray(n_readings, dtype=np.float64)
     phi = np.exp(-1.0 / np.where(decay_readings > 0.0, decay_readings, 1.0))
     lasts = phi / (1.0 - phi) - phi * (1.0 - phi**count) / (count * (1.0 - phi) ** 2)
     return np.asarray(1.0 + 2.0 * np.where(decay_readings > 0.0, correlated_fraction, 0.0) * lasts)

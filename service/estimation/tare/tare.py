@@ -134,8 +134,8 @@ def compute_thermal_shift_kpa(tare: Tare, warming_k: Floats) -> Floats:
     return np.asarray(tare.baseline_kpa / SEAL_TEMPERATURE_K * warming_k)
 
 
-def has_warmed(tare: Tare, temperature_counts: npt.ArrayLike) -> Bools:
-    """Return a mask of tiles whose temperature since the tare invalidates the baseline.
+def has_temperature_changed(tare: Tare, temperature_counts: npt.ArrayLike) -> Bools:
+    """Return a mask of tiles that warmed or cooled too far since the tare; False where unknown.
 
     Args:
         tare: in force; False for tiles without a temperature.
@@ -162,8 +162,8 @@ class BaselineTrend:
     kelvin_per_hour: Floats
 
 
-def fit_trend(tares: Sequence[Tare], *, tiles: int) -> BaselineTrend:
-    """Fit the trend of the last hours.
+def fit_recent_baseline_trend(tares: Sequence[Tare], *, tiles: int) -> BaselineTrend:
+    """Fit the trends of baseline and temperature over the last six hours; NaN below ten minutes.
 
     Args:
         tares: of the same tiles, in any order.

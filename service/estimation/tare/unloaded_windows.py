@@ -23,7 +23,7 @@ from devices.temperature_hold import hold_temperature
 from service.estimation.calibration import Calibration
 from service.estimation.tare.correlated_noise import (
     compute_variance_inflation,
-    fit_correlated_noise,
+    fit_correlated_fraction_and_decay,
 )
 from service.estimation.tare.tare import Tare, TareSource
 
@@ -32,7 +32,7 @@ NEAR_BASELINE_KPA = 1.5
 """Largest distance of an unloaded bubble from its baseline in the rig: 5 K, by p0 / T0."""
 LOADED_KPA = 3.0
 """Distance above the rig baseline, 10 K by p0 / T0, from which a tile counts as loaded, even if the
-user or a flag markers it as unloaded."""
+user or a flag marks it as unloaded."""
 QUIET_FACTOR = 1.5
 """Largest scatter of an unloaded tile over that in the rig."""
 STILL_SIGMAS = 4.0
@@ -137,7 +137,7 @@ class TareFrames:
         """Compute the tare from the frames of `rows`.
 
         Raises:
-            TareError: a tile has fewer than `MIN_FRAMES` readable frames among them.
+            TareError: a tile has fewer than `FRAMES_MIN` readable frames among them.
         """
         kpa = self.kpa[rows]
         readable = np.isfinite(kpa).sum(axis=0)
@@ -156,7 +156,7 @@ class TareFrames:
             np.nanstd(kpa, axis=0, ddof=1), self.compute_rounding_sigma_kpa(temperature_raw_counts)
         )
         t_s = self.since_ns[rows] * 1e-9
-        part, readings = fit_correlated_noise(kpa)
+        part, readings = fit_correlated_fraction_and_decay(kpa)
         return Tare(
             baseline_kpa=np.nanmean(kpa, axis=0),
             baseline_sigma_kpa=noise_kpa
@@ -219,7 +219,9 @@ class TareFrames:
             )
 
 
-def compute_window_starts(since_ns: Times, begin_ns: int, step_ns: int, length_ns: int) -> Times:
+def compute_nonempty_window_starts(
+    since_ns: Times, anchor_ns: int, step_ns: int, length_ns: int
+) -> Times:
     """Return the starts of the windows with at least one frame, (windows,), rising, from 0 on.
 
     Windows start every step before and after one instant. A long gap, or a step of the clock, has
@@ -227,13 +229,13 @@ def compute_window_starts(since_ns: Times, begin_ns: int, step_ns: int, length_n
 
     Args:
         since_ns: (n,), of frames, rising.
-        begin_ns: of one window.
+        anchor_ns: of one window.
         step_ns: from window to window; above 0.
         length_ns: of a window.
     """
-    last = np.unique((since_ns - begin_ns) // step_ns)
+    last = np.unique((since_ns - anchor_ns) // step_ns)
     numbers = np.unique(last[:, None] - np.arange(-(-length_ns // step_ns)))
-    begins_ns = begin_ns + step_ns * numbers
+    begins_ns = anchor_ns + step_ns * numbers
     return np.asarray(begins_ns[(begins_ns >= 0) & (begins_ns <= since_ns[-1])], dtype=np.int64)
 
 
@@ -261,7 +263,7 @@ def compute_recording_tare(
     *,
     interval_s: tuple[float, float] | None = None,
 ) -> Tare:
-    """Compute the tare of a recording from its first frames.
+    """Compute a recording's tare from `interval_s`, its lead, or an unloaded window.
 
     Args:
         frames: frames from the first of the recording on.
@@ -312,7 +314,7 @@ def _find_unloaded_rows(seen: TareFrames, calibration: Calibration) -> slice:
         )
     # A bare tile is not calibrated: it may read anything, with the noise that it shows.
     noise_kpa = np.where(seen.is_calibrated, seen.rig_noise_kpa, seen.step_noise_kpa)
-    begins_ns = compute_window_starts(seen.since_ns, 0, WINDOW_NS // 2, WINDOW_NS)
+    begins_ns = compute_nonempty_window_starts(seen.since_ns, 0, WINDOW_NS // 2, WINDOW_NS)
     firsts, ends = np.searchsorted(seen.since_ns, [begins_ns, begins_ns + WINDOW_NS])
     windows = seen.find_quiet_windows(zip(firsts.tolist(), ends.tolist(), strict=True), noise_kpa)
     near = [

@@ -162,7 +162,7 @@ class EstimateTask(EstimateRequest):
     def _complete_result(
         self, source: Path, work: Path, made: EstimateResult, remarks: list[str]
     ) -> dict[str, Any]:
-        if source.is_dir() and self.part.is_whole_session:
+        if source.is_dir() and self.part.is_unrestricted:
             _copy_session_files(source, work)
         return {
             "frames": made.frame_count,

@@ -3,7 +3,7 @@
 Live and offline differ only by the look-ahead. The result is bit-identical for any batch size, so
 both are estimated in the pipeline's chunks.
 
-The CPU time per frame is measured over `step` and `finish` alone.
+The CPU time per frame is measured over `process_frames` and `finish` alone.
 """
 
 from __future__ import annotations

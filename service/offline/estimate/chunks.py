@@ -60,7 +60,7 @@ def needs_chunks(source: Path, request: EstimateRequest, chunk_frames: int) -> b
     Raises:
         FileFormatError: the file is no session.
     """
-    if not request.part.is_whole_session:
+    if not request.part.is_unrestricted:
         return False
     with SealedFileReader(source, only_slices=True) as session:
         return session.frame_count > chunk_frames and len(session.footer.rows_by_group) > 1

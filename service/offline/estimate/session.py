@@ -20,7 +20,7 @@ from service.offline.estimate.estimation_range import (
 from service.offline.estimate.preparation import PreparedEstimate, prepare_estimate
 from service.offline.estimate.request import EstimateRequest
 from service.offline.estimate_summary import EstimateSummarizer, EstimateSummary
-from service.sessions.pipeline import EstimateOptions, EstimateStream, make_notes
+from service.sessions.pipeline import EstimateOptions, EstimateStream, make_estimate_metadata
 from service.sessions.stances import StancesWriter
 from storage.formats.slice import Slice
 from storage.parquet_hash import compute_sha256
@@ -84,18 +84,18 @@ def estimate_session(
             frame; `out` is unchanged.
     """
     part = request.part
-    if not part.is_whole_session and out.exists() and out.samefile(source):
+    if not part.is_unrestricted and out.exists() and out.samefile(source):
         raise UsageError(
             f"--out {str(out)!r} is the session itself, of which a part would be left",
             expected="another file",
         )
-    with SealedFileReader(source, only_slices=not part.is_whole_session) as session:
+    with SealedFileReader(source, only_slices=not part.is_unrestricted) as session:
         what = prepare_estimate(session, request, on_remark)
         begin_t_ns = session.read_span_ns()[0] if session.footer.rows_by_group else 0
         notes, stretch = dict(session.notes), EstimationRange()
         if session.time_axis.is_shifted:  # the output may have no clock table beside it
             notes[TIME_AXIS_NOTE] = session.time_axis.to_json_list()
-        if not part.is_whole_session:
+        if not part.is_unrestricted:
             options, stretch = _restrict_to_part(session, what.info, what.options, part)
             notes, what = (
                 _make_part_notes(session, notes, part, stretch),
@@ -111,7 +111,7 @@ def estimate_session(
         watched = given if judged is None else judged.observe(given, stream)
         frames = write_estimates(out, what, notes, stream, watched, on_remark)
     if not frames or stream.plan is None:
-        problem = "the session has no frames" + ("" if part.is_whole_session else " in that time")
+        problem = "the session has no frames" + ("" if part.is_unrestricted else " in that time")
         raise FileFormatError(problem, where=str(source))
     found = () if judged is None else judged.finish(stream.plan)
     return EstimateResult(frames, stream.plan, begin_t_ns, *found)
@@ -146,7 +146,10 @@ def write_estimates(
     if first is None:
         return 0
     assert stream.plan is not None  # noqa: S101  # it exists before the first output
-    notes = {**notes, **make_notes(stream.plan, stream.rounding, prepared_estimate.options.tares)}
+    notes = {
+        **notes,
+        **make_estimate_metadata(stream.plan, stream.rounding, prepared_estimate.options.tares),
+    }
     stances, frames = StancesWriter(), 0
     with SealedFileWriter(out, prepared_estimate.info, notes) as writer:
         for batch, extra in chain((first,), left):
@@ -154,7 +157,7 @@ def write_estimates(
             frames += len(batch)
             stances.add_frames(batch.seq, batch.t_ns, extra)
     if out.name == FRAMES_NAME:  # in a session's folder
-        stances.write_file(out.parent, compute_sha256(out))
+        stances.try_write_or_delete_file(out.parent, compute_sha256(out))
         if stances.problem is not None:
             on_remark(stances.problem)
     return frames
@@ -179,7 +182,7 @@ class _FindingsObserver:
             yield batch, extra
 
     def finish(self, plan: EstimationPlan) -> tuple[EstimateSummary, Mapping[str, float]]:
-        return self._found.finish_summary(plan), self._asking.compute_effects_n()
+        return self._found.finish_summary(plan), self._asking.compute_notable_mean_effects_n()
 
 
 def _restrict_to_part(

@@ -9,7 +9,7 @@ import numpy as np
 
 from devices.arrays import Bools, Floats
 from service.estimation.estimates import SIGMAS_95
-from service.estimation.fitting.confidence import compute_curve_n, compute_mean_band_n
+from service.estimation.fitting.confidence import compute_curve_n, compute_mean_half_width_95_n
 from service.offline.compare.plot import OUR_COLOUR, REFERENCE_COLOUR, TILE_COLOURS
 from service.offline.figure_output import create_figure, render_png
 from service.offline.reproduce import paper
@@ -57,7 +57,10 @@ def _draw_domes(domes: Sequence[DomeResult]) -> bytes:
     for found in domes:
         tile, colour = found.indented_tile.tile, _colour(found)
         grid_kpa = np.linspace(0.0, min(tile.range_kpa[1], found.end_kpa), 120)
-        force_n, half_n = compute_curve_n(tile, grid_kpa), compute_mean_band_n(tile, grid_kpa)
+        force_n, half_n = (
+            compute_curve_n(tile, grid_kpa),
+            compute_mean_half_width_95_n(tile, grid_kpa),
+        )
         curves.fill_between(
             grid_kpa, force_n - half_n, force_n + half_n, color=colour, alpha=0.25, linewidth=0
         )

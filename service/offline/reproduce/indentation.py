@@ -15,8 +15,8 @@ from devices.arrays import Floats
 from devices.scene.scene_file import Scene
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.domes import Dome, SaturationLoad, compute_saturation_load
-from service.estimation.fitting.confidence import compute_curve_n, compute_mean_band_n
-from service.estimation.fitting.rig.indentation import Strokes, average_strokes, select_loaded
+from service.estimation.fitting.confidence import compute_curve_n, compute_mean_half_width_95_n
+from service.estimation.fitting.rig.indentation import Strokes, average_stroke_blocks, select_loaded
 from service.estimation.fitting.static_fit import fit_static_curve
 from service.offline.calibration_fit import TileRecording as MillRecording
 from service.offline.calibration_fit import fit_calibration, read_indentations
@@ -81,7 +81,7 @@ def indent_tile(scene: Scene, *, seed: int, parts_seed: int) -> IndentedTile:
     with _record_indentation(scene, seed, parts_seed) as recordings:
         ((pressed,),) = recordings.values()
         own = pressed.indentation
-    return IndentedTile(fit_static_curve(own), average_strokes(*select_loaded([own])))
+    return IndentedTile(fit_static_curve(own), average_stroke_blocks(*select_loaded([own])))
 
 
 def calibrate_tile(scene: Scene, *, seed: int, parts_seed: int) -> Calibration:
@@ -131,7 +131,7 @@ def evaluate_dome(dome: Dome, pressed: IndentedTile) -> DomeResult:
         end_kpa=end_kpa,
         full_scale_n=(
             float(compute_curve_n(tile, at_kpa)[0]),
-            float(compute_mean_band_n(tile, at_kpa)[0]),
+            float(compute_mean_half_width_95_n(tile, at_kpa)[0]),
         ),
         is_full_scale_reached=beyond_kpa <= 0.0,
         repeatability=compute_repeatability(pressed.strokes),

@@ -10,8 +10,8 @@ import numpy as np
 from service.estimation.calibration import Calibration
 from service.estimation.fitting.confidence import (
     compute_curve_n,
-    compute_mean_band_n,
-    compute_new_loading_band_n,
+    compute_mean_half_width_95_n,
+    compute_new_loading_half_width_95_n,
 )
 from service.offline.compare.trials import TrialMean
 from service.offline.reproduce.indentation import DomeResult, pool_repeatability
@@ -126,7 +126,7 @@ def _dome_to_dict(found: DomeResult) -> dict[str, object]:
         "curve": {
             "gauge_kpa": gauge_kpa.tolist(),
             "force_n": compute_curve_n(tile, gauge_kpa).tolist(),
-            "half_95_of_mean_n": compute_mean_band_n(tile, gauge_kpa).tolist(),
-            "half_95_of_loading_n": compute_new_loading_band_n(tile, gauge_kpa).tolist(),
+            "half_95_of_mean_n": compute_mean_half_width_95_n(tile, gauge_kpa).tolist(),
+            "half_95_of_loading_n": compute_new_loading_half_width_95_n(tile, gauge_kpa).tolist(),
         },
     }

@@ -52,7 +52,7 @@ class Subscriber:
         self._backlog: PendingUpdate | None = None
         self._backlog_since_s = 0.0
 
-    def send_tick(self, tick: Tick, now_s: float) -> None:
+    def send_or_merge_tick(self, tick: Tick, now_s: float) -> None:
         """Write the update, or merge it into the backlog of a subscriber that does not read."""
         is_ready = self._socket.is_writable
         if self._backlog is None:
@@ -63,13 +63,15 @@ class Subscriber:
         self._backlog.add_update(tick.update)
         if is_ready:
             self._socket.write_framed(
-                frame_texts(self._backlog.pop_update().encode_messages(tick.ages_ms))
+                encode_websocket_messages(self._backlog.pop_update().encode_messages(tick.ages_ms))
             )
             self._backlog = None
         elif now_s - self._backlog_since_s > TOO_SLOW_S:
-            self.disconnect(CloseConnection(LinkCloseCode.TOO_SLOW, "this client does not read"))
+            self.request_disconnect(
+                CloseConnection(LinkCloseCode.TOO_SLOW, "this client does not read")
+            )
 
-    def disconnect(self, reason: Exception) -> None:
+    def request_disconnect(self, reason: Exception) -> None:
         """Request that the subscriber is disconnected, by its task; the first reason counts."""
         if not self.disconnected.done():
             self.disconnected.set_exception(reason)
@@ -80,7 +82,7 @@ class Tick:
 
     def __init__(self, summary: PendingUpdate, ages_ms: Mapping[str, float]) -> None:
         self.update, self.ages_ms = summary.pop_update(), ages_ms
-        self.framed = frame_texts(self.update.encode_messages(ages_ms))
+        self.framed = encode_websocket_messages(self.update.encode_messages(ages_ms))
 
 
 class RateGroup:
@@ -95,7 +97,7 @@ class RateGroup:
         self._rate_hz = rate_hz
         self._nodes = nodes
 
-    def pending_update(self) -> PendingUpdate:
+    def schedule_pending_update(self) -> PendingUpdate:
         """Schedule the next tick, and return its content, for additions."""
         self._has_pending.set()
         return self._pending
@@ -113,7 +115,7 @@ class RateGroup:
             except Exception as error:
                 # An encoding error affects one group only: its subscribers may reconnect.
                 for viewer in self.subscribers:
-                    viewer.disconnect(error)
+                    viewer.request_disconnect(error)
             await asyncio.sleep(due_s - loop.time())
 
     async def send_update(self, now_s: float) -> None:
@@ -123,7 +125,7 @@ class RateGroup:
         tick = Tick(self._pending, _newest_frame_ages_ms(self._nodes.values()))
         for count, viewer in enumerate(tuple(self.subscribers), 1):
             if viewer in self.subscribers:  # it may have left meanwhile
-                viewer.send_tick(tick, now_s)
+                viewer.send_or_merge_tick(tick, now_s)
             if count % _WRITES_PER_TURN == 0:
                 await asyncio.sleep(0)
 
@@ -144,16 +146,16 @@ class Broadcaster:
         return sum(len(feed.subscribers) for feed, _ in self._groups.values())
 
     def subscribe(
-        self, socket: SubscriberSocket, rate_hz: float, node_filter: str | None = None
+        self, socket: SubscriberSocket, max_rate_hz: float, node_filter: str | None = None
     ) -> Subscriber:
         """Add a subscriber to events from now on, of all nodes or one.
 
         Args:
             socket: websocket of the subscriber.
-            rate_hz: greatest update rate, 1 to 60.
+            max_rate_hz: greatest update rate, 1 to 60.
             node_filter: node of interest; None: all.
         """
-        key = node_filter, max(rate for rate in RATES_HZ if rate <= rate_hz)
+        key = node_filter, max(rate for rate in RATES_HZ if rate <= max_rate_hz)
         if key not in self._groups:
             feed = RateGroup(*key, self._nodes)
             self._groups[key] = feed, asyncio.create_task(feed.run())
@@ -169,24 +171,24 @@ class Broadcaster:
                 task.cancel()
                 del self._groups[key]
 
-    def send_notice(self, message: Mapping[str, Any]) -> None:
+    def queue_notice(self, message: Mapping[str, Any]) -> None:
         """Queue a message to all subscribers for the next update."""
         if self._groups:
             text = encode_json(message)
             for summary in self._pending_updates():
                 summary.add_notice(text)
 
-    def send_progress(
+    def queue_progress(
         self, node: str, progress_by_session: Mapping[str, Mapping[str, Any]]
     ) -> None:
         """Queue the progress of sessions, by id, for the subscribers of their node."""
         for summary in self._pending_updates():
             summary.add_progress(node, progress_by_session)
 
-    def add_frames(self, node: ServerNode, due: list[EstimatedBatch]) -> None:
+    def add_to_history_and_updates(self, node: ServerNode, batches: list[EstimatedBatch]) -> None:
         """Add estimated frames of a node to its histories and to the next updates."""
         self._nodes[node.name] = node
-        for frames, columns in due:
+        for frames, columns in batches:
             node.published_t_ns = int(frames.t_ns[-1])
             span = summarize_force(frames, columns)
             self._force_histories.setdefault(node.name, ForceHistory()).add_span(
@@ -196,18 +198,18 @@ class Broadcaster:
             if self._groups:
                 piece = summarize_frames(node.stream_id, span, frames, columns)
                 for summary in self._pending_updates():
-                    summary.add_frames(node.name, piece)
+                    summary.add_summary(node.name, piece)
 
-    def force_history(self, node: ServerNode) -> ForceHistory:
+    def get_present_force_history(self, node: ServerNode) -> ForceHistory:
         """Return the force history of a node's present stream; an empty one if it has no frames."""
         recent = self._force_histories.get(node.name)
         return (
             recent if recent is not None and recent.stream_id == node.stream_id else ForceHistory()
         )
 
-    def tile_history(self, node: ServerNode) -> TileHistory:
+    def get_present_tile_history(self, node: ServerNode) -> TileHistory:
         """Return the tile history of a node's present stream; it replaces one of another stream."""
-        return self._get_tile_history(node, len(node.info.tiles))
+        return self._get_tile_history(node, len(node.last_info.tiles))
 
     def _get_tile_history(self, node: ServerNode, tiles: int) -> TileHistory:
         recent = self._tile_histories.get(node.name)
@@ -221,10 +223,10 @@ class Broadcaster:
         return _newest_frame_ages_ms([node]).get(node.name) if has_frames else None
 
     def _pending_updates(self) -> list[PendingUpdate]:
-        return [feed.pending_update() for feed, _ in self._groups.values()]
+        return [feed.schedule_pending_update() for feed, _ in self._groups.values()]
 
 
-def frame_texts(texts: Iterable[str]) -> bytes:
+def encode_websocket_messages(texts: Iterable[str]) -> bytes:
     """Encode texts as websocket messages of a server (RFC 6455), one behind the other."""
     return b"".join(
         Frame(Opcode.TEXT, text.encode()).serialize(mask=False, extensions=()) for text in texts

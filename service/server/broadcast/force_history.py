@@ -57,19 +57,21 @@ class ForceHistory:
         ):
             self._merge(self._as_published.popleft())
 
-    def get_spans(self, seconds: float, before_seq: int | None = None) -> npt.NDArray[np.void]:
+    def get_newest_spans(
+        self, seconds: float, end_before_seq: int | None = None
+    ) -> npt.NDArray[np.void]:
         """Return the newest seconds, with the fields of `ForceSpan`, oldest first.
 
         Args:
             seconds: counted back from the newest frame.
-            before_seq: only spans that end before this number.
+            end_before_seq: only spans that end before this number.
         """
         first = max(0, self._count - _MERGED_MAX)
         older = self._merged[np.arange(first, self._count) % _MERGED_MAX]
         newer = [*([] if self._last_merged is None else [self._last_merged]), *self._as_published]
         rows = np.concatenate([older, np.array(newer, _ROW)])
-        if before_seq is not None:
-            rows = rows[rows["seq"] < before_seq]
+        if end_before_seq is not None:
+            rows = rows[rows["seq"] < end_before_seq]
         if len(rows):
             rows = rows[rows["t_ns"] > rows["t_ns"][-1] - int(seconds * 1e9)]
         return rows

@@ -124,7 +124,7 @@ class PendingUpdate:
         """Add a message for all; the oldest are dropped if they are not sent."""
         self._notices.append(message)
 
-    def add_frames(self, node: str, summary: FrameSummary) -> None:
+    def add_summary(self, node: str, summary: FrameSummary) -> None:
         """Merge the summary of newer frames of a node, unless it is filtered out."""
         if self._node_filter not in (None, node):
             return
@@ -164,7 +164,7 @@ class PendingUpdate:
             for first, last in dropped:
                 self._add_dropped(node, first, last)
         for node, piece in update.summaries.items():
-            self.add_frames(node, piece)
+            self.add_summary(node, piece)
 
     def _add_dropped(self, node: str, seq_first: int, seq_last: int) -> None:
         # Frames missed for hours are one interval, not a growing list.

@@ -60,23 +60,25 @@ class TileHistory:
         self._extremes[index] = least, greatest
         self._count += 1
 
-    def get_spans(
-        self, seconds: float, unit: str, before_seq: int | None = None
+    def get_newest_spans(
+        self, seconds: float, quantity: str, begin_before_seq: int | None = None
     ) -> tuple[npt.NDArray[np.void], Halves, Halves]:
         """Return the newest seconds, oldest first.
 
         Args:
             seconds: counted back from the newest frame.
-            unit: one of `UNITS`.
-            before_seq: only spans that begin before this number.
+            quantity: one of `UNITS`.
+            begin_before_seq: only spans that begin before this number.
 
         Returns:
             Numbers (n,) with the fields of `ForceSpan`, minimum and maximum (n, tiles).
         """
         indices = np.arange(max(0, self._count - _SPANS_MAX), self._count) % _SPANS_MAX
         rows = self._rows[indices]
-        keep = rows["seq_first"] < (np.iinfo(np.int64).max if before_seq is None else before_seq)
+        keep = rows["seq_first"] < (
+            np.iinfo(np.int64).max if begin_before_seq is None else begin_before_seq
+        )
         if keep.any():
             keep &= rows["t_ns"] > rows["t_ns"][keep][-1] - int(seconds * 1e9)
-        least, greatest = self._extremes[indices[keep], :, UNITS.index(unit)].swapaxes(0, 1)
+        least, greatest = self._extremes[indices[keep], :, UNITS.index(quantity)].swapaxes(0, 1)
         return rows[keep], least, greatest

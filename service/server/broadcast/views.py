@@ -15,7 +15,7 @@ from service.estimation.tare.tare import (
     IntervalSource,
     compute_thermal_shift_kpa,
     compute_warming_k,
-    fit_trend,
+    fit_recent_baseline_trend,
 )
 from service.private_paths import PublicText
 from service.server.estimates.ranges import TileRanges
@@ -23,7 +23,7 @@ from service.server.estimates.tare_controller import AutoTare
 from service.server.identities import RefusedMachine
 from service.server.node import ServerNode
 from service.server.recorder import Recorder
-from service.server.session_store import marker_revision, session_revision
+from service.server.session_store import marker_revision, user_fields_revision
 from service.sessions.tare_file import RecordedTare
 from storage.sessions.folder import Marker, Part, Session
 
@@ -124,8 +124,10 @@ class DriftView(View):
     @classmethod
     def from_node(cls, node: ServerNode) -> DriftView:
         """Return the present drift of a node."""
-        live, tiles = node.estimator.live, len(node.info.tiles)
-        line = fit_trend(node.estimator.tare_history.valid_tares(node.info), tiles=tiles)
+        live, tiles = node.estimator.live, len(node.last_info.tiles)
+        line = fit_recent_baseline_trend(
+            node.estimator.tare_history.valid_tares(node.last_info), tiles=tiles
+        )
         unknown = np.full(tiles, np.nan)
         slope = unknown if live.ranges is None else live.ranges.slope_n_per_kpa
         warmer_by_k = (
@@ -137,7 +139,7 @@ class DriftView(View):
             unknown if live.tare is None else compute_thermal_shift_kpa(live.tare, warmer_by_k)
         )
         # A bare tile has no sealed gas.
-        since_kpa = np.where([tile.reference for tile in node.info.tiles], np.nan, since_kpa)
+        since_kpa = np.where([tile.reference for tile in node.last_info.tiles], np.nan, since_kpa)
         return cls(
             kpa_per_hour=_nan_to_none(line.kpa_per_hour),
             sigma_kpa_per_hour=_nan_to_none(line.sigma_kpa_per_hour),
@@ -242,10 +244,10 @@ class NodeView(View):
         cls, node: ServerNode, recorder: Recorder, replacement: RefusedMachine | None
     ) -> NodeView:
         """Return the present state of a node."""
-        info, estimates = node.info, node.estimator
+        info, estimates = node.last_info, node.estimator
         live, keeper = estimates.live, estimates.tare_controller
         calibration = live.calibration
-        tare, lost = estimates.tare_history.tare_in_force(info), node.lost_by_reason
+        tare, lost = estimates.tare_history.tare_in_force(info), node.present_stream_lost_by_reason
         return cls(
             node=node.name,
             connected=node.is_connected,
@@ -365,7 +367,7 @@ class SessionView(View):
             lost=ledger.lost,
             missed_slots=ledger.missed_slots,
             marker_count=len(session.markers),
-            revision=session_revision(session),
+            revision=user_fields_revision(session),
             max_lost_tail_frames=ledger.max_lost_tail_frames,
             problem=recorder.find_problem(session),
             duration_s=recorder.compute_duration_s(session, ledger.recorded),

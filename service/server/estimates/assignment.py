@@ -60,7 +60,7 @@ class CalibrationAssignment:
         except StorageError as error:
             self.problem = f"the calibration that was assigned cannot be read: {error}"
 
-    def assign(self, calibration: Calibration, t_ns: int) -> None:
+    def store_assignment(self, calibration: Calibration, t_ns: int) -> None:
         """Store a calibration as the assigned one, in place of the present one.
 
         Raises:
@@ -69,7 +69,7 @@ class CalibrationAssignment:
         self._store({"id": calibration.id, **calibration.model_dump(mode="json")}, t_ns)
         self.current, self.problem = AssignedCalibration(calibration, t_ns), None
 
-    def unassign(self, t_ns: int) -> None:
+    def clear_stored_assignment(self, t_ns: int) -> None:
         """Remove the assignment, on the disk too: the node's own calibration is used again.
 
         Raises:

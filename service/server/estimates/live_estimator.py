@@ -22,9 +22,9 @@ from service.estimation.pipeline.plan import make_plan
 from service.estimation.tare.automatic import (
     HISTORY_NS,
     FlightTareResult,
-    compute_first_flight_tare,
-    compute_flight_tare,
     compute_newest_unloaded_tare,
+    propose_first_flight_tare,
+    propose_flight_tare,
 )
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded_windows import TareFrames, compute_recording_tare
@@ -126,7 +126,7 @@ class LiveEstimator:
         )
         self._run = EstimateRun(plan)
 
-    def continue_from(self, previous: LiveEstimator) -> None:
+    def drain_frames_from(self, previous: LiveEstimator) -> None:
         """Take the frames of an estimator of the same stream with another calibration, and end it.
 
         Its recent frames are taken over, not copied; frames that wait for their look-ahead are
@@ -192,7 +192,7 @@ class LiveEstimator:
         shift_n = (slope_n_per_kpa * baseline_shift_kpa)[np.isfinite(slope_n_per_kpa)]
         return float(shift_n.sum()) if np.isfinite(shift_n).all() else None
 
-    def tare_from_lead(self, lead: FrameBatch) -> Tare:
+    def compute_lead_tare(self, lead: FrameBatch) -> Tare:
         """Compute the tare from an emulated lead; the tare in force is unchanged.
 
         Raises:
@@ -213,12 +213,12 @@ class LiveEstimator:
             return FlightTareResult()
         frames = FrameBatch.concatenate(list(self._recent))
         if tare is None:
-            return compute_first_flight_tare(self._tare_frames(frames, calibration))
+            return propose_first_flight_tare(self._tare_frames(frames, calibration))
         if self.airborne_since_t_ns is None or self._estimated_t_ns is None:
             return FlightTareResult()
         # Contact of newer frames is not estimated yet.
         count = int(np.searchsorted(frames.t_ns, self._estimated_t_ns, side="right"))
-        return compute_flight_tare(
+        return propose_flight_tare(
             self._tare_frames(frames.slice_rows(0, count), calibration),
             present=tare,
             last_manual=anchor,
@@ -226,7 +226,7 @@ class LiveEstimator:
             is_load_bearing=self._is_loaded_tile,
         )
 
-    def compute_tare(self) -> Tare:
+    def compute_unloaded_tare(self) -> Tare:
         """Compute a tare from the newest unloaded interval of the last seconds, not in force yet.
 
         Raises:

@@ -48,7 +48,7 @@ class NodeEstimator:
         self._restart()
 
     @property
-    def info(self) -> ArrayInfo:
+    def last_info(self) -> ArrayInfo:
         """Array of the present stream, from the last hello."""
         return self._hello.array_info
 
@@ -89,7 +89,7 @@ class NodeEstimator:
             return tuple(self.live.epochs)
         return self._ended_epochs.get(stream_id, ())
 
-    def assign_calibration(self, calibration: Calibration | None, t_ns: int) -> None:
+    def store_and_apply_calibration(self, calibration: Calibration | None, t_ns: int) -> None:
         """Store the assigned calibration, and use it from the next frame on.
 
         Sessions that are being recorded keep theirs.
@@ -102,17 +102,17 @@ class NodeEstimator:
             StorageError: that cannot be stored; nothing has changed then.
         """
         if calibration is None:
-            self.assignment.unassign(t_ns)
+            self.assignment.clear_stored_assignment(t_ns)
         else:
-            self.assignment.assign(calibration, t_ns)
+            self.assignment.store_assignment(calibration, t_ns)
         before = self.live
         self._restart()
         try:
-            self.live.continue_from(before)
+            self.live.drain_frames_from(before)
         except Exception as error:
             self._disable(error)
 
-    def on_hello(self, hello: Hello) -> None:
+    def restart_if_changed(self, hello: Hello) -> None:
         """Restart the estimator if hello has another stream or calibration."""
         previous, self._hello = self._hello, hello
         if previous.array_info.stream_id != hello.array_info.stream_id:
@@ -134,14 +134,14 @@ class NodeEstimator:
             self._disable(error)
             return [(frames, {})]
 
-    def update_tare(self, journal: Journal | None, get_obtainable: Callable[[], Intervals]) -> None:
+    def tare_if_due(self, journal: Journal | None, get_obtainable: Callable[[], Intervals]) -> None:
         """Tare if there is reason to, as `TareController.update`.
 
         Raises:
             StorageError: the tare cannot be stored; it is not in force then, and retried.
         """
         try:
-            self.tare_controller.update(journal, get_obtainable)
+            self.tare_controller.tare_if_due(journal, get_obtainable)
         except StorageError:
             raise
         except Exception as error:
@@ -150,22 +150,22 @@ class NodeEstimator:
     def _restart(self) -> None:
         self._has_failed = False
         try:
-            tare = self.tare_history.tare_for_estimates(self.info)
-            self.live = LiveEstimator(self.info, self.configured_calibration, tare, self.live)
+            tare = self.tare_history.tare_in_force_or_lost(self.last_info)
+            self.live = LiveEstimator(self.last_info, self.configured_calibration, tare, self.live)
         except Exception as error:
             self._disable(error)
             return
         automatic = self._hello.scene.get("auto_tare", True) is not False
         self.tare_controller = TareController(
-            self.info, self.live, self.tare_history, automatic=automatic
+            self.last_info, self.live, self.tare_history, automatic=automatic
         )
 
     def _disable(self, error: Exception) -> None:
-        node = self.info.node
+        node = self.last_info.node
         log.exception("node %s: this is a bug; it goes on without estimates", node)
         self._has_failed = True
-        self.live = LiveEstimator(self.info, None, None, self.live)
+        self.live = LiveEstimator(self.last_info, None, None, self.live)
         self.live.calibration_problem = f"the estimator failed, until it connects again: {error!r}"
         self.tare_controller = TareController(
-            self.info, self.live, self.tare_history, automatic=False
+            self.last_info, self.live, self.tare_history, automatic=False
         )

@@ -24,7 +24,7 @@ from service.estimation.tare.tare import (
     Tare,
     compute_thermal_shift_kpa,
     compute_warming_k,
-    has_warmed,
+    has_temperature_changed,
 )
 from service.server.estimates.live_estimator import LiveEstimator
 from service.sessions.tare_file import RecordedTare
@@ -103,7 +103,7 @@ class TareController:
     def _temperature_warning(self, tare: Tare) -> str | None:
         temperature_raw = self._live.mean_recent_temperature_raw()
         bears = np.array([not tile.reference for tile in self._info.tiles])
-        tiles = np.flatnonzero(has_warmed(tare, temperature_raw) & bears)
+        tiles = np.flatnonzero(has_temperature_changed(tare, temperature_raw) & bears)
         if not len(tiles):
             return None
         warmer = compute_warming_k(tare, temperature_raw)
@@ -123,7 +123,7 @@ class TareController:
             TareError: the foot was loaded, or there is nothing to tare.
             StorageError: the tare cannot be stored.
         """
-        recorded = self._history.add_tare(self._live.compute_tare(), self._info, reason)
+        recorded = self._history.store_tare(self._live.compute_unloaded_tare(), self._info, reason)
         self._put_in_force(recorded)
         return recorded
 
@@ -135,9 +135,9 @@ class TareController:
         """
         self._history.undo_tare(tare_id)
         self._flight_warning = None
-        self._live.set_tare(self._history.tare_for_estimates(self._info))
+        self._live.set_tare(self._history.tare_in_force_or_lost(self._info))
 
-    def update(self, journal: Journal | None, get_obtainable: Callable[[], Intervals]) -> None:
+    def tare_if_due(self, journal: Journal | None, get_obtainable: Callable[[], Intervals]) -> None:
         """Tare from a lead that has ended, or in flight, if that is due.
 
         Args:
@@ -179,15 +179,15 @@ class TareController:
             self._is_lead_done = True
             return
         try:
-            tare = self._live.tare_from_lead(lead)
+            tare = self._live.compute_lead_tare(lead)
         except TareError as error:
             self._is_lead_done, self._lead_problem = True, error.what
             return
-        keys = {(t.tare.source, t.tare.t_ns) for t in self._history.tares}
+        keys = {(t.tare.source, t.tare.t_ns) for t in self._history.all_tares}
         # In the history, or lost: the server was restarted, and another tare may have followed.
-        is_older = not self._has_seen_lead and self._history.may_be_lost(tare.t_ns)
+        is_older = not self._has_seen_lead and self._history.may_have_lost_tare(tare.t_ns)
         if ("lead", tare.t_ns) not in keys and not is_older:
-            self._live.set_tare(self._history.add_tare(tare, self._info).tare)
+            self._live.set_tare(self._history.store_tare(tare, self._info).tare)
         self._is_lead_done = True
 
     def _is_flight_check_due(self) -> bool:
@@ -205,13 +205,13 @@ class TareController:
         return True
 
     def _tare_in_flight(self) -> None:
-        anchor = self._history.automatic_reference(self._info)
+        anchor = self._history.last_non_automatic_or_oldest(self._info)
         found: FlightTareResult = self._live.find_flight_tare(
             anchor.tare if anchor is not None else None
         )
         self._flight_warning = found.rejection
         if found.tare is not None:
-            self._put_in_force(self._history.add_tare(found.tare, self._info, found.reason))
+            self._put_in_force(self._history.store_tare(found.tare, self._info, found.reason))
 
     def _put_in_force(self, recorded: RecordedTare) -> None:
         self._lead_problem = self._flight_warning = None

@@ -65,7 +65,9 @@ class ArrowEncoder:
         """Return the schema's message."""
         return self.schema.serialize().to_pybytes()
 
-    def encode_rows(self, rows: FrameRows, cache: EncodeCache) -> Iterator[tuple[bytes, int]]:
+    def encode_rows_with_next_seq(
+        self, rows: FrameRows, cache: EncodeCache
+    ) -> Iterator[tuple[bytes, int]]:
         """Yield messages of at most `ROWS_MAX` frames, each with the number of the next frame.
 
         Args:

@@ -66,7 +66,7 @@ class FeedBuffer:
         self._waiting: set[asyncio.Event] = set()
 
     @property
-    def oldest_number(self) -> int:
+    def oldest_batch_number(self) -> int:
         """Number of the oldest batch, or of the next one if the buffer is empty."""
         return self._next_number - len(self._batches)
 
@@ -76,13 +76,13 @@ class FeedBuffer:
         return len(self._waiting)
 
     @property
-    def next_number(self) -> int:
+    def next_batch_number(self) -> int:
         """Number of the next batch."""
         return self._next_number
 
-    def add_batches(self, stream_id: str, due: list[EstimatedBatch]) -> None:
+    def add_batches(self, stream_id: str, batches: list[EstimatedBatch]) -> None:
         """Add due batches, which may be none, and wake all readers."""
-        for frames, columns in due:
+        for frames, columns in batches:
             if not len(frames):
                 continue
             self._batches.append(FeedBatch(self._next_number, stream_id, frames, columns))
@@ -100,7 +100,7 @@ class FeedBuffer:
 
     def __getitem__(self, number: int) -> FeedBatch:
         """Return the batch of this number, which is in the buffer."""
-        return self._batches[number - self.oldest_number]
+        return self._batches[number - self.oldest_batch_number]
 
     def find_batch(self, stream_id: str, seq: int) -> FeedBatch | None:
         """Return the batch with this frame; None if it is not in the buffer."""
@@ -137,7 +137,7 @@ class FeedBuffer:
             self._waiting.discard(news)
 
 
-async def wait_for_batch(event: asyncio.Event) -> None:
+async def wait_briefly_for_batch(event: asyncio.Event) -> None:
     """Wait for new frames, at most a second: not every change sets the event."""
     try:
         async with asyncio.timeout(_POLL_S):
@@ -157,11 +157,11 @@ class FeedBuffers:
         """Return the buffer of a node, created for its first reader."""
         return self._buffers.setdefault(node, FeedBuffer(self._turn))
 
-    def add_batches(self, node: ServerNode, due: list[EstimatedBatch]) -> None:
+    def add_to_existing_buffer(self, node: ServerNode, batches: list[EstimatedBatch]) -> None:
         """Add estimated frames of a node's present stream to its buffer, if it has one."""
         memory = self._buffers.get(node.name)
         if memory is not None:
-            memory.add_batches(node.stream_id, due)
+            memory.add_batches(node.stream_id, batches)
 
 
 def _size_bytes(frames: FrameBatch, columns: Columns) -> int:

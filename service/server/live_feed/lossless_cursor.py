@@ -65,7 +65,7 @@ class LosslessCursor:
         self.position = position
         self._buffer = buffer
         self._find_stream = find_stream
-        self._next_number: int | None = buffer.next_number if position is None else None
+        self._next_number: int | None = buffer.next_batch_number if position is None else None
         """Number of the next batch, while the reader is served from the buffer."""
 
     def next_event(self) -> FeedEvent | Recompute | None:
@@ -76,9 +76,9 @@ class LosslessCursor:
         """
         memory = self._buffer
         if (position := self.position) is None:
-            if self._next_number is None or self._next_number >= memory.next_number:
+            if self._next_number is None or self._next_number >= memory.next_batch_number:
                 return None
-            self._next_number = max(self._next_number, memory.oldest_number)
+            self._next_number = max(self._next_number, memory.oldest_batch_number)
             piece = memory[self._next_number]
             position = self.position = Position(piece.stream_id, piece.first_seq)
         if (found := self._buffered_batch(position)) is not None:
@@ -115,9 +115,9 @@ class LosslessCursor:
         memory, number = self._buffer, self._next_number
         if number is None:
             return memory.find_batch(position.stream_id, position.seq)
-        if number < memory.oldest_number:
+        if number < memory.oldest_batch_number:
             raise CloseConnection(LinkCloseCode.TOO_SLOW, f"too slow; {position}")
-        if number < memory.next_number:
+        if number < memory.next_batch_number:
             piece = memory[number]
             if piece.stream_id == position.stream_id and piece.first_seq <= position.seq:
                 return piece
@@ -128,7 +128,7 @@ class LosslessCursor:
         self, position: Position, stream: StreamView, ahead: FeedBatch | None
     ) -> FeedEvent | None:
         """Return the event for a frame that is not stored: none yet, a gap, or the next stream."""
-        comes = stream.compute_obtainable().restricted_to(position.seq, NO_END).first
+        comes = stream.compute_unstored_obtainable().restricted_to(position.seq, NO_END).first
         if comes == position.seq:
             return None
         next_stored = stream.stored.restricted_to(position.seq, NO_END).first
@@ -144,7 +144,7 @@ class LosslessCursor:
             reason, last = _loss_reason(stream, position.seq, to_seq)
             self._move_to(Position(position.stream_id, last + 1))
             return Gap(position.stream_id, position.seq, last, reason)
-        following = stream.next_stream if stream.has_ended else None
+        following = stream.next_stream_id if stream.has_ended else None
         if following is None:
             return None
         self._move_to(Position(following, 0))

@@ -41,7 +41,7 @@ class LossyCursor:
         self._buffer = buffer
         self._find_stream = find_stream
         self._queue_ns = queue_ns
-        self._next_number = buffer.next_number
+        self._next_number = buffer.next_batch_number
         """Number of the next batch to send."""
         if position is not None:
             key = position.stream_id, position.seq
@@ -50,7 +50,7 @@ class LossyCursor:
 
     def next_event(self) -> FeedEvent | None:
         """Return the next event and go on to the one after; None: nothing yet."""
-        while self._next_number < self._buffer.next_number:
+        while self._next_number < self._buffer.next_batch_number:
             piece, position = self._oldest_allowed(), self.position
             reason = SLOW if piece.number > self._next_number else LATE
             if position is not None and position.stream_id != piece.stream_id:
@@ -76,10 +76,10 @@ class LossyCursor:
     def _oldest_allowed(self) -> FeedBatch:
         """Return the oldest batch that is not to be dropped."""
         memory = self._buffer
-        newest = memory[memory.next_number - 1]
+        newest = memory[memory.next_batch_number - 1]
         if self._queue_ns is None:
             return newest
-        number = max(self._next_number, memory.oldest_number)
+        number = max(self._next_number, memory.oldest_batch_number)
         until_t_ns = int(newest.frames.t_ns[-1]) - self._queue_ns
         while number < newest.number and memory[number].frames.t_ns[-1] < until_t_ns:
             number += 1
@@ -96,7 +96,7 @@ class LossyCursor:
         current: str | None = stream_id
         while current is not None and current != target:
             stream = self._find_stream(current)
-            current = None if stream is None else stream.next_stream
+            current = None if stream is None else stream.next_stream_id
             if current in seen:
                 return target
             if current is not None and len(seen) == 1:

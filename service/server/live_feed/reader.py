@@ -15,7 +15,7 @@ from typing import Literal, get_args
 from devices.errors import DamagedFramesError, FootTileError, StorageError
 from service.estimation.compilation import is_compiling
 from service.protocol import CloseConnection, LinkCloseCode
-from service.server.live_feed.buffer import FeedBuffer, wait_for_batch
+from service.server.live_feed.buffer import FeedBuffer, wait_briefly_for_batch
 from service.server.live_feed.events import FeedEvent, FrameRows, Position, StreamStart, slice_batch
 from service.server.live_feed.lossless_cursor import LosslessCursor, Recompute
 from service.server.live_feed.lossy_cursor import QUEUE_NS, LossyCursor
@@ -42,7 +42,7 @@ def start_position(
         return None
     stream_id = node.stream_id if stream_id is None else stream_id
     if stream_id in node.unreadable_streams:
-        node.retry_unreadable()
+        node.retry_unreadable_journals()
     if stream_id not in node.streams and stream_id not in (
         *node.stream_order,
         *node.unreadable_streams,
@@ -106,7 +106,7 @@ class FeedReader:
                 news.clear()
                 item = await self.next_event()
                 if item is None:
-                    await wait_for_batch(news)
+                    await wait_briefly_for_batch(news)
                     continue
                 if not isinstance(item, StreamStart) and item.stream_id != announced_id:
                     yield StreamStart(item.stream_id, item.first_seq)

@@ -125,7 +125,7 @@ class RecomputedFrames:
         self.position = position
         """Next frame."""
         calibration = node.estimator.live.calibration
-        if calibration is not None and not _is_compatible(calibration, stream.info, node.info):
+        if calibration is not None and not _is_compatible(calibration, stream.info, node.last_info):
             calibration = None
         last = self._journal.stored.last or 0
         begin = self._first_model_seq(node, stream, calibration, position.seq)
@@ -142,7 +142,7 @@ class RecomputedFrames:
     ) -> int:
         """Return the number of the frame with which models start."""
         t_ns = self._journal.find_t_ns_near(seq, is_upper=False)
-        tare = node.estimator.tare_history.tare_for_estimates(stream.info)
+        tare = node.estimator.tare_history.tare_in_force_or_lost(stream.info)
         if calibration is None or tare is None or t_ns is None:
             return seq
         plan = make_plan(
@@ -213,5 +213,5 @@ def _list_changes(
     until_ns = journal.find_t_ns_near(until, is_upper=True)
     if t_ns is None or until_ns is None:
         return recorded
-    tares = node.estimator.tare_history.tares_between(stream.info, t_ns, until_ns)
+    tares = node.estimator.tare_history.tares_in_force_between(stream.info, t_ns, until_ns)
     return [*(EstimateInputsChange(calibration, tare, t_ns=tare.t_ns) for tare in tares), *recorded]

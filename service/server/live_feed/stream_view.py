@@ -30,10 +30,10 @@ class StreamView(Protocol):
         """Number after the last known frame."""
 
     @property
-    def next_stream(self) -> str | None:
+    def next_stream_id(self) -> str | None:
         """Next stream of the node; None: this is the present one."""
 
-    def compute_obtainable(self) -> Intervals:
+    def compute_unstored_obtainable(self) -> Intervals:
         """Return the frames that are not stored and that the node can still send."""
 
 
@@ -92,8 +92,8 @@ class ServerStreamView:
         return max([announced or 0, *ends])
 
     @property
-    def next_stream(self) -> str | None:
-        """See `StreamView.next_stream`."""
+    def next_stream_id(self) -> str | None:
+        """See `StreamView.next_stream_id`."""
         node, order = self._node, self._node.stream_order
         if self._stream_id in order:
             return (*order, None)[order.index(self._stream_id) + 1]
@@ -106,8 +106,8 @@ class ServerStreamView:
                     return each.array_info.stream_id
         return node.stream_id
 
-    def compute_obtainable(self) -> Intervals:
-        """Return the frames as in `StreamView.compute_obtainable`."""
+    def compute_unstored_obtainable(self) -> Intervals:
+        """Return the frames as in `StreamView.compute_unstored_obtainable`."""
         stream = self._stream
         if stream is None:
             return Intervals([(0, NO_END)])

@@ -18,7 +18,7 @@ from storage.formats.readers.device_columns import (
 )
 from storage.formats.readers.plate_signals import make_plate_table
 from storage.formats.readers.table import ColumnFilter, ForceTable
-from storage.formats.readers.text import is_number, split_cells_trimmed
+from storage.formats.readers.text import is_number, split_cells_without_empty_end
 
 FORM = "lines of facts, a line of names that begins with a time, lines of numbers"
 _NAMES = re.compile(
@@ -32,7 +32,9 @@ def is_bioware(head: str) -> bool:
     return re.match(r"\s*\"?bioware\b", head, re.IGNORECASE) is not None
 
 
-def read_bioware(text: str, where: str, is_needed: ColumnFilter, values_max: int) -> ForceTable:
+def parse_bioware_force_and_cop(
+    text: str, where: str, _is_needed: ColumnFilter, values_max: int
+) -> ForceTable:
     """Parse the vertical force and centre of pressure of each plate, whichever columns are needed.
 
     Raises:
@@ -45,13 +47,13 @@ def read_bioware(text: str, where: str, is_needed: ColumnFilter, values_max: int
     facts = {
         cells[0].strip(" :").lower(): cells[1:]
         for line in text[: found.start()].split("\n")
-        if (cells := split_cells_trimmed(line, delimiter))
+        if (cells := split_cells_without_empty_end(line, delimiter))
     }
     line, _, rows = text[found.start() :].partition("\n")
-    names = split_cells_trimmed(line, delimiter)[1:]
+    names = split_cells_without_empty_end(line, delimiter)[1:]
     devices = [*facts.get("device", []), *[""] * len(names)]
     units = [""] * (len(names) + 1)
-    below = split_cells_trimmed(rows.partition("\n")[0], delimiter)
+    below = split_cells_without_empty_end(rows.partition("\n")[0], delimiter)
     if not any(map(is_number, below)):
         units = [*below, *units]
         rows = rows.partition("\n")[2]
@@ -78,7 +80,9 @@ def read_bioware(text: str, where: str, is_needed: ColumnFilter, values_max: int
         where,
         numbers[0] * second,
         [
-            make_plate_signals(f"plate{i + 1}", plate, columns, numbers, is_positive=True)
+            make_plate_signals(
+                f"plate{i + 1}", plate, columns, numbers, is_positive_under_load=True
+            )
             for i, plate in enumerate(plates)
         ],
         notes,

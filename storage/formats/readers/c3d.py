@@ -54,20 +54,24 @@ class C3dFile:
     raw: RawNumbers
     notes: tuple[str, ...] = ()
 
-    def get_text_parameter(self, group: str, name: str) -> list[str]:
+    def get_texts_or_empty(self, group: str, name: str) -> list[str]:
         """Return a parameter that is a list of texts; empty if missing or of another type."""
         value = self.parameters.get(group, {}).get(name)
         return value if isinstance(value, list) else []
 
-    def get_number_parameter(self, group: str, name: str) -> RawNumbers:
+    def get_numbers_or_empty(self, group: str, name: str) -> RawNumbers:
         """Return a parameter that is an array of numbers; empty if missing or of another type."""
         value = self.parameters.get(group, {}).get(name)
         return np.empty(0) if value is None or isinstance(value, list) else value
 
-    def get_channel_texts(self, name: str) -> list[str]:
+    def get_channel_texts(self, parameter_name: str) -> list[str]:
         """Return a text parameter of ANALOG, one a channel; beyond 255 from NAME2 and so on."""
-        more = (f"{name}{number}" for number in range(2, 2 + self.channel_count // 255))
-        return [text for one in (name, *more) for text in self.get_text_parameter("ANALOG", one)]
+        more = (f"{parameter_name}{number}" for number in range(2, 2 + self.channel_count // 255))
+        return [
+            text
+            for one in (parameter_name, *more)
+            for text in self.get_texts_or_empty("ANALOG", one)
+        ]
 
     def get_scaled_samples(self, channels: Sequence[int]) -> Floats:
         """Return the scaled samples of channels, (len(channels), n), each in its unit.
@@ -76,7 +80,7 @@ class C3dFile:
             FileFormatError: the file states no scale for a channel.
         """
         scale, offset = self._get_channel_numbers("SCALE"), self.get_channel_offsets()
-        general = float(np.ravel(self.get_number_parameter("ANALOG", "GEN_SCALE"))[:1].sum() or 1.0)
+        general = float(np.ravel(self.get_numbers_or_empty("ANALOG", "GEN_SCALE"))[:1].sum() or 1.0)
         at = list(channels)
         if max(at) >= min(len(scale), len(offset)):
             raise FileFormatError(
@@ -95,11 +99,11 @@ class C3dFile:
         return offset % 65536 if self._is_unsigned() else offset
 
     def _is_unsigned(self) -> bool:
-        return "".join(self.get_text_parameter("ANALOG", "FORMAT")).strip().upper() == "UNSIGNED"
+        return "".join(self.get_texts_or_empty("ANALOG", "FORMAT")).strip().upper() == "UNSIGNED"
 
     def _get_channel_numbers(self, name: str) -> Floats:
         more = (f"{name}{number}" for number in range(2, 2 + self.channel_count // 255))
-        parts = [np.ravel(self.get_number_parameter("ANALOG", one)) for one in (name, *more)]
+        parts = [np.ravel(self.get_numbers_or_empty("ANALOG", one)) for one in (name, *more)]
         return np.concatenate(parts).astype(np.float64)
 
 

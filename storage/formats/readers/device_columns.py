@@ -14,8 +14,8 @@ from storage.formats.readers.plate_signals import PlateSignals
 from storage.formats.readers.text import (
     TextLayout,
     parse_columns,
-    split_cells_trimmed,
-    split_cells_unchanged,
+    split_cells_without_empty_end,
+    split_csv_cells,
 )
 
 FORCE_UNITS = {"n": "N", "kn": "kN"}
@@ -96,8 +96,8 @@ def parse_device_columns(
         raise FileFormatError(
             "there are no numbers below the names", where=where, expected="a whole file"
         )
-    width = len(split_cells_unchanged(first, delimiter))
-    if len(split_cells_trimmed(first, delimiter)) > len(columns) or width <= max(indices):
+    width = len(split_csv_cells(first, delimiter))
+    if len(split_cells_without_empty_end(first, delimiter)) > len(columns) or width <= max(indices):
         raise FileFormatError(
             f"there are {len(columns)} names for {width} columns of numbers",
             where=where,
@@ -121,7 +121,7 @@ def make_plate_signals(
     columns: Sequence[DeviceColumn],
     numbers: dict[int, Floats],
     *,
-    is_positive: bool = False,
+    is_positive_under_load: bool = False,
 ) -> PlateSignals:
     """Return a plate made of its columns, with a note about its name in the file."""
     head = columns[plate_columns["fz"]]
@@ -134,7 +134,7 @@ def make_plate_signals(
         np.stack([numbers[i] for i in cop]) if cop else None,
         FORCE_UNITS.get(head.unit.lower()),
         length if length in LENGTH_UNITS else None,
-        is_positive,
+        is_positive_under_load,
         (f"{head.device!r} of the file",),
     )
 

@@ -23,7 +23,7 @@ from devices.errors import FileFormatError
 from storage.formats.readers.c3d import C3dFile, read_c3d
 from storage.formats.readers.plate_geometry import (
     PlatePose,
-    compute_force_and_cop,
+    compute_fz_and_local_cop,
     compute_loaded_eccentricity,
     compute_plate_pose,
     correct_cop_for_bending,
@@ -55,7 +55,7 @@ _FORCE_UNITS = {"n": "N", "newton": "N", "newtons": "N", "kn": "kN"}
 _MOMENT = re.compile(r"(k?N)[ .*·-]?(mm|cm|m)", re.IGNORECASE)
 
 
-def read_force_platforms(path: Path, is_needed: ColumnFilter, values_max: int) -> ForceTable:
+def read_c3d_force_platforms(path: Path, _is_needed: ColumnFilter, values_max: int) -> ForceTable:
     """Read force and centre of pressure of each readable plate of a C3D file, at the analog rate.
 
     Columns are `plate1_fz`, `plate1_cop_x`, `plate1_cop_y` and so on, in the file's units. A
@@ -65,7 +65,7 @@ def read_force_platforms(path: Path, is_needed: ColumnFilter, values_max: int) -
         FileFormatError: the file cannot be read, or has no readable plate.
     """
     file = read_c3d(path)
-    count = min(int(file.get_number_parameter("FORCE_PLATFORM", "USED").sum()), 255)
+    count = min(int(file.get_numbers_or_empty("FORCE_PLATFORM", "USED").sum()), 255)
     if count == 0:
         raise FileFormatError(
             "there is no force platform in it",
@@ -90,7 +90,7 @@ def read_force_platforms(path: Path, is_needed: ColumnFilter, values_max: int) -
 
 
 def _zero_notes(file: C3dFile, plates: list[PlateSignals]) -> list[str]:
-    zero = [int(frame) for frame in np.ravel(file.get_number_parameter("FORCE_PLATFORM", "ZERO"))]
+    zero = [int(frame) for frame in np.ravel(file.get_numbers_or_empty("FORCE_PLATFORM", "ZERO"))]
     if len(zero) != 2 or not 1 <= zero[0] <= zero[1]:
         return []
     first, last = zero
@@ -109,11 +109,11 @@ def _read_plate(file: C3dFile, i: int, values_max: int) -> PlateSignals:
     Raises:
         FileFormatError: the type is not supported, or channels are missing.
     """
-    kinds = np.ravel(file.get_number_parameter("FORCE_PLATFORM", "TYPE")).astype(int)
+    kinds = np.ravel(file.get_numbers_or_empty("FORCE_PLATFORM", "TYPE")).astype(int)
     kind = int(kinds[i]) if i < len(kinds) else 0
     if kind not in _CHANNEL_COUNTS:
         raise FileFormatError(f"it is of type {kind}", where=file.where, expected=FORM)
-    table = file.get_number_parameter("FORCE_PLATFORM", "CHANNEL")
+    table = file.get_numbers_or_empty("FORCE_PLATFORM", "CHANNEL")
     table = table.reshape(len(table), -1)
     numbers = (table[: _CHANNEL_COUNTS[kind], i : i + 1].astype(int) % 65536).ravel().tolist()
     if len(numbers) < _CHANNEL_COUNTS[kind] or not all(
@@ -133,7 +133,7 @@ def _read_plate(file: C3dFile, i: int, values_max: int) -> PlateSignals:
     force = _common_unit(
         {_FORCE_UNITS.get(units[at].lower()) for at in _VERTICAL_FORCE_CHANNELS.get(kind, ())}
     )
-    position = next(iter(file.get_text_parameter("POINT", "UNITS")), "").strip().lower()
+    position = next(iter(file.get_texts_or_empty("POINT", "UNITS")), "").strip().lower()
     length = position if position in _METRES else None
     origin, pose = (
         _surface_centre(file, i, kind),
@@ -149,14 +149,14 @@ def _read_plate(file: C3dFile, i: int, values_max: int) -> PlateSignals:
         )
         factor = 1.0 if lever is None else _METRES[lever] / _METRES[length]
         length = None if lever is None else length
-    fz, local = compute_force_and_cop(kind, channels, origin, factor)
+    fz, local = compute_fz_and_local_cop(kind, channels, origin, factor)
     cop = None
     if local is None:
         notes.append("ORIGIN does not state where its sensors are: no centre of pressure")
     elif pose is None:
         notes.append("CORNERS do not state where it is: no centre of pressure")
     else:
-        _, other = compute_force_and_cop(kind, channels, origin)
+        _, other = compute_fz_and_local_cop(kind, channels, origin)
         if factor != 1.0 and other is not None and _is_in_corner_unit(fz, local, other, pose):
             local = other
             notes.append(
@@ -248,10 +248,10 @@ def _calibration_matrix(file: C3dFile, i: int) -> Floats:
     Raises:
         FileFormatError: the matrix is missing, or has another size.
     """
-    stored = file.get_number_parameter("FORCE_PLATFORM", "CAL_MATRIX").astype(np.float64)
+    stored = file.get_numbers_or_empty("FORCE_PLATFORM", "CAL_MATRIX").astype(np.float64)
     stored = stored.reshape((*stored.shape, 1, 1, 1)[:3], order="F")
     is_by_row = (
-        "".join(file.get_text_parameter("FORCE_PLATFORM", "MATRIX_STORE")).strip().upper()
+        "".join(file.get_texts_or_empty("FORCE_PLATFORM", "MATRIX_STORE")).strip().upper()
         == "BYROW"
     )
     if stored.shape[:2] != (6, 6) or i >= stored.shape[2] or not np.isfinite(stored[:, :, i]).all():
@@ -265,7 +265,7 @@ def _calibration_matrix(file: C3dFile, i: int) -> Floats:
 
 def _plate_parameter(file: C3dFile, name: str, i: int, shape: tuple[int, ...]) -> Floats | None:
     """Return a plate's values of a parameter; None if they are missing."""
-    value = file.get_number_parameter("FORCE_PLATFORM", name).astype(np.float64)
+    value = file.get_numbers_or_empty("FORCE_PLATFORM", name).astype(np.float64)
     size = int(np.prod(shape))
     flat = np.ravel(value, order="F")[i * size : (i + 1) * size]
     if len(flat) < size or not np.isfinite(flat).all():

@@ -35,7 +35,9 @@ def is_loadsol(head: str) -> bool:
     return _find_names(head) is not None
 
 
-def read_loadsol(text: str, where: str, is_needed: ColumnFilter, values_max: int) -> ForceTable:
+def parse_loadsol_forces(
+    text: str, where: str, is_time_source: ColumnFilter, values_max: int
+) -> ForceTable:
     """Parse the force of each sole as `left_fz`, `right_fz`, at times picked by `is_time_source`.
 
     Raises:
@@ -91,7 +93,7 @@ def read_loadsol(text: str, where: str, is_needed: ColumnFilter, values_max: int
         times_s.append(np.asarray(columns[names[stamp]] * scale, dtype=np.float64))
     if len({plate.name for plate in plates}) < len(plates):
         raise FileFormatError("two soles are of one side", where=where, expected="one of each")
-    time_s = _needed_times(plates, times_s, is_needed, where)
+    time_s = _needed_times(plates, times_s, is_time_source, where)
     return make_plate_table(where, time_s, plates)
 
 

@@ -37,7 +37,9 @@ def is_moticon(head: str) -> bool:
     return _find_names(head) is not None
 
 
-def read_moticon(text: str, where: str, is_needed: ColumnFilter, values_max: int) -> ForceTable:
+def parse_moticon_force_and_cop(
+    text: str, where: str, _is_needed: ColumnFilter, values_max: int
+) -> ForceTable:
     """Parse force and centre of pressure of each sole: `left_fz`, `left_cop_x`, `left_cop_y`.
 
     Raises:

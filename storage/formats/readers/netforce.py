@@ -15,7 +15,12 @@ from devices.arrays import Floats
 from devices.errors import FileFormatError
 from storage.formats.readers.plate_signals import PlateSignals, make_plate_table
 from storage.formats.readers.table import ColumnFilter, ForceTable
-from storage.formats.readers.text import FORM, is_number, parse_text_table, split_cells_trimmed
+from storage.formats.readers.text import (
+    FORM,
+    is_number,
+    parse_text_table,
+    split_cells_without_empty_end,
+)
 
 _CHANNELS = 6
 _INSPECTED_LINES = 20
@@ -28,7 +33,7 @@ def is_netforce(head: str) -> bool:
     A first column that rises from line to line is a time, not a force.
     """
     lines = islice((line for line in head.split("\n") if line.strip()), _INSPECTED_LINES)
-    rows = [split_cells_trimmed(line, ",") for line in lines]
+    rows = [split_cells_without_empty_end(line, ",") for line in lines]
     if len(rows) == _INSPECTED_LINES or not head.endswith("\n"):
         rows = rows[:-1]  # the last line may be truncated
     width = len(rows[0]) if rows else 0
@@ -40,7 +45,9 @@ def is_netforce(head: str) -> bool:
     return not all(a < b for a, b in pairwise(first))
 
 
-def read_netforce(text: str, where: str, is_needed: ColumnFilter, values_max: int) -> ForceTable:
+def parse_netforce_force_and_cop(
+    text: str, where: str, _is_needed: ColumnFilter, values_max: int
+) -> ForceTable:
     """Parse the vertical force and centre of pressure of each plate, beside the numbered columns.
 
     Raises:

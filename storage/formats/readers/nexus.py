@@ -24,7 +24,7 @@ from storage.formats.readers.device_columns import (
 )
 from storage.formats.readers.plate_signals import PlateSignals, make_plate_table
 from storage.formats.readers.table import ColumnFilter, ForceTable
-from storage.formats.readers.text import split_cells_trimmed
+from storage.formats.readers.text import split_cells_without_empty_end
 
 FORM = "a section Devices: its rate, lines of devices, names and units, lines of numbers"
 _NAMES = re.compile(r"^\"?Frame\"?(?P<delimiter>[,;\t])\"?Sub ?Frame\"?", re.I | re.M)
@@ -38,7 +38,9 @@ def is_nexus(head: str) -> bool:
     return _NAMES.search(head) is not None
 
 
-def read_nexus(text: str, where: str, is_needed: ColumnFilter, values_max: int) -> ForceTable:
+def parse_nexus_force_and_cop(
+    text: str, where: str, _is_needed: ColumnFilter, values_max: int
+) -> ForceTable:
     """Parse the vertical force and centre of pressure of each plate, at the rate of the devices.
 
     Raises:
@@ -48,15 +50,15 @@ def read_nexus(text: str, where: str, is_needed: ColumnFilter, values_max: int) 
     for found in _NAMES.finditer(text):
         delimiter = found["delimiter"]
         above = [
-            split_cells_trimmed(line, delimiter)
+            split_cells_without_empty_end(line, delimiter)
             for line in text[: found.start()].split("\n")[-4:-1]
         ]
         line, _, below = text[found.start() :].partition("\n")
         units, _, rows = below.partition("\n")
         columns = _make_device_columns(
             above[-1] if above else [],
-            split_cells_trimmed(line, delimiter),
-            [cell.strip("[]() ") for cell in split_cells_trimmed(units, delimiter)],
+            split_cells_without_empty_end(line, delimiter),
+            [cell.strip("[]() ") for cell in split_cells_without_empty_end(units, delimiter)],
         )
         try:
             groups = group_columns_by_plate(columns, where)

@@ -16,7 +16,7 @@ from devices.errors import FileFormatError
 from storage.formats.readers.table import (
     ColumnFilter,
     ForceTable,
-    make_force_table,
+    make_table_with_standard_names,
     select_needed_names,
 )
 from storage.formats.readers.text import (
@@ -24,7 +24,7 @@ from storage.formats.readers.text import (
     TextLayout,
     parse_columns,
     read_decoded_text,
-    split_cells_trimmed,
+    split_cells_without_empty_end,
 )
 
 FORM = "a header to the line endheader, a line of names, lines of numbers"
@@ -48,10 +48,13 @@ def read_opensim_table(path: Path, is_needed: ColumnFilter, values_max: int) -> 
     rows = rows.strip("\n")
     line = rows.partition("\n")[0]
     delimiter = "\t" if "\t" in head and "\t" in line else BLANKS
-    names, first = split_cells_trimmed(head, delimiter), split_cells_trimmed(line, delimiter)
+    names, first = (
+        split_cells_without_empty_end(head, delimiter),
+        split_cells_without_empty_end(line, delimiter),
+    )
     if len(first) > 1 and all(map(_VECTOR.fullmatch, first[1:])):
         rows = rows.replace(",", delimiter)
-        first = split_cells_trimmed(rows.partition("\n")[0], delimiter)
+        first = split_cells_without_empty_end(rows.partition("\n")[0], delimiter)
         vectors = (name if name.endswith(("_v", "_p", "_m")) else f"{name}_" for name in names[1:])
         names = [*names[:1], *(f"{name}{axis}" for name in vectors for axis in "xyz")]
     if len(names) < 2 or (first and len(first) != len(names)):
@@ -75,7 +78,7 @@ def read_opensim_table(path: Path, is_needed: ColumnFilter, values_max: int) -> 
     for name in times:
         columns["time_s"] = columns[name]
     units = {name: unit for name in names for ending, unit in _UNITS if ending.search(name)}
-    table = make_force_table(
+    table = make_table_with_standard_names(
         where, names, columns, units=units | dict.fromkeys(times, "s"), expected_form=FORM
     )
     forces = {name for name, unit in units.items() if unit == "N"}

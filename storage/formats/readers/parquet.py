@@ -17,7 +17,7 @@ from storage.formats.readers.table import (
     ColumnFilter,
     ForceTable,
     check_table_size,
-    make_force_table,
+    make_table_with_standard_names,
     select_needed_names,
 )
 from storage.formats.readers.text import arrow_to_floats
@@ -47,7 +47,7 @@ def read_parquet_table(path: Path, is_needed: ColumnFilter, values_max: int) -> 
             f"cannot be read: {error}", where=where, expected="a Parquet file"
         ) from error
     columns = {name: _to_numbers(table[name], name, where) for name in needed}
-    return make_force_table(where, schema.names, columns, schema=schema)
+    return make_table_with_standard_names(where, schema.names, columns, schema=schema)
 
 
 def _to_numbers(cells: pa.ChunkedArray[Any], name: str, where: str) -> Column:

@@ -21,7 +21,7 @@ def is_pedar(head: str) -> bool:
     return _HEAD.search(head) is not None and _NAMES.search(head) is not None
 
 
-def refuse_pedar(text: str, where: str, is_needed: ColumnFilter, values_max: int) -> NoReturn:
+def refuse_pedar(text: str, where: str, _is_needed: ColumnFilter, values_max: int) -> NoReturn:
     """Refuse pressures without areas.
 
     Raises:

@@ -46,7 +46,7 @@ def compute_plate_pose(corners: Floats | None) -> PlatePose | None:
     return PlatePose(corners.mean(axis=1), np.stack([x, np.cross(z, x), z], axis=1), half)
 
 
-def compute_force_and_cop(
+def compute_fz_and_local_cop(
     plate_type: int, channels: Floats, origin: Floats, length_factor: float = 1.0
 ) -> tuple[Floats, Floats | None]:
     """Return the force along z, (n,), and the centre of pressure from the middle, (2, n).

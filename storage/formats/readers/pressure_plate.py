@@ -15,13 +15,13 @@ import numpy as np
 from devices.arrays import Floats
 from devices.errors import FileFormatError
 from devices.input_files import check_regular_file
-from storage.formats.readers.table import ColumnFilter, ForceTable, make_force_table
+from storage.formats.readers.table import ColumnFilter, ForceTable, make_table_with_standard_names
 
 _CELL_FACTORS = {"force_n": 1.0, "pressure_kpa": 1e3}
 """Factor of cells to newtons or to pascals, by name of the array."""
 
 
-def read_pressure_plate(path: Path, is_needed: ColumnFilter, values_max: int) -> ForceTable:
+def read_npz_pressure_plate(path: Path, is_needed: ColumnFilter, values_max: int) -> ForceTable:
     """Read a `.npz` file of cells as total force and centre of pressure; NaN if a cell is NaN.
 
     The centre of pressure is NaN without load.
@@ -57,14 +57,14 @@ def read_pressure_plate(path: Path, is_needed: ColumnFilter, values_max: int) ->
     area_m2 = float(pitch_m.prod()) if named[0] == "pressure_kpa" else 1.0
     force_n = cells * (_CELL_FACTORS[named[0]] * area_m2)
     x_m, y_m = (origin_m[i] + pitch_m[i] * np.arange(cells.shape[i + 1]) for i in (0, 1))
-    grf_n, (cop_x_m, cop_y_m) = sum_cell_forces(force_n, x_m, y_m)
+    grf_n, (cop_x_m, cop_y_m) = compute_total_force_and_cop(force_n, x_m, y_m)
     columns = {"time_s": time_s, "grf_n": grf_n, "cop_x_m": cop_x_m, "cop_y_m": cop_y_m}
     notes = (f"a plate of {cells.shape[1]} by {cells.shape[2]} cells, added up",)
     needed = {name: column for name, column in columns.items() if is_needed(name)}
-    return make_force_table(where, columns, needed, notes=notes)
+    return make_table_with_standard_names(where, columns, needed, notes=notes)
 
 
-def sum_cell_forces(force_n: Floats, x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
+def compute_total_force_and_cop(force_n: Floats, x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
     """Return the total force (n,) and its centre of pressure (2, n) in m.
 
     Args:

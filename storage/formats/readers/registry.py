@@ -7,19 +7,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from devices.errors import FileFormatError, UsageError
-from storage.formats.readers.bioware import is_bioware, read_bioware
-from storage.formats.readers.force_platform import read_force_platforms
-from storage.formats.readers.loadsol import is_loadsol, read_loadsol
-from storage.formats.readers.moticon import is_moticon, read_moticon
-from storage.formats.readers.netforce import is_netforce, read_netforce
-from storage.formats.readers.nexus import is_nexus, read_nexus
+from storage.formats.readers.bioware import is_bioware, parse_bioware_force_and_cop
+from storage.formats.readers.force_platform import read_c3d_force_platforms
+from storage.formats.readers.loadsol import is_loadsol, parse_loadsol_forces
+from storage.formats.readers.moticon import is_moticon, parse_moticon_force_and_cop
+from storage.formats.readers.netforce import is_netforce, parse_netforce_force_and_cop
+from storage.formats.readers.nexus import is_nexus, parse_nexus_force_and_cop
 from storage.formats.readers.opensim import read_opensim_table
 from storage.formats.readers.parquet import read_parquet_table
 from storage.formats.readers.pedar import is_pedar, refuse_pedar
-from storage.formats.readers.pressure_plate import read_pressure_plate
-from storage.formats.readers.rosbag import is_bag_folder, read_bag_table
+from storage.formats.readers.pressure_plate import read_npz_pressure_plate
+from storage.formats.readers.rosbag import is_bag_folder, read_bag_wrenches
 from storage.formats.readers.table import VALUES_MAX, ColumnFilter, ForceTable
-from storage.formats.readers.tekscan import is_tekscan, read_tekscan
+from storage.formats.readers.tekscan import is_tekscan, parse_tekscan_force_and_cop
 from storage.formats.readers.text import HEAD_CHARACTERS, parse_text_table, read_decoded_text
 from storage.formats.readers.text_options import TextOptions
 
@@ -38,13 +38,13 @@ class TextFormat:
 
 
 TEXT_FORMATS: tuple[TextFormat, ...] = (
-    TextFormat(is_bioware, read_bioware),
-    TextFormat(is_nexus, read_nexus),
-    TextFormat(is_loadsol, read_loadsol),
-    TextFormat(is_moticon, read_moticon),
-    TextFormat(is_tekscan, read_tekscan),
+    TextFormat(is_bioware, parse_bioware_force_and_cop),
+    TextFormat(is_nexus, parse_nexus_force_and_cop),
+    TextFormat(is_loadsol, parse_loadsol_forces),
+    TextFormat(is_moticon, parse_moticon_force_and_cop),
+    TextFormat(is_tekscan, parse_tekscan_force_and_cop),
     TextFormat(is_pedar, refuse_pedar),
-    TextFormat(is_netforce, read_netforce),  # last: the format has no head
+    TextFormat(is_netforce, parse_netforce_force_and_cop),  # last: the format has no head
 )
 
 
@@ -67,21 +67,21 @@ def _read_text(
     options = options or TextOptions()
     text = read_decoded_text(path, options.encoding)
     head = text[:HEAD_CHARACTERS]
-    for one in () if options.is_plain_table else TEXT_FORMATS:
+    for one in () if options.has_layout_option else TEXT_FORMATS:
         if one.matches_head(head):
             return one.read(text, str(path), is_needed, values_max)
     return parse_text_table(text, str(path), is_needed, values_max, options)
 
 
 TEXT = TableFormat((".csv", ".txt", ".tsv"), _read_text)
-BAG = TableFormat((".bag", ".mcap", ".db3"), read_bag_table)
+BAG = TableFormat((".bag", ".mcap", ".db3"), read_bag_wrenches)
 TABLE_FORMATS = (
     TEXT,
     BAG,
     TableFormat((".parquet",), read_parquet_table),
-    TableFormat((".c3d",), read_force_platforms),
+    TableFormat((".c3d",), read_c3d_force_platforms),
     TableFormat((".mot", ".sto"), read_opensim_table),
-    TableFormat((".npz",), read_pressure_plate),
+    TableFormat((".npz",), read_npz_pressure_plate),
 )
 
 

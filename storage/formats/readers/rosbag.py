@@ -54,7 +54,7 @@ def is_bag_folder(path: Path) -> bool:
 
 
 @require_extra("mcap", "To read ROS bags and MCAP")
-def read_bag_table(path: Path, is_needed: ColumnFilter, values_max: int) -> ForceTable:
+def read_bag_wrenches(path: Path, is_needed: ColumnFilter, values_max: int) -> ForceTable:
     """Read all columns of each topic with a needed column, or of a bag's only topic of wrenches.
 
     Raises:

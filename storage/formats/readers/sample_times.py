@@ -11,7 +11,7 @@ DEVIATION_MAX_STEPS = 1.5
 """Largest deviation from a constant rate, in smallest steps of the times."""
 
 
-def respace_repeated_times(time_s: Floats) -> tuple[Floats, str]:
+def respace_rounded_times_evenly(time_s: Floats) -> tuple[Floats, str]:
     """Replace all times by times at a constant rate if rounding made some of them equal.
 
     Times are returned unchanged unless the rate is clear: no time falls, and all deviate from a

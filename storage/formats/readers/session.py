@@ -18,14 +18,14 @@ from storage.sessions.reader import SealedFileReader
 from storage.sessions.time_axis import NODE_AXIS, TimeAxis
 
 
-def read_session_table(path: Path, extra_names: Collection[str]) -> ForceTable | None:
+def read_sealed_session_table(path: Path, optional_names: Collection[str]) -> ForceTable | None:
     """Read the standard and optional columns that a sealed session has; None for another file.
 
     Raises:
         FileFormatError: the session is damaged, or has no frames.
     """
     where = str(path)
-    if not is_sealed_session(path):
+    if not is_sealed_session_file(path):
         return None
     with SealedFileReader(path) as reader:
         single = [
@@ -35,7 +35,7 @@ def read_session_table(path: Path, extra_names: Collection[str]) -> ForceTable |
         ]
         wanted = [
             name
-            for name in (INSTANT_COLUMN, "part", *STANDARD_UNITS, *sorted(extra_names))
+            for name in (INSTANT_COLUMN, "part", *STANDARD_UNITS, *sorted(optional_names))
             if name in single
         ]
         pieces = list(reader.read_columns(*dict.fromkeys(wanted)))
@@ -44,7 +44,7 @@ def read_session_table(path: Path, extra_names: Collection[str]) -> ForceTable |
         raise FileFormatError("the session has no frames", where=where)
     joined = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
     t_ns = axis.shift_to_axis(joined.pop(INSTANT_COLUMN), joined.get("part"))
-    if "part" not in extra_names:
+    if "part" not in optional_names:
         joined.pop("part", None)
     columns = {name: values.astype(np.float64) for name, values in joined.items()}
     columns["time_s"] = (t_ns - t_ns[0]) * 1e-9
@@ -58,19 +58,19 @@ def read_session_table(path: Path, extra_names: Collection[str]) -> ForceTable |
     )
 
 
-def read_time_axis(path: Path) -> TimeAxis:
+def read_time_axis_or_node_axis(path: Path) -> TimeAxis:
     """Return the time axis of a sealed session; for another file the node's axis, not shifted.
 
     Raises:
         FileFormatError: the session is damaged.
     """
-    if not is_sealed_session(path):
+    if not is_sealed_session_file(path):
         return NODE_AXIS
     with SealedFileReader(path) as reader:
         return reader.time_axis
 
 
-def is_sealed_session(path: Path) -> bool:
+def is_sealed_session_file(path: Path) -> bool:
     """Return whether a file is a sealed FootTile session.
 
     Raises:

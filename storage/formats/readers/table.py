@@ -64,7 +64,7 @@ class ForceTable:
     schema: pa.Schema | None = None
 
 
-def make_force_table(
+def make_table_with_standard_names(
     where: str,
     names: Iterable[str],
     columns: Mapping[str, Column],

@@ -15,7 +15,7 @@ import numpy as np
 from devices.arrays import Floats
 from devices.errors import FileFormatError
 from storage.formats.readers.plate_signals import PlateSignals, make_plate_table
-from storage.formats.readers.pressure_plate import sum_cell_forces
+from storage.formats.readers.pressure_plate import compute_total_force_and_cop
 from storage.formats.readers.table import ColumnFilter, ForceTable, check_table_size
 
 FORM = "facts above ASCII_DATA @@, then frames of ROWS lines with COLS cells"
@@ -32,7 +32,9 @@ def is_tekscan(head: str) -> bool:
     return _BEGIN.search(head) is not None
 
 
-def read_tekscan(text: str, where: str, is_needed: ColumnFilter, values_max: int) -> ForceTable:
+def parse_tekscan_force_and_cop(
+    text: str, where: str, _is_needed: ColumnFilter, values_max: int
+) -> ForceTable:
     """Parse the frames of cells to total force and centre of pressure, from the sensor's middle.
 
     Raises:
@@ -69,7 +71,9 @@ def read_tekscan(text: str, where: str, is_needed: ColumnFilter, values_max: int
         np.asarray(pitch * ((count - 1) / 2 - np.arange(count)), dtype=np.float64)
         for pitch, count in zip(pitch_m, (rows, columns), strict=True)
     )
-    force_n, cop_m = sum_cell_forces(pressure * (_PASCALS[unit.lower()] * area_m2), x_m, y_m)
+    force_n, cop_m = compute_total_force_and_cop(
+        pressure * (_PASCALS[unit.lower()] * area_m2), x_m, y_m
+    )
     notes = [f"a sensor of {rows} by {columns} cells, added up"]
     is_mirrored = any(facts.get(name, "0") != "0" for name in ("MIRROR_ROW", "MIRROR_COL"))
     if is_mirrored:

@@ -32,7 +32,7 @@ from storage.formats.readers.table import (
     ColumnFilter,
     ForceTable,
     check_table_size,
-    make_force_table,
+    make_table_with_standard_names,
     select_needed_names,
 )
 from storage.formats.readers.text_options import DECIMAL_PATTERNS, TextOptions
@@ -114,12 +114,12 @@ def parse_text_table(
         raise FileFormatError(f"there is no text below {options.skip_rows} lines", where=where)
     layout = detect_layout(text, where, options)
     if units is not None:
-        cells = split_cells_trimmed(units, layout.delimiter)
+        cells = split_cells_without_empty_end(units, layout.delimiter)
         layout = replace(layout, units={**layout.units, **_units_by_name(layout.names, cells)})
     needed = select_needed_names(layout.names, is_needed, where)
     columns = parse_columns(text, layout, needed, values_max, where, options.decimal)
     notes = () if layout.is_named else ("no line names its columns: they are numbered from 1 on",)
-    return make_force_table(
+    return make_table_with_standard_names(
         where, layout.names, columns, units=layout.units, notes=notes, expected_form=FORM
     )
 
@@ -290,14 +290,17 @@ def _detect_named_layout(
     Of several candidates for the line of names, the one with most numbers below wins: other lines
     state single values, such as a rate. With `is_first` the first line has the names.
     """
-    rows = [(number, split_cells_trimmed(line, delimiter)) for number, line in enumerate(lines)]
+    rows = [
+        (number, split_cells_without_empty_end(line, delimiter))
+        for number, line in enumerate(lines)
+    ]
     rows = [(number, cells) for number, cells in rows if any(cells)]
     comments = {number for number, _ in rows if COMMENT_START.match(lines[number])}
     found: list[TextLayout] = []
     for i, (number, cells) in enumerate(rows[:1] if is_first else rows):
         is_comment = number in comments
         names = (
-            split_cells_trimmed(COMMENT_START.sub("", lines[number]), delimiter)
+            split_cells_without_empty_end(COMMENT_START.sub("", lines[number]), delimiter)
             if is_comment
             else cells
         )
@@ -310,7 +313,7 @@ def _detect_named_layout(
         elif below and (len(below[0][1]) == len(names) or not (is_comment or delimiter == BLANKS)):
             first, numbers = below[0]
             if len(numbers) <= len(names) and any(map(is_number, numbers)):
-                width = len(split_cells_unchanged(lines[first], delimiter))
+                width = len(split_csv_cells(lines[first], delimiter))
                 padded = [*names, *[""] * (width - len(names))]
                 found.append(_make_layout(padded, units, delimiter, first, numbers))
     return max(found, key=lambda layout: layout.score, default=None)
@@ -321,13 +324,11 @@ def _detect_nameless_layout(
 ) -> TextLayout | None:
     """Return the layout of numbers without a line of names; None if the delimiter does not fit."""
     for number, line in enumerate(lines):
-        cells = split_cells_trimmed(line, delimiter)
+        cells = split_cells_without_empty_end(line, delimiter)
         if not any(cells) or COMMENT_START.match(line):
             continue
         if all(map(is_number, cells)):
-            names = tuple(
-                f"column{i + 1}" for i in range(len(split_cells_unchanged(line, delimiter)))
-            )
+            names = tuple(f"column{i + 1}" for i in range(len(split_csv_cells(line, delimiter))))
             return TextLayout(names, delimiter, number, {}, len(cells), is_named=False)
         if is_first:
             return None
@@ -349,7 +350,7 @@ def _units_by_name(names: Sequence[str], units: Sequence[str]) -> dict[str, str]
     return {name: unit.strip("[]() ") for name, unit in pairs if name and unit}
 
 
-def split_cells_unchanged(line: str, delimiter: str) -> list[str]:
+def split_csv_cells(line: str, delimiter: str) -> list[str]:
     """Return the cells of a line of CSV without their quotes, trailing empty cells included."""
     if delimiter == BLANKS:
         return line.split()
@@ -359,9 +360,9 @@ def split_cells_unchanged(line: str, delimiter: str) -> list[str]:
         return []
 
 
-def split_cells_trimmed(line: str, delimiter: str) -> list[str]:
+def split_cells_without_empty_end(line: str, delimiter: str) -> list[str]:
     """Return the cells of a line with normalised blanks, without trailing empty cells."""
-    cells = [" ".join(cell.split()) for cell in split_cells_unchanged(line, delimiter)]
+    cells = [" ".join(cell.split()) for cell in split_csv_cells(line, delimiter)]
     while cells and not cells[-1]:
         cells.pop()
     return cells

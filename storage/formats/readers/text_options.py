@@ -50,6 +50,6 @@ class TextOptions:
                 ) from error
 
     @property
-    def is_plain_table(self) -> bool:
+    def has_layout_option(self) -> bool:
         """True if an option other than the encoding is set; the head is then not inspected."""
         return any(one is not None for one in (self.skip_rows, self.units_row, self.decimal))

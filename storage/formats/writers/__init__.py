@@ -10,8 +10,8 @@ A module defines an `ExportFormat` (`storage.formats.writers.format`) with a gen
   refuses more than `frames_max`;
 - raises as many errors as possible before its first chunk: a client then gets an error response,
   while later errors abort a download; it never completes an incomplete file;
-- writes `Export.metadata` and `Export.full_notes` into the file, with time base, axes, and facts
-  about resampled, filled or omitted data;
+- writes `Export.metadata` and `Export.notes_with_clock_and_markers` into the file, with time base,
+  axes, and facts about resampled, filled or omitted data;
 - imports heavy packages, and packages of an extra, inside of itself; `ExportFormat.extra` names the
   extra.
 """

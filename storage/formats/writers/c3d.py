@@ -29,9 +29,13 @@ from storage.formats.writers.format import ExportFormat
 from storage.formats.writers.ground_reaction import (
     OPTIONAL_COLUMNS,
     GroundReaction,
-    read_ground_reactions,
+    read_reactions_on_common_axis,
 )
-from storage.formats.writers.text_metadata import format_clock_bound, format_metadata, to_ascii
+from storage.formats.writers.text_metadata import (
+    format_largest_clock_bound,
+    format_metadata,
+    to_ascii_line,
+)
 from storage.schema import COLUMNS_BY_NAME
 
 FRAMES_MAX = 2_000_000
@@ -106,7 +110,7 @@ def _read_content(exports: Sequence[Export]) -> tuple[ParameterGroups, Floats]:
     width = len(exports) * (len(_PLATFORM_CHANNELS) + len(OPTIONAL_COLUMNS) + 4) + tiles
     frames_max = min(FRAMES_MAX, NUMBERS_MAX // width)
     return build_c3d_content(
-        read_ground_reactions(exports, [*OPTIONAL_COLUMNS, "force_n"], frames_max), exports
+        read_reactions_on_common_axis(exports, [*OPTIONAL_COLUMNS, "force_n"], frames_max), exports
     )
 
 
@@ -148,7 +152,7 @@ def build_c3d_content(
         "ANALOG": {
             "RATE": [rate_hz],
             "LABELS": [label for label, *_ in channels],
-            "DESCRIPTIONS": [to_ascii(text)[:_TEXT_MAX] for _, _, text, _ in channels],
+            "DESCRIPTIONS": [to_ascii_line(text)[:_TEXT_MAX] for _, _, text, _ in channels],
             "UNITS": [unit for _, unit, *_ in channels],
             "GEN_SCALE": [1.0],
             "SCALE": np.ones(len(channels)),
@@ -165,7 +169,7 @@ def build_c3d_content(
         "EVENT": _event_parameters(reactions, exports),
         "MANUFACTURER": {
             "COMPANY": ["FootTile"],
-            "SOFTWARE": [to_ascii(exports[0].array_info.software)[:_TEXT_MAX]],
+            "SOFTWARE": [to_ascii_line(exports[0].array_info.software)[:_TEXT_MAX]],
         },
     }
     for number, (reaction, export) in enumerate(zip(reactions, exports, strict=True), 1):
@@ -204,7 +208,7 @@ def _metadata_texts(
     return texts | (
         {}
         if reaction.server_time_bound_s is None
-        else format_clock_bound(reaction.server_time_bound_s)
+        else format_largest_clock_bound(reaction.server_time_bound_s)
     )
 
 
@@ -235,7 +239,7 @@ def _event_parameters(
     contacts: list[tuple[float, str, str]] = []
     for reaction, export in zip(reactions, exports, strict=True):
         node = export.array_info.node
-        named = to_ascii(node)[:_TEXT_MAX] if len(reactions) > 1 else "General"
+        named = to_ascii_line(node)[:_TEXT_MAX] if len(reactions) > 1 else "General"
         context = _CONTEXTS_BY_NODE.get(node.lower(), named)
         events = [(at_s, context, label) for at_s, label in reaction.events]
         markers += events[: reaction.marker_count]
@@ -244,7 +248,7 @@ def _event_parameters(
     return {
         "USED": np.array([len(written)]),
         "CONTEXTS": [context or "General" for _, context, _ in written],
-        "LABELS": [to_ascii(label)[:_TEXT_MAX] or "marker" for _, _, label in written],
+        "LABELS": [to_ascii_line(label)[:_TEXT_MAX] or "marker" for _, _, label in written],
         "DESCRIPTIONS": [" "] * len(written),
         "TIMES": np.array([divmod(at_s, 60.0) for at_s, *_ in written]).reshape(-1, 2).T,
     }
@@ -277,13 +281,13 @@ def _platform_geometry(export: Export) -> tuple[Floats, Floats]:
 
 def _platform_signals(reaction: GroundReaction, centre_m: Floats) -> Iterator[Floats]:
     """Yield Fx, Fy, Fz, Mx, My and Mz on the foot in the platform's axes, (n,) in N and N mm."""
-    fz_n = 0.0 - reaction.frame_grf_n
+    fz_n = 0.0 - reaction.frame_contact_grf_n
     fz = reaction.resampling.interpolate(fz_n)
     nothing = np.where(np.isnan(fz), np.nan, 0.0)
     yield from (nothing, nothing, fz)
     for at in (1, 0):  # r x F; the platform's y is opposite to the foot's
         along_m = reaction.columns[f"cop_{'xy'[at]}_m"].astype(np.float64) - centre_m[at]
-        moment = np.where(reaction.is_unloaded, 0.0, -1e3 * along_m * fz_n)
+        moment = np.where(reaction.is_frame_unloaded, 0.0, -1e3 * along_m * fz_n)
         yield reaction.resampling.interpolate(moment)
     yield nothing
 

@@ -23,7 +23,7 @@ _FORMULA_START = r"^([=+\-@'\t\r\n\x{ff0b}\x{ff0d}\x{ff1d}\x{ff20}])"
 """Pattern of the beginning of a spreadsheet's formula, and of the apostrophe that escapes it."""
 
 
-def write_csv_table(sink: BinaryIO, table: pa.Table) -> None:
+def write_spreadsheet_safe_csv(sink: BinaryIO, table: pa.Table) -> None:
     """Write a table as CSV, with text escaped against spreadsheets' formulas."""
     with _EscapingWriter(sink, table.schema) as writer:
         writer.write_table(table)

@@ -15,10 +15,10 @@ import numpy.typing as npt
 from devices.arrays import Floats, Times
 from devices.errors import UsageError
 from storage.formats.export import Export
-from storage.formats.writers.multi_session import get_frame_instants_ns
+from storage.formats.writers.multi_session import get_instants_on_export_clock_ns
 from storage.formats.writers.resampling import Resampling, make_resampling, make_sample_axis
 from storage.formats.writers.row_place import NEEDED as POINT
-from storage.formats.writers.row_place import with_row_place
+from storage.formats.writers.row_place import fill_cop_across_tile_row
 from storage.schema import SERVER_TIME_COLUMNS, Array
 
 REQUIRED_COLUMNS = ("t_ns", "contact", *POINT)
@@ -41,7 +41,7 @@ class GroundReaction:
 
     Attributes:
         resampling: resampling of frames to samples.
-        columns: flat columns of frames, (m,) each; the COP `with_row_place`.
+        columns: flat columns of frames, (m,) each; the COP `fill_cop_across_tile_row`.
         events: time in seconds after the first sample, and label: first the markers, then begins
             and ends of contact.
         marker_count: number of markers among the events.
@@ -70,17 +70,17 @@ class GroundReaction:
         )
 
     @property
-    def is_unloaded(self) -> npt.NDArray[np.bool_]:
+    def is_frame_unloaded(self) -> npt.NDArray[np.bool_]:
         """Mask (m,) of the frames known to be without contact."""
         return np.asarray(self.columns["contact"] == 0)
 
     @property
-    def frame_grf_n(self) -> Floats:
+    def frame_contact_grf_n(self) -> Floats:
         """GRF of the frames (m,) in N, 0 in frames known to be without contact."""
-        return np.where(self.is_unloaded, 0.0, self.columns["grf_n"].astype(np.float64))
+        return np.where(self.is_frame_unloaded, 0.0, self.columns["grf_n"].astype(np.float64))
 
 
-def read_ground_reactions(
+def read_reactions_on_common_axis(
     exports: Sequence[Export], optional_columns: Sequence[str], frames_max: int
 ) -> list[GroundReaction]:
     """Read the frames of several exports, and resample them to one time axis.
@@ -120,7 +120,7 @@ def _read_frames(
     names += ["marker"] if export.markers is not None else []
     names += ["part"] if "part" in present else []
     columns = export.read_all(list(dict.fromkeys(["seq", *names])), frames_max=frames_max)
-    t_ns = get_frame_instants_ns(export, columns)
+    t_ns = get_instants_on_export_clock_ns(export, columns)
     if not len(t_ns):
         raise UsageError(
             "no frame is in this slice",
@@ -134,7 +134,7 @@ def _read_frames(
             where=export.display_name,
             remedy="Ask for Parquet, Arrow or CSV: they have counts and bounds",
         )
-    return t_ns, with_row_place(columns, export.array_info)
+    return t_ns, fill_cop_across_tile_row(columns, export.array_info)
 
 
 def _marker_events(columns: Mapping[str, Array], since_s: Floats) -> list[tuple[float, str]]:

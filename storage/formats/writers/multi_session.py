@@ -22,7 +22,7 @@ def make_names_unique(names: Sequence[str]) -> list[str]:
     return unique
 
 
-def get_frame_instants_ns(export: Export, columns: Mapping[str, Array]) -> Times:
+def get_instants_on_export_clock_ns(export: Export, columns: Mapping[str, Array]) -> Times:
     """Return the instants of frames on the export's clock, int64[n].
 
     Args:

@@ -20,7 +20,7 @@ _COP_MASKED = 16
 """Bit of `estimate_flags`: no centre of pressure."""
 
 
-def with_row_place(columns: Mapping[str, Array], info: ArrayInfo) -> dict[str, Array]:
+def fill_cop_across_tile_row(columns: Mapping[str, Array], info: ArrayInfo) -> dict[str, Array]:
     """Return the columns, with the place of a row of tiles as the unmeasured COP across it.
 
     Args:
@@ -36,7 +36,7 @@ def with_row_place(columns: Mapping[str, Array], info: ArrayInfo) -> dict[str, A
     return {**columns, **placed}
 
 
-def row_facts(info: ArrayInfo) -> dict[str, str]:
+def make_tile_row_metadata(info: ArrayInfo) -> dict[str, str]:
     """Return the facts about the row's place for a file; empty for an array without a row."""
     rows = [
         f"{axis} = {1e3 * place_m:g} mm"

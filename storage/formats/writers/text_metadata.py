@@ -10,8 +10,8 @@ import numpy as np
 
 from devices.arrays import Floats
 from storage.formats.export import Export
-from storage.formats.export_facts import read_completeness
-from storage.formats.writers.row_place import row_facts
+from storage.formats.export_facts import read_completeness_and_losses
+from storage.formats.writers.row_place import make_tile_row_metadata
 
 
 def format_metadata(export: Export, begin_ns: int) -> dict[str, str]:
@@ -47,13 +47,13 @@ def format_metadata(export: Export, begin_ns: int) -> dict[str, str]:
         "CALIBRATION": _calibration_text(notes),
         "SCALE": str(notes.get("absolute_scale") or "not known"),
         "SOFTWARE": export.array_info.software,
-        **row_facts(export.array_info),
+        **make_tile_row_metadata(export.array_info),
     }
-    return {name: to_ascii(text) for name, text in texts.items()}
+    return {name: to_ascii_line(text) for name, text in texts.items()}
 
 
 def _completeness_text(notes: Mapping[str, object], source: Mapping[str, object]) -> str:
-    complete, lost = read_completeness(notes, source)
+    complete, lost = read_completeness_and_losses(notes, source)
     if complete is None:
         return "not known: there is no ledger"
     losses = ", ".join(f"{count} {reason}" for reason, count in lost.items() if count)
@@ -66,7 +66,7 @@ def _completeness_text(notes: Mapping[str, object], source: Mapping[str, object]
     return f"{text}; {missed} slots in which no frame was taken" if missed else text
 
 
-def format_clock_bound(uncertainty_s: Floats) -> dict[str, str]:
+def format_largest_clock_bound(uncertainty_s: Floats) -> dict[str, str]:
     """Return the metadata entry with the largest bound of the server's time.
 
     Args:
@@ -78,7 +78,7 @@ def format_clock_bound(uncertainty_s: Floats) -> dict[str, str]:
     }
 
 
-def to_ascii(text: str) -> str:
+def to_ascii_line(text: str) -> str:
     """Return text without accents, other characters outside ASCII as code points (U+1F600)."""
     line = " ".join(text.split())
     plain = unicodedata.normalize("NFKD", line)

@@ -23,9 +23,9 @@ import pyarrow as pa
 from devices.errors import UsageError
 from storage.formats.export import Export
 from storage.formats.writers.format import ExportFormat
-from storage.formats.writers.multi_session import get_frame_instants_ns, make_names_unique
+from storage.formats.writers.multi_session import get_instants_on_export_clock_ns, make_names_unique
 from storage.formats.writers.resampling import make_resampling, make_sample_axis
-from storage.formats.writers.xml_text import escape_invalid_xml
+from storage.formats.writers.xml_text import escape_xml_invalid_characters
 from storage.schema import COLUMNS_BY_NAME, SERVER_TIME_COLUMNS, UNKNOWN_T_NS, Array
 
 _MAGIC = b"XDF:"
@@ -120,7 +120,7 @@ class _SessionEncoder:
         self._export, self._name, self._numbers = export, name, numbers
         self._channel_quantities = {
             name: of
-            for name, of in export.select_columns().items()
+            for name, of in export.map_columns_to_quantities().items()
             if of not in _TIME_COLUMNS and not pa.types.is_string(COLUMNS_BY_NAME[of].type)
         }
         if export.clock is not None:
@@ -145,7 +145,7 @@ class _SessionEncoder:
             return
         for piece in export.read_chunks(requested):
             if not is_alone:
-                get_frame_instants_ns(export, piece)
+                get_instants_on_export_clock_ns(export, piece)
             yield piece
 
     def _read_resampled(self, requested: Sequence[str], *, is_alone: bool) -> Mapping[str, Array]:
@@ -156,7 +156,7 @@ class _SessionEncoder:
         export = self._export
         flat = export.read_all(list(dict.fromkeys([*requested, "seq"])), frames_max=_SAMPLES_MAX)
         if not is_alone:
-            get_frame_instants_ns(export, flat)
+            get_instants_on_export_clock_ns(export, flat)
         t_ns = export.to_session_axis_ns(flat)
         if not len(t_ns):
             raise UsageError(
@@ -334,7 +334,7 @@ def _encode_chunk(tag: int, content: bytes) -> bytes:
 
 def _add_text_elements(parent: Element, texts: Mapping[str, str]) -> None:
     for name, text in texts.items():
-        SubElement(parent, name).text = escape_invalid_xml(text)
+        SubElement(parent, name).text = escape_xml_invalid_characters(text)
 
 
 XDF = ExportFormat(

@@ -92,12 +92,12 @@ def test_a_node_that_could_not_be_taken_in_is_not_known_and_its_name_is_free(
         raise kind("as a bug would")
 
     with monkeypatch.context() as patch:
-        patch.setattr(ServerNode, "on_hello", failing)
+        patch.setattr(ServerNode, "apply_hello", failing)
         node.open_with_hello()
         assert closed(node.socket)[0] == 1011
     assert running.http.get("/nodes/bench").status_code == 404
     with monkeypatch.context() as patch:
-        patch.setattr(ServerNode, "missing_ranges", failing)
+        patch.setattr(ServerNode, "frames_to_request", failing)
         node.open_with_hello()
         assert closed(node.socket)[0] == 1011
     until(lambda: not running.node()["connected"])

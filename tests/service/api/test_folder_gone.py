@@ -174,7 +174,7 @@ def test_a_copy_that_took_its_place_between_sync_and_acknowledgement_is_promised
     data, folder = running.data, running.server.data_folder
     copy, away = data.with_name("copy"), data.with_name("away")
     shutil.copytree(data, copy)
-    node, check = running.server.nodes.get("bench"), folder.check_in_place
+    node, check = running.server.nodes.get("bench"), folder.check_still_in_place
 
     def swap_and_check() -> None:
         if node.last_seq == 99 and copy.exists():
@@ -182,7 +182,7 @@ def test_a_copy_that_took_its_place_between_sync_and_acknowledgement_is_promised
             copy.rename(data)
         check()
 
-    monkeypatch.setattr(folder, "check_in_place", swap_and_check)
+    monkeypatch.setattr(folder, "check_still_in_place", swap_and_check)
     sent = tared.send(30, 20.0)
     assert closed(tared.socket)[0] == 1012
     assert away.exists()
@@ -228,9 +228,9 @@ def test_a_folder_is_not_used_before_what_is_open_in_the_one_before_is_closed(
     shutil.copytree(away, data)
     for _ in range(2):
         with pytest.raises(FolderGoneError, match="not used yet"):
-            folder.check_in_place()
-    folder.reopen()
-    folder.check_in_place()
+            folder.check_still_in_place()
+    folder.relock_same_folder()
+    folder.check_still_in_place()
     folder.close()
 
 
@@ -243,8 +243,8 @@ def test_a_copy_that_another_server_has_is_not_taken_from_it(tmp_path: Path) -> 
     with (data / LOCK_NAME).open() as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with pytest.raises(StorageError, match="another foottile server"):
-            folder.reopen()
-    folder.reopen()
+            folder.relock_same_folder()
+    folder.relock_same_folder()
     folder.close()
 
 

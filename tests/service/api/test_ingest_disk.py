@@ -138,14 +138,14 @@ def test_a_disk_that_is_full_between_two_syncs_has_refused_nothing(
 def test_what_a_node_says_is_written_down_in_another_thread_before_its_frames_are_promised(
     running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    begun, may_go_on, keep = threading.Event(), threading.Event(), ServerNode.save
+    begun, may_go_on, keep = threading.Event(), threading.Event(), ServerNode.save_hello
 
     def slow(self: ServerNode) -> None:
         begun.set()
         assert may_go_on.wait(PATIENCE_S)
         keep(self)
 
-    monkeypatch.setattr(ServerNode, "save", slow)
+    monkeypatch.setattr(ServerNode, "save_hello", slow)
     try:
         node.connect()
         node.send(10)
@@ -184,7 +184,7 @@ def test_what_a_node_says_is_followed_although_it_cannot_be_written_down(
     node.restart()
     node.tiles += 1
     with monkeypatch.context() as patch:
-        patch.setattr(service.server.node.ServerNode, "save", refusing(*STORAGE_FULL))
+        patch.setattr(service.server.node.ServerNode, "save_hello", refusing(*STORAGE_FULL))
         node.connect()
     shown = running.node()
     assert len(shown["tiles"]) == node.tiles

@@ -15,8 +15,8 @@ from service.estimation.calibration import (
     PRESETS,
     Calibration,
     TileCalibration,
-    is_monotonic,
-    make_paper_eq2_preset,
+    is_increasing_cubic,
+    make_paper_shape_preset,
 )
 from service.estimation.models.static import StaticCurves
 from tests.builders.calibrations import make_calibration, newton_tile
@@ -194,7 +194,7 @@ def test_a_cubic_is_monotonic_exactly_if_no_point_of_a_fine_grid_falls(
     u = low + width * np.linspace(0, 1, 4001)
     slope = c[1] + 2 * c[2] * u + 3 * c[3] * u**2
     assume(abs(slope.min()) > 1e-3)  # nearer to zero the grid cannot tell
-    assert is_monotonic(c, (low, low + width)) == bool(slope.min() > 0)
+    assert is_increasing_cubic(c, (low, low + width)) == bool(slope.min() > 0)
 
 
 @pytest.mark.parametrize(
@@ -210,7 +210,7 @@ def test_a_cubic_is_monotonic_exactly_if_no_point_of_a_fine_grid_falls(
 def test_monotony_is_judged_at_both_ends_and_in_between(
     coefficients: tuple[float, float, float, float], expected: bool
 ) -> None:
-    assert is_monotonic(coefficients, (0.0, 1.0)) is expected
+    assert is_increasing_cubic(coefficients, (0.0, 1.0)) is expected
 
 
 # --- the paper's equation 2, hardware.md 7 --------------------------------------------------------
@@ -223,7 +223,7 @@ def test_the_papers_preset_is_zero_at_zero_and_30_n_at_15_kpa() -> None:
 
 
 def test_the_papers_preset_has_the_papers_shape_at_41_45_n_per_unit() -> None:
-    tile = make_paper_eq2_preset().get_tile("T01")
+    tile = make_paper_shape_preset().get_tile("T01")
     assert tile.f_scale_n == pytest.approx(41.45, abs=0.005)
     for gauge_kpa in np.linspace(0.0, 15.0, 61).tolist():
         p = gauge_kpa / 15.0
@@ -232,9 +232,9 @@ def test_the_papers_preset_has_the_papers_shape_at_41_45_n_per_unit() -> None:
 
 
 def test_the_papers_preset_says_that_its_scale_is_assumed_and_doubts_it_by_a_tenth() -> None:
-    tile = make_paper_eq2_preset().get_tile("T01")
+    tile = make_paper_shape_preset().get_tile("T01")
     assert tile.absolute_scale == "assumed"
     assert tile.relative_misfit == 0.1
     assert tile.monotonic
     assert tile.range_kpa == (0.0, 15.0)
-    assert "assumed" in make_paper_eq2_preset().reference
+    assert "assumed" in make_paper_shape_preset().reference

@@ -51,8 +51,8 @@ def test_nineteen_of_twenty_lie_within_two_sigma() -> None:
 
 
 def test_the_walls_give_is_that_of_the_soak_or_of_the_material() -> None:
-    assert Effects(temperature=temperature()).wall_per_kpa == 0.002
-    assert Effects().wall_per_kpa == WALL_PER_KPA == 0.00124
+    assert Effects(temperature=temperature()).wall_compliance_per_kpa == 0.002
+    assert Effects().wall_compliance_per_kpa == WALL_PER_KPA == 0.00124
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""`step` and `finish`: any split the same bits, nothing raises, honest uncertainty.
+"""`process_frames` and `finish`: any split the same bits, nothing raises, honest uncertainty.
 
 Tiles read one newton a count (see tests/builders), so forces below are what the tiles see.
 """

@@ -126,10 +126,10 @@ def test_rounding_moves_nothing_by_more_than_half_a_step_and_twice_is_once(
         for name, steps in rounding.steps.items()
     }
     columns = {n: v if len(rounding.steps[n]) > 1 else v[:, 0] for n, v in columns.items()}
-    rounded = rounding.quantize(columns)
-    same_bits(rounding.quantize(rounded), rounded)
+    rounded = rounding.round_to_steps(columns)
+    same_bits(rounding.round_to_steps(rounded), rounded)
     in_file = {name: values.astype(np.float32) for name, values in _small(rounded).items()}
-    again = rounding.quantize({name: v.astype(np.float64) for name, v in in_file.items()})
+    again = rounding.round_to_steps({name: v.astype(np.float64) for name, v in in_file.items()})
     same_bits({name: values.astype(np.float32) for name, values in again.items()}, in_file)
     for name, values in columns.items():
         finite = np.isfinite(values)
@@ -150,7 +150,7 @@ def _small(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def test_a_bound_is_rounded_down_and_remains_one() -> None:
     rounding = Quantization.for_plans([plan_of(("static",), [1.0] * 4, 0.0)])
     bound_n = np.random.default_rng(0).normal(0.0, 20.0, 1000)
-    rounded = rounding.quantize({"grf_lower_bound_n": bound_n})["grf_lower_bound_n"]
+    rounded = rounding.round_to_steps({"grf_lower_bound_n": bound_n})["grf_lower_bound_n"]
     assert (rounded <= bound_n).all()
 
 
@@ -164,8 +164,8 @@ def test_any_split_gives_the_same_rounded_bits_and_flags_and_contact_are_as_they
     frames = wild_frames(200, 4, seed)
     exact = columns_of(estimate(plan, frames))
     pieces = columns_of(estimate(plan, *cut_up(frames, sorted(cuts))))
-    same_bits(rounding.quantize(exact), rounding.quantize(pieces))
-    rounded = rounding.quantize(exact)
+    same_bits(rounding.round_to_steps(exact), rounding.round_to_steps(pieces))
+    rounded = rounding.round_to_steps(exact)
     for name in ("seq", "t_ns", "contact", "estimate_flags"):
         assert rounded[name] is exact[name]
     for name, values in exact.items():
@@ -183,7 +183,7 @@ def test_a_last_bit_that_is_another_on_another_machine_is_rounded_off(seed: int)
     for name, steps in rounding.steps.items():
         values = exact[name]
         other = values * (1.0 + rng.choice([-1.0, 0.0, 1.0], values.shape) * 2.0**-50)
-        one, two = (rounding.quantize({name: v})[name] for v in (values, other))
+        one, two = (rounding.round_to_steps({name: v})[name] for v in (values, other))
         # What lies on the edge itself may fall to either side; it is a rare one.
         edge = values / steps + (0.0 if name == "grf_lower_bound_n" else 0.5)
         clear = np.abs(edge - np.rint(edge)) > 1e-9
@@ -193,10 +193,13 @@ def test_a_last_bit_that_is_another_on_another_machine_is_rounded_off(seed: int)
 def test_one_step_goes_with_all_tares_of_a_recording() -> None:
     quiet, loud = (plan_of(("static",), [counts] * 4, 0.0) for counts in (0.3, 3.0))
     both = Quantization.for_plans([loud, quiet])
-    assert both.steps_by_column() == Quantization.for_plans([quiet]).steps_by_column()
     assert (
-        both.steps_by_column()["force_n_0"]
-        < Quantization.for_plans([loud]).steps_by_column()["force_n_0"]
+        both.collect_flat_column_steps()
+        == Quantization.for_plans([quiet]).collect_flat_column_steps()
+    )
+    assert (
+        both.collect_flat_column_steps()["force_n_0"]
+        < Quantization.for_plans([loud]).collect_flat_column_steps()["force_n_0"]
     )
 
 
@@ -210,17 +213,17 @@ def test_a_lost_tare_has_no_say_and_alone_leaves_nothing_to_be_rounded() -> None
         lag_ms=0.0,
     )
     assert (
-        Quantization.for_plans([known, lost]).steps_by_column()
-        == Quantization.for_plans([known]).steps_by_column()
+        Quantization.for_plans([known, lost]).collect_flat_column_steps()
+        == Quantization.for_plans([known]).collect_flat_column_steps()
     )
-    assert Quantization.for_plans([lost]).steps_by_column() == {}
+    assert Quantization.for_plans([lost]).collect_flat_column_steps() == {}
 
 
 def test_without_noise_nothing_is_rounded_but_what_the_servo_says() -> None:
     plan = newton_plan(array_at(SQUARE, servo=make_servo()), sigma_n=0.0)
-    assert list(Quantization.for_plans([plan]).steps_by_column()) == ["angle_rad"]
+    assert list(Quantization.for_plans([plan]).collect_flat_column_steps()) == ["angle_rad"]
     values = np.random.default_rng(0).normal(size=(9, 4))
-    kept = Quantization.for_plans([plan]).quantize({"force_n": values})
+    kept = Quantization.for_plans([plan]).round_to_steps({"force_n": values})
     np.testing.assert_array_equal(kept["force_n"], values)
 
 
@@ -229,7 +232,7 @@ def test_with_next_to_no_noise_nothing_is_moved_that_shows(sigma_n: float) -> No
     rounding = Quantization.for_plans([newton_plan(array_at(SQUARE), sigma_n=sigma_n)])
     values = np.random.default_rng(0).normal(0.0, 100.0, size=(9, 4))
     columns = {"gauge_kpa": values, "force_n": values, "grf_lower_bound_n": values[:, 0]}
-    same_bits(rounding.quantize(columns), columns)
+    same_bits(rounding.round_to_steps(columns), columns)
 
 
 @pytest.mark.parametrize(
@@ -239,7 +242,7 @@ def test_with_next_to_no_noise_nothing_is_moved_that_shows(sigma_n: float) -> No
 def test_the_centre_of_pressure_has_a_step_along_each_measured_axis(
     positions: list[tuple[float, float, float]], measured: str
 ) -> None:
-    steps = Quantization.for_plans([newton_plan(array_at(positions))]).steps_by_column()
+    steps = Quantization.for_plans([newton_plan(array_at(positions))]).collect_flat_column_steps()
     assert {name for name in steps if name.startswith("cop") and name.endswith("_m")} == {
         name
         for axis in measured
@@ -254,14 +257,16 @@ def test_a_bare_tile_has_a_pressure_to_be_rounded_and_no_force() -> None:
     bare = info.tiles[2].model_copy(update={"reference": True})
     info = info.model_copy(update={"tiles": (*info.tiles[:2], bare)})
     plan = newton_plan(info, tiles=[newton_tile("T01"), newton_tile("T02")])
-    steps = Quantization.for_plans([plan]).steps_by_column()
+    steps = Quantization.for_plans([plan]).collect_flat_column_steps()
     assert "gauge_kpa_2" in steps
     assert "force_n_1" in steps
     assert "force_n_2" not in steps
 
 
 def test_steps_are_said_for_every_flat_column_and_survive_json() -> None:
-    steps = Quantization.for_plans([plan_of(("static",), [1.0] * 4, 0.0)]).steps_by_column()
+    steps = Quantization.for_plans(
+        [plan_of(("static",), [1.0] * 4, 0.0)]
+    ).collect_flat_column_steps()
     assert json.loads(json.dumps(steps)) == steps
     assert {"gauge_kpa_3", "force_sigma_n_0", "grf_lower_bound_n", "cop_index_y"} <= set(steps)
     assert {"contact", "estimate_flags"}.isdisjoint(steps)

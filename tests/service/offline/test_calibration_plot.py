@@ -11,7 +11,7 @@ import pytest
 
 from devices.scene.scene_file import load_scene, validate_scene
 from service.estimation.calibration import Calibration
-from service.estimation.fitting.effects_fit import extract_replays, fit_effects
+from service.estimation.fitting.effects_fit import fit_effects, replay_release_and_tap
 from service.estimation.fitting.rig.indentation import Indentation
 from service.offline.calibration_fit import fit_calibration, read_indentations
 from service.offline.calibration_lookup import replace_tiles
@@ -36,7 +36,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
 
 def test_a_release_and_a_tap_are_replayed_better_with_effects_than_without(bench: Bench) -> None:
     calibration, recordings = bench
-    found = extract_replays(recordings["T01"], calibration.get_tile("T01"))
+    found = replay_release_and_tap(recordings["T01"], calibration.get_tile("T01"))
     assert set(found) == {"release", "tap"}
     for replay in found.values():
         known = np.isfinite(replay.measured_kpa)
@@ -57,7 +57,7 @@ def test_a_recording_without_fast_loads_has_nothing_to_replay(bench: Bench) -> N
         n: v[:last] for n, v in vars(recording).items() if isinstance(v, np.ndarray)
     }
     only_slow = replace(recording, **columns)
-    assert extract_replays([only_slow], calibration.get_tile("T01")) == {}
+    assert replay_release_and_tap([only_slow], calibration.get_tile("T01")) == {}
 
 
 def test_a_soak_in_a_file_of_its_own_tells_the_same_of_warmth(bench: Bench) -> None:

@@ -13,7 +13,7 @@ from devices.chips.compensation import Compensation
 from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameFlag
 from devices.scene.emulation_sections import FaultSection
 from devices.scene.scene_file import load_scene
-from service.estimation.foot.geometry import compute_rad_per_count
+from service.estimation.foot.geometry import compute_segment_rad_per_count
 from service.offline.simulation import EmulatedRun, SimulationOptions
 from service.rig.emulated_foot import EmulatedFoot
 
@@ -43,7 +43,7 @@ def test_any_turn_of_the_servo_reaches_frames_and_angle_unharmed(
     assert info is not None
     known = (frames.frame_flags & FrameFlag.SERVO_STALE) == 0
     assert known.sum() > 200
-    angle_rad = (frames.servo_counts - info.zero_counts) * compute_rad_per_count(info)
+    angle_rad = (frames.servo_counts - info.zero_counts) * compute_segment_rad_per_count(info)
     error_rad = angle_rad - truth["true_angle_rad"]
     # 0.13 rad/s for 13 ms at most, and half a count of 0.15 mrad
     assert np.abs(error_rad[known]).max() < 2.5e-3

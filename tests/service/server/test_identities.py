@@ -47,12 +47,12 @@ class Machine:
             answer = Proof(secret=secret)
         claim = IdentityClaim(NODE, challenge, answer, ADDRESS)
         try:
-            is_proven = server.verify_claim(claim, NOW_T_NS)
+            is_proven = server.verify_or_refuse_claim(claim, NOW_T_NS)
         except CloseConnection as end:
             self.is_refused = end.code == LinkCloseCode.WRONG_IDENTITY
             return False
         if not is_proven:
-            server.store_first_secret(claim)
+            server.try_store_first_secret(claim)
         if dies_after == "keep":
             raise _Killed
         self.is_refused = False
@@ -203,4 +203,4 @@ def test_no_answer_but_the_right_one_is_that_of_the_node(
     assert machine.connect(server)
     claim = IdentityClaim(NODE, server.make_challenge(NODE, SERVER), answer(), ADDRESS)
     with pytest.raises(CloseConnection, match="foottile accept-node leg"):
-        server.verify_claim(claim, NOW_T_NS)
+        server.verify_or_refuse_claim(claim, NOW_T_NS)

@@ -70,7 +70,7 @@ class Told:
         return EarlierStream(**(content | changes))
 
     def connect(self, **changes: Any) -> None:
-        self.node.on_hello(self.hello(**changes), UTC_NS)
+        self.node.apply_hello(self.hello(**changes), UTC_NS)
 
     def take(self, first: int, last: int, boot: str = NEW) -> list[int]:
         """Numbers whose estimates are due then."""
@@ -88,7 +88,7 @@ class Told:
 
     def lacks(self, **needed: list[tuple[int, int]]) -> dict[str, list[tuple[int, int | None]]]:
         named = {{"old": OLD, "new": NEW}[name]: Intervals(n) for name, n in needed.items()}
-        return {each.stream_id: [*each.numbers] for each in self.node.missing_ranges(named)}
+        return {each.stream_id: [*each.numbers] for each in self.node.frames_to_request(named)}
 
     def close(self) -> None:
         for journal in self.node.journals.values():
@@ -168,7 +168,7 @@ def test_frames_of_two_streams_in_any_order_and_any_number_of_times_are_each_hel
                 np.testing.assert_array_equal(
                     getattr(found, name), getattr(frames(0, total - 1, boot), name)
                 )
-        assert told.node.lost_by_reason == {}
+        assert told.node.present_stream_lost_by_reason == {}
         assert told.node.backlog_frames == 0
         told.close()
 
@@ -177,7 +177,7 @@ def test_what_is_missing_and_still_with_the_node_is_backlog_and_not_lost(told: T
     told.connect(stored=((0, 99),), next_seq=100)
     told.take(100, 104)
     assert told.node.backlog_frames == 100
-    assert told.node.lost_by_reason == {}
+    assert told.node.present_stream_lost_by_reason == {}
     told.take(50, 54)
     assert told.node.backlog_frames == 95
 
@@ -185,23 +185,23 @@ def test_what_is_missing_and_still_with_the_node_is_backlog_and_not_lost(told: T
 def test_what_the_node_has_lost_is_counted_by_its_reason_and_no_backlog(told: Told) -> None:
     told.connect(stored=((0, 99),), next_seq=100)
     told.take(100, 104)
-    told.node.present_stream.set_losses({"evicted": ((0, 9),), "disk_full": ((20, 24),)})
-    assert told.node.lost_by_reason == {"evicted": 10, "disk_full": 5}
+    told.node.present_stream.set_node_losses({"evicted": ((0, 9),), "disk_full": ((20, 24),)})
+    assert told.node.present_stream_lost_by_reason == {"evicted": 10, "disk_full": 5}
     assert told.node.backlog_frames == 85
 
 
 def test_a_loss_that_came_all_the_same_is_none(told: Told) -> None:
     told.connect(stored=((0, 9),), next_seq=10)
     told.take(0, 9)
-    told.node.present_stream.set_losses({"disk_full": ((5, 6),)})
-    assert told.node.lost_by_reason == {}
+    told.node.present_stream.set_node_losses({"disk_full": ((5, 6),)})
+    assert told.node.present_stream_lost_by_reason == {}
 
 
 def test_frames_from_before_the_server_knew_the_node_are_not_lost(told: Told) -> None:
     told.connect(stored=((500, 599),), next_seq=600)
     told.take(500, 599)
     told.take(600, 609)
-    assert told.node.lost_by_reason == {}
+    assert told.node.present_stream_lost_by_reason == {}
 
 
 def test_what_was_deleted_because_nobody_needs_it_is_not_lost_even_after_a_restart(
@@ -217,7 +217,7 @@ def test_what_was_deleted_because_nobody_needs_it_is_not_lost_even_after_a_resta
     held = told.node.present_stream.stored
     assert held.missing_in(10, 12).count == 0
     assert held.missing_in(0, 99).count > 50
-    assert told.node.lost_by_reason == {}
+    assert told.node.present_stream_lost_by_reason == {}
     # It is not asked for again either, but what a session needs is.
     told.connect(stored=((0, 99),), next_seq=100)
     assert told.lacks() == {NEW: [(100, None)]}
@@ -225,7 +225,7 @@ def test_what_was_deleted_because_nobody_needs_it_is_not_lost_even_after_a_resta
     told.restart()
     told.connect(stored=((100, 104),), next_seq=105)
     told.take(105, 109)
-    assert told.node.lost_by_reason == {}
+    assert told.node.present_stream_lost_by_reason == {}
 
 
 def test_of_the_present_stream_all_is_asked_for_and_what_sessions_need_first(told: Told) -> None:
@@ -310,9 +310,9 @@ def test_slots_that_a_killed_node_has_forgotten_are_still_counted(told: Told) ->
     told.connect(stored=((0, 9),), next_seq=10)
     stream = told.node.present_stream
     stream.missed_slots = 4
-    stream.on_earlier(told.earlier(stored=((0, 9),), next_seq=10, missed_slots=0))
+    stream.apply_end_report(told.earlier(stored=((0, 9),), next_seq=10, missed_slots=0))
     assert (stream.missed_slots, stream.notes.missed_slots) == (4, 4)
-    stream.on_earlier(told.earlier(stored=((0, 9),), next_seq=10, missed_slots=5))
+    stream.apply_end_report(told.earlier(stored=((0, 9),), next_seq=10, missed_slots=5))
     assert (stream.missed_slots, stream.notes.missed_slots) == (5, 5)
 
 

@@ -54,7 +54,7 @@ class Foot:
         if hasattr(self, "node"):
             self.close()
         self.node = ServerNode(self._folder / "node", self._folder / "journal", self.hello)
-        self.node.on_hello(self.hello, UTC_NS)
+        self.node.apply_hello(self.hello, UTC_NS)
         self.node.is_connected = True
 
     def close(self) -> None:
@@ -116,7 +116,7 @@ class Foot:
 
     @property
     def history(self) -> list[tuple[str, bool]]:
-        return [(t.tare.source, t.undone) for t in self.node.estimator.tare_history.tares]
+        return [(t.tare.source, t.undone) for t in self.node.estimator.tare_history.all_tares]
 
     @property
     def offset_counts(self) -> list[float]:
@@ -214,7 +214,7 @@ def test_without_a_lead_that_could_be_used_the_tare_of_before_stays_and_that_is_
     again = {"stream_id": "1" * 32}
     info = foot.hello.array_info.model_copy(update=again)
     foot.hello = foot.hello.model_copy(update={"array_info": info})
-    foot.node.on_hello(foot.hello, UTC_NS)
+    foot.node.apply_hello(foot.hello, UTC_NS)
     foot.seq = 0
     foot.live(1.0, lead=True, silent=0)
     foot.live(1.0)
@@ -271,9 +271,9 @@ def test_a_dome_that_warms_is_followed_between_steps_and_each_time_is_in_the_his
         for _ in range(20):
             foot.live(2.0, COUNTS_PER_K * warmer_k, warmer_k=warmer_k)
             foot.live(1.0, COUNTS_PER_K * warmer_k + 40.0, warmer_k=warmer_k)
-    flights = [t for t in foot.node.estimator.tare_history.tares if t.tare.source == "flight"]
+    flights = [t for t in foot.node.estimator.tare_history.all_tares if t.tare.source == "flight"]
     assert 3 <= len(flights) <= 5
-    t_s = np.array([t.tare.t_ns for t in foot.node.estimator.tare_history.tares]) * 1e-9
+    t_s = np.array([t.tare.t_ns for t in foot.node.estimator.tare_history.all_tares]) * 1e-9
     assert (np.diff(t_s) >= 60.0 - 1e-6).all()
     assert all("in flight" in t.reason for t in flights)
     assert foot.offset_counts == pytest.approx([COUNTS_PER_K * 2.0] * 2, abs=COUNTS_PER_K * 0.6)
@@ -328,7 +328,7 @@ def test_an_automatic_tare_that_is_undone_does_not_come_back_until_somebody_tare
     foot.live(70.0, 0.9)
     assert foot.history == [("lead", False), ("flight", False)]
     assert foot.auto_tare == "on"
-    foot.node.estimator.tare_controller.undo_tare(foot.node.estimator.tare_history.tares[-1].id)
+    foot.node.estimator.tare_controller.undo_tare(foot.node.estimator.tare_history.all_tares[-1].id)
     assert foot.offset_counts == pytest.approx([0.0, 0.0], abs=0.4)
     assert foot.auto_tare == "paused"
     foot.live(200.0, 0.9)

@@ -185,7 +185,9 @@ def test_what_was_half_deleted_is_no_session_and_gone_at_the_next_start(
 ) -> None:
     session = sealed(tared)
     running.http.delete(session.url)
-    monkeypatch.setattr(service.server.server, "delete_files", lambda folders: 0)  # killed before
+    monkeypatch.setattr(
+        service.server.server, "delete_and_count_bytes", lambda folders: 0
+    )  # killed before
     running.http.delete("/trash")
     assert [path.name for path in (running.data / "trash").iterdir()] == [
         DELETED_PREFIX + session.id

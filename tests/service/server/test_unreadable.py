@@ -60,7 +60,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def _tares(folder: Path) -> None:
-    TareHistory(folder / "tares.json").add_tare(make_tare(2), INFO)
+    TareHistory(folder / "tares.json").store_tare(make_tare(2), INFO)
 
 
 def _wanted(folder: Path) -> None:
@@ -149,7 +149,7 @@ def test_tares_that_are_damaged_and_cannot_be_set_aside_are_not_written_over(
         with pytest.raises(StorageError, match="Move it away by hand"):
             TareHistory(path)
     assert contents(tmp_path) == before
-    assert len(TareHistory(path).tares) == 1
+    assert len(TareHistory(path).all_tares) == 1
 
 
 @pytest.mark.parametrize("name", ["hello.json", "tares.json"])

@@ -30,7 +30,7 @@ class Tile:
         t_ns = (self._readings + np.arange(n)) * (1_000_000_000 // RATE_HZ)
         self._readings += n
         noise_kpa = 0.15 * self._rng.standard_normal(n)
-        return self.weighing.push(t_ns, EMPTY_KPA + kpa + per_s * since_s + noise_kpa)
+        return self.weighing.feed_pressures(t_ns, EMPTY_KPA + kpa + per_s * since_s + noise_kpa)
 
 
 def labels(actions: list[Action]) -> list[str]:
@@ -63,7 +63,7 @@ def test_a_weight_that_moves_is_held_once_more() -> None:
     assert labels(tile.reads(3.0, 3.0)) == ["T01 500 g"]
     (withdrawn,) = tile.reads(0.0, 1.0)
     assert isinstance(withdrawn, Withdraw)
-    assert tile.weighing.number == 0
+    assert tile.weighing.weight_index == 0
     assert labels(tile.reads(3.0, HOLD_S + 2.0)) == ["T01 500 g", "End"]
 
 
@@ -108,9 +108,12 @@ def test_a_weight_that_was_another_one_is_repeated_from_its_rest_on() -> None:
     tile.reads(0.0, REST_S + 2.0)
     tile.reads(5.0, HOLD_S + 2.0)
     tile.reads(0.0, REST_S + 2.0)
-    assert tile.weighing.number == 1
-    assert labels(tile.weighing.repeat()) == ["Withdraw", "Withdraw"]  # the rest, and the weight
-    assert tile.weighing.number == 0
+    assert tile.weighing.weight_index == 1
+    assert labels(tile.weighing.repeat_last_weight()) == [
+        "Withdraw",
+        "Withdraw",
+    ]  # the rest, and the weight
+    assert tile.weighing.weight_index == 0
     done = tile.reads(0.0, REST_S + 2.0) + tile.reads(3.0, HOLD_S + 2.0)
     assert labels(done) == ["T01 rest", "End", "T01 500 g", "End"]
 
@@ -119,7 +122,7 @@ def test_a_weight_that_is_repeated_while_it_is_held_is_no_rest() -> None:
     tile = Tile()
     tile.reads(0.0, REST_S + 2.0)
     tile.reads(5.0, 3.0)
-    assert labels(tile.weighing.repeat()) == ["Withdraw"]
+    assert labels(tile.weighing.repeat_last_weight()) == ["Withdraw"]
     assert tile.reads(5.0, REST_S + 2.0) == []
     assert tile.weighing.prompt == "Take everything off T01"
     assert labels(tile.reads(0.0, REST_S + 2.0)) == ["T01 rest", "End"]

@@ -53,7 +53,7 @@ def same(one: RecordedTare, other: RecordedTare) -> None:
 def history(tmp_path: Path, *t_ns: int) -> TareHistory:
     made = TareHistory(tmp_path / "node" / "tares.json")
     for t in t_ns:
-        made.add_tare(tare(t), INFO)
+        made.store_tare(tare(t), INFO)
     return made
 
 

@@ -37,7 +37,7 @@ def series(t_ms: Any, ours_n: Any, reference_n: Any) -> pa.Table:
 
 def kept(folder: Path, table: pa.Table) -> ComparisonSeries:
     write_series(folder / SERIES_NAME, table)
-    found = ComparisonSeriesCache().get(folder)
+    found = ComparisonSeriesCache().get_or_read(folder)
     assert found is not None
     return found
 
@@ -128,17 +128,17 @@ def test_it_is_read_whole_once_and_again_when_it_is_another(
     monkeypatch.setattr(service.sessions.comparison_series, "read_series", counted)
     series_kept = ComparisonSeriesCache()
     write_series(tmp_path / SERIES_NAME, series([0, 2], [1.0, 1.0], [2.0, 2.0]))
-    first = series_kept.get(tmp_path)
-    assert series_kept.get(tmp_path) is first
+    first = series_kept.get_or_read(tmp_path)
+    assert series_kept.get_or_read(tmp_path) is first
     write_series(tmp_path / SERIES_NAME, series([0, 2], [1.0, 1.0], [5.0, 2.0]))
-    second = series_kept.get(tmp_path)
+    second = series_kept.get_or_read(tmp_path)
     assert second is not None
     assert second.get_bins(BEGIN_NS, ALL, 10)[0]["reference_grf_n_max"].tolist() == [5.0, 2.0]
     assert len(read) == 2
     for folder in (tmp_path / str(i) for i in range(6)):
         folder.mkdir()
         write_series(folder / SERIES_NAME, series([0], [1.0], [1.0]))
-        assert series_kept.get(folder) is not None
+        assert series_kept.get_or_read(folder) is not None
     assert len(series_kept._entries) == 4
 
 

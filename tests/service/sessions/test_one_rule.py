@@ -204,7 +204,7 @@ def test_a_server_and_recovery_in_its_folder_come_to_the_same_session(
         stream.write(data)
         if tared is not None:
             history = TareHistory(data / "nodes" / "bench" / "tares.json")
-            history.add_tare(make_tare(t_ns=t_ns(tared)), INFO)
+            history.store_tare(make_tare(t_ns=t_ns(tared)), INFO)
         recorder, node = server_on(data, begun)
         made = recorder.collect_inputs(ID)
         waiting = recorder.get_ledger(ID)
@@ -221,7 +221,7 @@ def test_a_server_and_recovery_in_its_folder_come_to_the_same_session(
         assert done.state == "sealed"
         assert (done.parts, done.given_up) == (given_up.parts, True)
         assert done.max_lost_tail_frames == given_up.max_lost_tail_frames
-        streams_then = session_parts.find_streams(given_up, node)
+        streams_then = session_parts.make_session_streams(given_up, node)
         ledger = compute_ledger(
             given_up.parts, adjust_states_to_session(given_up, streams_then), is_finished=True
         )
@@ -246,7 +246,7 @@ def server_on(data: Path, begun: Session) -> tuple[Recorder, ServerNode]:
         calibration_problem="for this test",
     )
     node = nodes.get_or_create(hello)
-    node.save()
+    node.save_hello()
     keep(data, begun)
     book = SessionStore(
         SessionsFolder(data / "sessions"), Trash(data / "trash"), on_change=lambda _: None

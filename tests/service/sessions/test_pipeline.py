@@ -20,7 +20,7 @@ from service.estimation.estimates import Estimates
 from service.estimation.pipeline.plan import make_plan
 from service.estimation.tare.tare import Tare
 from service.sessions import pipeline
-from service.sessions.pipeline import EstimateStream, estimate_columns, make_notes
+from service.sessions.pipeline import EstimateStream, make_estimate_columns, make_estimate_metadata
 from storage.schema import ESTIMATE_COLUMNS
 from tests.builders.arrays import COUNT_KPA, UNLOADED_KPA
 from tests.service.sessions.pieces import (
@@ -213,7 +213,9 @@ def test_the_notes_are_enough_to_make_the_same_estimates_again() -> None:
     batch = frames(hopping(300, loaded_from=100), lead=100)
     stream, _, columns = run([(batch, {})], lag_ms=9.2, models=("static",))
     assert stream.plan is not None
-    notes = json.loads(json.dumps(make_notes(stream.plan, stream.rounding), allow_nan=False))
+    notes = json.loads(
+        json.dumps(make_estimate_metadata(stream.plan, stream.rounding), allow_nan=False)
+    )
     kept = notes["tare"]
     tare = Tare(
         baseline_kpa=np.array(kept["baseline_kpa"]),
@@ -247,7 +249,7 @@ def test_the_notes_are_enough_to_make_the_same_estimates_again() -> None:
 def test_the_notes_say_what_was_used() -> None:
     stream, _, _ = run([(frames(hopping(300, loaded_from=100), lead=100), {})], lag_ms=100.0)
     assert stream.plan is not None
-    notes = make_notes(stream.plan, stream.rounding)
+    notes = make_estimate_metadata(stream.plan, stream.rounding)
     assert notes["calibration_id"] == calibration().id
     assert notes["absolute_scale"] == "measured"
     assert notes["models"] == ["unwrap", "static"]
@@ -261,7 +263,7 @@ def test_an_assumed_scale_is_said_in_the_notes() -> None:
     assumed = calibration(absolute_scale="assumed")
     stream, _, _ = run([(frames(hopping(99, loaded_from=50), lead=50), {})], calibration=assumed)
     assert stream.plan is not None
-    assert make_notes(stream.plan, stream.rounding)["absolute_scale"] == "assumed"
+    assert make_estimate_metadata(stream.plan, stream.rounding)["absolute_scale"] == "assumed"
 
 
 def test_the_calibration_in_the_notes_is_the_one_that_they_name() -> None:
@@ -269,7 +271,7 @@ def test_the_calibration_in_the_notes_is_the_one_that_they_name() -> None:
     many = calibration("T07", "T02", "T01", "T05")
     stream, _, _ = run([(frames(hopping(99, loaded_from=50), lead=50), {})], calibration=many)
     assert stream.plan is not None
-    notes = make_notes(stream.plan, stream.rounding)
+    notes = make_estimate_metadata(stream.plan, stream.rounding)
     assert Calibration.model_validate(notes["calibration"]).id == notes["calibration_id"]
 
 
@@ -281,7 +283,7 @@ def test_estimate_columns_are_those_of_the_estimates_without_number_and_time() -
         models=("static",),
     )
     estimates = Estimator(plan).process_frames(frames(np.zeros((3, 2))))
-    columns = estimate_columns(estimates)
+    columns = make_estimate_columns(estimates)
     assert set(columns) == {f.name for f in fields(Estimates)} - {"seq", "t_ns"}
     assert columns["grf_n"] is estimates.grf_n
 

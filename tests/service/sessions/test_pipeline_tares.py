@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from devices.errors import TareError
 from devices.frames import FrameBatch
 from service.estimation.tare.tare import Tare
-from service.sessions.pipeline import EstimateStream, make_notes
+from service.sessions.pipeline import EstimateStream, make_estimate_metadata
 from tests.builders.arrays import COUNT_KPA, UNLOADED_KPA
 from tests.service.sessions.pieces import (
     Piece,
@@ -99,10 +99,12 @@ def test_all_tares_are_in_the_notes_and_none_if_none_were_taken() -> None:
     tares = (taken_at(0, 0.0), taken_at(10**8, 5.0))
     stream, _, _ = run([(frames(hopping(99, loaded_from=50)), {})], tares=tares)
     assert stream.plan is not None
-    notes = json.loads(json.dumps(make_notes(stream.plan, stream.rounding, tares), allow_nan=False))
+    notes = json.loads(
+        json.dumps(make_estimate_metadata(stream.plan, stream.rounding, tares), allow_nan=False)
+    )
     assert [kept["t_ns"] for kept in notes["tares"]] == [tare.t_ns for tare in tares]
     assert notes["tare"] == notes["tares"][0]
-    assert "tares" not in make_notes(stream.plan, stream.rounding)
+    assert "tares" not in make_estimate_metadata(stream.plan, stream.rounding)
 
 
 def later_part(batch: FrameBatch, after_ns: int) -> FrameBatch:

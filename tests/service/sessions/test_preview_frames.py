@@ -25,7 +25,7 @@ from service.sessions.frames import iterate_raw_frames
 from service.sessions.inputs import SessionInputs
 from service.sessions.preview import SessionPreview, SessionPreviews
 from service.sessions.preview_frames import PreviewFrames
-from storage.formats.export import Export, make_frame_source
+from storage.formats.export import Export, make_one_pass_frame_source
 from storage.formats.slice import Slice
 from storage.formats.writers.registry import FORMATS
 from storage.journal.journal import Journal
@@ -124,7 +124,7 @@ def in_one_go(sources: SessionInputs, part: Slice) -> bytes:
     stream = make_preview_stream(sources)
     raw = iterate_raw_frames(sources)
     pieces = raw if stream is None else stream.estimate_batches(raw)
-    return text_of(make_frame_source(pieces, axis=sources.compute_time_axis()), part)
+    return text_of(make_one_pass_frame_source(pieces, axis=sources.compute_time_axis()), part)
 
 
 def so_it_is(so_far: SessionPreview, sources: SessionInputs, part: Slice) -> None:

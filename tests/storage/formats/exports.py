@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 
 from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, NOT_READ, ArrayInfo, FrameBatch
 from storage.clock.table import ClockTable
-from storage.formats.export import Export, FrameSource, make_frame_source
+from storage.formats.export import Export, FrameSource, make_one_pass_frame_source
 from storage.formats.markers import PlacedMarkers
 from storage.formats.options import FormatOptions
 from storage.formats.slice import Slice
@@ -96,7 +96,7 @@ def export(
 def exported(
     to: str, part: Slice | None = None, *, every: int = 20, options: FormatOptions = NO_TIMES
 ) -> bytes:
-    content = make_frame_source(cut(frames(), extra(), every))
+    content = make_one_pass_frame_source(cut(frames(), extra(), every))
     chunks = export(content, make_array(), NOTES, to, part or Slice(), options=options)
     return b"".join(chunks)
 

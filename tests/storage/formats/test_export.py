@@ -16,7 +16,7 @@ from devices.errors import UsageError
 from devices.frames import NO_SERVO_COUNTS, NOT_READ, ArrayInfo
 from storage.clock.bounds import OffsetRows
 from storage.clock.table import ClockTable, StreamClockFacts
-from storage.formats.export import make_frame_source
+from storage.formats.export import make_one_pass_frame_source
 from storage.formats.slice import Slice
 from storage.schema import ARRAY_INFO_KEY, CONTACT_UNKNOWN, MEASURED_COLUMNS
 from storage.sessions.footer import NOTES_KEY
@@ -77,7 +77,8 @@ def test_a_slice_of_a_gap_has_a_header_and_no_rows(to: str) -> None:
 
     part = Slice(20 * PERIOD_NS * 1e-9, 30 * PERIOD_NS * 1e-9, ("seq",))
     found = read(
-        b"".join(export(make_frame_source(with_a_gap()), make_array(), NOTES, to, part)), to
+        b"".join(export(make_one_pass_frame_source(with_a_gap()), make_array(), NOTES, to, part)),
+        to,
     )
     assert found.column_names == ["seq"]
     assert found.num_rows == 0
@@ -86,7 +87,7 @@ def test_a_slice_of_a_gap_has_a_header_and_no_rows(to: str) -> None:
 @pytest.mark.parametrize("to", TABLES)
 def test_a_slice_that_begins_after_the_end_is_refused_before_the_first_chunk(to: str) -> None:
     chunks = export(
-        make_frame_source(cut(frames(), extra(), 20)),
+        make_one_pass_frame_source(cut(frames(), extra(), 20)),
         make_array(),
         NOTES,
         to,
@@ -173,7 +174,9 @@ def on_servers_axis(to: str, part: Slice | None = None, *, every: int = 20) -> b
     columns["part"][30:] = 1
     pieces = cut(frames(), columns, every)
     return b"".join(
-        export(make_frame_source(pieces), make_array(), NOTES, to, part or Slice(), clock())
+        export(
+            make_one_pass_frame_source(pieces), make_array(), NOTES, to, part or Slice(), clock()
+        )
     )
 
 
@@ -237,7 +240,7 @@ def test_chunks_come_while_frames_are_read_and_are_no_larger_than_a_piece(to: st
             later = (asked - 1) * rows * PERIOD_NS
             yield replace(piece, t_ns=piece.t_ns + later), {}
 
-    chunks = export(make_frame_source(endless()), make_array(), {}, to, Slice())
+    chunks = export(make_one_pass_frame_source(endless()), make_array(), {}, to, Slice())
     sizes = []
     for number in range(1, 31):
         sizes.append(len(next(chunks)))
@@ -249,7 +252,9 @@ def test_chunks_come_while_frames_are_read_and_are_no_larger_than_a_piece(to: st
 @pytest.mark.parametrize("to", TABLES)
 def test_frames_outside_of_a_slice_make_no_chunks(to: str) -> None:
     part = Slice(0.09, None, ("seq",))
-    chunks = list(export(make_frame_source(cut(frames(), extra(), 1)), make_array(), {}, to, part))
+    chunks = list(
+        export(make_one_pass_frame_source(cut(frames(), extra(), 1)), make_array(), {}, to, part)
+    )
     assert len(chunks) <= 1 + 5 + 1
     assert read(b"".join(chunks), to).num_rows == 5
 
@@ -257,7 +262,7 @@ def test_frames_outside_of_a_slice_make_no_chunks(to: str) -> None:
 @pytest.mark.parametrize("to", TABLES)
 def test_a_session_without_frames_is_refused(to: str) -> None:
     with pytest.raises(UsageError, match="no frames"):
-        next(export(make_frame_source([]), make_array(), {}, to, Slice()))
+        next(export(make_one_pass_frame_source([]), make_array(), {}, to, Slice()))
 
 
 @pytest.mark.parametrize("to", TABLES)
@@ -266,7 +271,7 @@ def test_an_error_on_the_way_is_not_the_end_of_a_file(to: str) -> None:
         yield frames(), {}
         raise OSError("the disk is gone")
 
-    chunks = export(make_frame_source(broken()), make_array(), {}, to, Slice())
+    chunks = export(make_one_pass_frame_source(broken()), make_array(), {}, to, Slice())
     next(chunks)
     with pytest.raises(OSError, match="the disk is gone"):
         list(chunks)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import UsageError
-from storage.formats.export import make_frame_source
+from storage.formats.export import make_one_pass_frame_source
 from storage.formats.slice import Slice
 from storage.schema import MEASURED_COLUMNS
 from tests.builders.arrays import make_array
@@ -61,9 +61,9 @@ def test_seconds_count_from_the_first_frame_whatever_the_pieces_are() -> None:
 
 
 def test_only_a_slice_of_everything_is_all() -> None:
-    assert Slice().is_whole_session
-    assert not Slice(start_s=0.0).is_whole_session
-    assert not Slice(columns=("seq",)).is_whole_session
+    assert Slice().is_unrestricted
+    assert not Slice(start_s=0.0).is_unrestricted
+    assert not Slice(columns=("seq",)).is_unrestricted
 
 
 # --- columns --------------------------------------------------------------------------------------
@@ -97,7 +97,7 @@ def test_a_column_that_is_not_there_is_refused_before_the_first_chunk(
     to: str, unknown: str
 ) -> None:
     chunks = export(
-        make_frame_source(cut(frames(), extra(), 20)),
+        make_one_pass_frame_source(cut(frames(), extra(), 20)),
         make_array(),
         {},
         to,

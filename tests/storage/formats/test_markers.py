@@ -17,7 +17,7 @@ from devices.errors import UsageError
 from devices.frames import FrameBatch
 from storage.clock.bounds import OffsetRows
 from storage.clock.table import ClockTable, StreamClockFacts
-from storage.formats.export import make_frame_source
+from storage.formats.export import make_one_pass_frame_source
 from storage.formats.markers import DISTANCE_MAX_NS, PLACEMENT_COLUMNS, PlacedMarkers, place_markers
 from storage.formats.options import FormatOptions
 from storage.formats.slice import Slice
@@ -177,7 +177,7 @@ def exported(
     )
     return b"".join(
         export(
-            make_frame_source(pieces),
+            make_one_pass_frame_source(pieces),
             make_array(),
             {},
             to,

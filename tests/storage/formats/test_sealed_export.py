@@ -20,7 +20,7 @@ from devices.frames import FrameBatch
 from storage.clock.file import write_clock_file
 from storage.clock.log import ClockOffset
 from storage.clock.table import StreamClockFacts
-from storage.formats.export import ClockName, make_frame_source
+from storage.formats.export import ClockName, make_one_pass_frame_source
 from storage.formats.markers import PLACEMENT_COLUMNS, place_markers
 from storage.formats.sealed_export import make_sealed_export, place_session_markers
 from storage.formats.slice import Slice
@@ -148,7 +148,7 @@ def of_the_whole(
         markers = place_markers(events, [times], table, part, axis=axis) if events else None
         return outcome(
             lambda: export(
-                make_frame_source([(frames, extra)], axis=axis),
+                make_one_pass_frame_source([(frames, extra)], axis=axis),
                 reader.info,
                 reader.notes,
                 "arrow",

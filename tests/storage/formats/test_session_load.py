@@ -12,7 +12,7 @@ import pytest
 
 from devices.emulation.ground.load_trace import LoadTrace
 from devices.errors import LoadTraceError
-from storage.formats.export import make_frame_source
+from storage.formats.export import make_one_pass_frame_source
 from storage.formats.load_trace import read_load_trace
 from storage.formats.options import FormatOptions
 from storage.formats.readers.registry import read_table
@@ -56,7 +56,7 @@ def exported(folder: Path, to: str, columns: dict[str, Array], *names: str) -> P
     path = folder / f"out.{to}"
     pieces = [(make_frames(ROWS, 3), columns)]
     path.write_bytes(
-        b"".join(export(make_frame_source(pieces), ARRAY, {}, to, Slice(columns=names)))
+        b"".join(export(make_one_pass_frame_source(pieces), ARRAY, {}, to, Slice(columns=names)))
     )
     return path
 
@@ -152,7 +152,9 @@ def test_forces_of_some_tiles_only_are_refused(tmp_path: Path) -> None:
 def test_an_export_for_excel_is_read_again_with_its_umlauts(tmp_path: Path) -> None:
     path = tmp_path / "out.csv"
     info = make_array([make_tile(0, serial="Größe"), make_tile(1)])
-    content = make_frame_source([(make_frames(ROWS, 2), {"force_n": ESTIMATE_N[:, [0, 2]]})])
+    content = make_one_pass_frame_source(
+        [(make_frames(ROWS, 2), {"force_n": ESTIMATE_N[:, [0, 2]]})]
+    )
     options = FormatOptions(names="serial", times=True, decimal="comma", about=True)
     path.write_bytes(b"".join(export(content, info, {}, "csv", Slice(), options=options)))
     assert path.read_bytes().startswith(codecs.BOM_UTF8)
@@ -160,7 +162,9 @@ def test_an_export_for_excel_is_read_again_with_its_umlauts(tmp_path: Path) -> N
     found = table.columns["force_n_Größe"].astype(np.float32)
     np.testing.assert_array_equal(found, ESTIMATE_N[:, 0])
     options = FormatOptions(times=True, decimal="comma", about=True)
-    content = make_frame_source([(make_frames(ROWS, 2), {"force_n": ESTIMATE_N[:, [0, 2]]})])
+    content = make_one_pass_frame_source(
+        [(make_frames(ROWS, 2), {"force_n": ESTIMATE_N[:, [0, 2]]})]
+    )
     path.write_bytes(b"".join(export(content, info, {}, "csv", Slice(), options=options)))
     found = cells(read_load_trace(path)).astype(np.float32)
     np.testing.assert_array_equal(found, ESTIMATE_N[:, [0, 2]])

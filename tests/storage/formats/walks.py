@@ -11,7 +11,7 @@ import numpy as np
 from devices.frames import ArrayInfo
 from storage.clock.bounds import OffsetRows
 from storage.clock.table import ClockTable, StreamClockFacts
-from storage.formats.export import Export, FrameSource, make_frame_source
+from storage.formats.export import Export, FrameSource, make_one_pass_frame_source
 from storage.formats.slice import Slice
 from storage.schema import CONTACT_UNKNOWN, Array
 from tests.builders.arrays import UTC_NS, make_array, make_tile
@@ -125,7 +125,7 @@ def export_of_walk(
     frames = with_columns(make_frames(kept, len(info.tiles)), **given)
 
     def content() -> FrameSource:
-        return make_frame_source(
+        return make_one_pass_frame_source(
             (
                 frames.slice_rows(a, a + every),
                 {name: v[kept][a : a + every] for name, v in columns.items()},

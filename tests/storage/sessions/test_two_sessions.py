@@ -11,7 +11,7 @@ import pytest
 
 from storage.clock.bounds import OffsetRows
 from storage.clock.table import ClockTable, StreamClockFacts
-from storage.formats.export import make_frame_source
+from storage.formats.export import make_one_pass_frame_source
 from storage.formats.slice import Slice
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames
@@ -71,7 +71,9 @@ class Node:
         clock = ClockTable(rows, [StreamClockFacts(name) for name in names], names)
         pieces = iter([(frames, {"part": part})])
         path.write_bytes(
-            b"".join(export(make_frame_source(pieces), info, {}, "parquet", Slice(), clock))
+            b"".join(
+                export(make_one_pass_frame_source(pieces), info, {}, "parquet", Slice(), clock)
+            )
         )
 
 

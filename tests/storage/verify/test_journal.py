@@ -81,7 +81,7 @@ def test_a_whole_journal_is_counted_and_nothing_is_touched(tmp_path: Path) -> No
     report = verify_journal(folder)
     assert report.problems == report.remarks == []
     assert report.stored == Intervals([(0, 39)])
-    assert not report.missing
+    assert not report.absent_not_lost
     assert not report.unsynced
     assert before == {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in folder.iterdir()}
 
@@ -125,11 +125,11 @@ def test_a_cut_at_a_batch_of_segment_and_index_is_seen_by_the_stream_s_end(tmp_p
     path.write_bytes(path.read_bytes()[: ends(folder)[4]])
     index.write_bytes(index.read_bytes()[: 5 * RECORD_DTYPE.itemsize])
     report = verify_journal(folder)
-    assert report.missing == Intervals([(25, 39)])
+    assert report.absent_not_lost == Intervals([(25, 39)])
     assert "cut behind frame 24" in "; ".join(report.problems)
     (tmp_path / "nodes").mkdir()  # a server may still get the rest
     report = verify_journal(folder)
-    assert (report.problems, report.missing.count) == ([], 15)
+    assert (report.problems, report.absent_not_lost.count) == ([], 15)
 
 
 def test_batches_that_are_in_no_index_are_seen(tmp_path: Path) -> None:

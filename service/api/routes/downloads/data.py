@@ -175,7 +175,11 @@ def _write_export(
         clock = sources.make_clock_table() if query.clock == "server" else None
         # A whole session is estimated once: no cached preview is needed.
         is_some, so_fars = query.slice.has_time_bounds, server.previews
-        so_far = so_fars.get_quickly(sources) if is_some else SessionPreview(sources, server.data)
+        so_far = (
+            so_fars.advance_unless_catching_up(sources)
+            if is_some
+            else SessionPreview(sources, server.data)
+        )
         frames = PreviewFrames(so_far, sources, query.slice)
         source = {"session": session.id, "state": session.state}
         content = frames.make_content()  # reads the first frames, which sets `notes`
@@ -193,7 +197,7 @@ def _write_export(
         )
         return
     with server.sessions.open_frames(
-        session.id, only_slices=not query.slice.is_whole_session
+        session.id, only_slices=not query.slice.is_unrestricted
     ) as reader:
         export = make_sealed_export(
             reader, query.slice, clock=query.clock, markers=markers, options=query.options

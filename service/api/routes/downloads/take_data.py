@@ -103,7 +103,7 @@ def _write_exports(
         exports = [
             make_sealed_export(
                 opened.enter_context(
-                    server.sessions.open_frames(session.id, only_slices=not part.is_whole_session)
+                    server.sessions.open_frames(session.id, only_slices=not part.is_unrestricted)
                 ),
                 part,
                 clock=query.clock_name,

@@ -185,7 +185,7 @@ def _make_report(session: Session, name: str, server: Server) -> ReportView:
 
 
 def _encode_series(session: Session, name: str, query: SeriesQuery, server: Server) -> bytes:
-    cached = server.comparison_series.get(
+    cached = server.comparison_series.get_or_read(
         find_comparison_folder(server.sessions.folder.get_path(session.id), name)
     )
     if cached is None:

@@ -27,7 +27,7 @@ from service.api.routes.common import (
     problem_responses,
 )
 from service.server.server import Server
-from service.sessions.overview import POINTS_MAX, BinnedSlice, bin_session
+from service.sessions.overview import POINTS_MAX, BinnedSlice, bin_from_overview_or_rebuild
 from service.version import SOFTWARE_VERSION
 from storage.formats.slice import Slice
 from storage.schema import Array
@@ -160,7 +160,9 @@ def _encode_sealed(
     assert session.sha256 is not None  # noqa: S101  # asked before
     part = Slice(query.start_s, query.end_s)
     with server.sessions.open_frames(session.id, only_slices=True) as reader:
-        seen = bin_session(reader, part, query.points, frames_sha256=session.sha256)
+        seen = bin_from_overview_or_rebuild(
+            reader, part, query.points, frames_sha256=session.sha256
+        )
         serials = list(reader.info.serials)
     flags = {"provisional": False, "catching_up": False}
     return _encode(session, seen, serials, flags, query, as_arrow=as_arrow, as_gzip=as_gzip)

@@ -174,7 +174,7 @@ async def stop_session(session_id: str, server: ServerState) -> SessionView:
     if node is not None:
         server.notify_node_changed(node)
     if node is not None and node.is_connected:
-        session = await server.sealer.wait_until_sealed(session_id, SEAL_TIMEOUT_S)
+        session = await server.sealer.wait_until_sealed_or_timeout(session_id, SEAL_TIMEOUT_S)
     return SessionView.from_session(session, server.recorder)
 
 
@@ -190,7 +190,7 @@ async def abandon_missing(session_id: str, server: ServerState) -> SessionView:
     It is sealed as lossy: the missing frames are lost, reason `given_up`.
     """
     server.recorder.abandon_missing(session_id)
-    session = await server.sealer.wait_until_sealed(session_id, SEAL_TIMEOUT_S)
+    session = await server.sealer.wait_until_sealed_or_timeout(session_id, SEAL_TIMEOUT_S)
     return SessionView.from_session(session, server.recorder)
 
 
@@ -277,7 +277,7 @@ async def change_session(
 ) -> SessionView:
     """Change name, subject, notes or tags; the sealed data does not change."""
     changes = {n: v for n, v in body.model_dump(exclude_unset=True).items() if v is not None}
-    session = server.sessions.edit_description(
+    session = server.sessions.edit_user_fields(
         session_id, if_revision=parse_if_match(if_match), **changes
     )
     return SessionView.from_session(session, server.recorder)
@@ -301,8 +301,8 @@ async def delete_session(session_id: str, server: ServerState, if_match: IfMatch
 
     Only emptying the trash frees its space.
     """
-    server.recorder.delete_session(session_id, if_revision=parse_if_match(if_match))
-    server.broadcaster.send_notice({"type": "deleted", "session_id": session_id})
+    server.recorder.move_to_trash(session_id, if_revision=parse_if_match(if_match))
+    server.broadcaster.queue_notice({"type": "deleted", "session_id": session_id})
 
 
 @router.post(

@@ -41,7 +41,7 @@ from service.protocol import (
 )
 from service.server.identities import IdentityClaim
 from service.server.node import ServerNode
-from service.server.nodes import is_node_name
+from service.server.nodes import is_valid_node_name
 from service.server.server import NodeLink, Server
 from service.server.streams import ServerStream
 from service.server_clock import server_utc_ns
@@ -88,7 +88,7 @@ async def _challenge_node(socket: WebSocket, server: Server, offered: list[str])
             + ("node" if protocol < PROTOCOL else "server"),
         )
     who = _require_message(Identify, first)
-    if not is_node_name(who.node):
+    if not is_valid_node_name(who.node):
         raise CloseConnection(
             LinkCloseCode.REFUSED,
             f"{who.node[:80]!r} is no name of a node: letters, digits, '.', '_', '-'",
@@ -125,7 +125,7 @@ def _verify_claim(server: Server, claim: IdentityClaim) -> bool:
     before = server.identities.refused_machines.get(claim.node)
     try:
         with _close_on_storage_error():
-            return server.identities.verify_claim(claim, server_utc_ns())
+            return server.identities.verify_or_refuse_claim(claim, server_utc_ns())
     except CloseConnection:
         asking, node = (
             server.identities.refused_machines.get(claim.node),
@@ -165,18 +165,18 @@ def _registered_node(server: Server, hello: Hello, claim: IdentityClaim) -> Iter
     is_new = server.nodes.find(name) is None
     try:
         node = server.nodes.get_or_create(hello)
-        node.on_hello(hello, server_utc_ns())
-        server.recorder.on_node_hello(node)
-        server.sealer.on_node_hello(node)
+        node.apply_hello(hello, server_utc_ns())
+        server.recorder.cache_missing_clock_offsets(node)
+        server.sealer.extend_node_sessions(node)
     except Exception as error:
         if is_new:
-            server.nodes.remove(name)
+            server.nodes.remove_from_memory(name)
         if not isinstance(error, LinkError | StorageError):
             raise
         code = LinkCloseCode.TRY_LATER if isinstance(error, StorageError) else LinkCloseCode.REFUSED
         raise CloseConnection(code, str(error)) from error
     if not is_proven:
-        server.identities.store_first_secret(claim)
+        server.identities.try_store_first_secret(claim)
     link = server.links[name] = NodeLink(node)
     node.is_connected = True
     try:
@@ -191,8 +191,8 @@ def _registered_node(server: Server, hello: Hello, claim: IdentityClaim) -> Iter
 
 async def _send_welcome(socket: WebSocket, server: Server, link: NodeLink) -> None:
     node = link.node
-    link.retention_request = server.recorder.retention_request(node.name)
-    lacks = node.missing_ranges(server.recorder.needed_frames(node.name))
+    link.retention_request = server.recorder.make_retention_request(node.name)
+    lacks = node.frames_to_request(server.recorder.needed_frames(node.name))
     welcome = Welcome(protocol=PROTOCOL, missing=lacks, retention=link.retention_request)
     await send_message(socket, encode_message(welcome))
     log.info("node %s connected, stream %s", node.name, node.stream_id)
@@ -230,9 +230,9 @@ async def _receive_messages(socket: WebSocket, server: Server, link: NodeLink) -
                 *_, due = node.receive_frames(link.stream, _verify_frames(message), server_utc_ns())
             except LinkError as error:
                 raise CloseConnection(LinkCloseCode.REFUSED, str(error)) from error
-            server.broadcaster.add_frames(node, due)
-            server.live_feeds.add_batches(node, due)
-            server.weighings.push(node, due)
+            server.broadcaster.add_to_history_and_updates(node, due)
+            server.live_feeds.add_to_existing_buffer(node, due)
+            server.weighings.feed_frames(node, due)
             if node.estimator.live.tare is not tare_before:
                 server.notify_node_changed(node)
             continue
@@ -243,13 +243,13 @@ async def _receive_messages(socket: WebSocket, server: Server, link: NodeLink) -
             case StreamSelect(stream_id=stream_id):
                 link.stream = _find_announced_stream(node, stream_id)
             case ClockSample():
-                server.recorder.record_clock_offset(node, parsed, server_utc_ns())
+                server.recorder.record_plausible_clock_offset(node, parsed, server_utc_ns())
             case NodeStatus():
                 node.present_stream.missed_slots = parsed.missed_slots
                 node.warnings, node.fault_counts = parsed.warnings, parsed.counts
                 server.notify_node_changed(node)
             case LossReport():
-                _find_announced_stream(node, parsed.stream_id).set_losses(parsed.lost)
+                _find_announced_stream(node, parsed.stream_id).set_node_losses(parsed.lost)
             case Identify() | Proof() | Hello():
                 raise CloseConnection(LinkCloseCode.REFUSED, f"{parsed.type} was sent before")
 
@@ -276,7 +276,7 @@ async def _send_updates(socket: WebSocket, server: Server, link: NodeLink) -> No
         await link.has_outgoing.wait()
         link.has_outgoing.clear()
         # The retention request goes first: a node may drop frames once they are acknowledged.
-        wanted = server.recorder.retention_request(link.node.name)
+        wanted = server.recorder.make_retention_request(link.node.name)
         if wanted != link.retention_request:
             link.retention_request = wanted
             await send_message(socket, encode_message(wanted))

@@ -15,7 +15,7 @@ from service.api.protocols import LimitedWebSocket as Connection
 from service.api.routes.sockets.live_frames import LiveFeedSession
 from service.private_paths import strip_private_folders
 from service.protocol import SUBPROTOCOL, CloseConnection, LinkCloseCode, format_close_reason
-from service.server.broadcast.broadcaster import RATES_HZ, frame_texts
+from service.server.broadcast.broadcaster import RATES_HZ, encode_websocket_messages
 from service.server.broadcast.summary import encode_json
 from service.server.broadcast.views import SessionView
 from service.server.index import start_key
@@ -54,7 +54,7 @@ async def serve_live(socket: WebSocket, server: Server) -> None:
 
 async def _serve_page(socket: WebSocket, server: Server, outlet: Connection) -> None:
     node, rate_hz = _parse_query(socket, server)
-    outlet.write_framed(frame_texts([encode_json(_make_hello(server, node))]))
+    outlet.write_framed(encode_websocket_messages([encode_json(_make_hello(server, node))]))
     viewer = server.broadcaster.subscribe(outlet, rate_hz, node)
     try:
         await _run_until_first(viewer.disconnected, _answer_pings(socket))
@@ -112,7 +112,7 @@ def _make_hello(server: Server, node: str | None) -> dict[str, object]:
         "nodes": [
             view
             for known in server.nodes
-            if node in (None, known.name) and (view := server.make_node_json(known)) is not None
+            if node in (None, known.name) and (view := server.try_make_node_json(known)) is not None
         ],
         "recording": [
             SessionView.from_session(session, recorder).model_dump(mode="json")

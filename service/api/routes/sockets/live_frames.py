@@ -51,7 +51,7 @@ class LiveFeedSession:
         names = [name.strip() for name in parameters.get("columns", "").split(",")]
         self._columns = tuple(name for name in names if name)
         try:
-            check_columns(self._node.info, self._columns)
+            check_columns(self._node.last_info, self._columns)
         except UsageError as error:
             raise CloseConnection(LinkCloseCode.POLICY, error.what) from error
         position = start_position(
@@ -66,7 +66,7 @@ class LiveFeedSession:
             self._policy,
             position,
             needed_frames=lambda: server.recorder.needed_frames(node.name),
-            invalidate_damaged=lambda error: server.sealer.invalidate_damaged(
+            invalidate_damaged=lambda error: server.sealer.invalidate_and_request_resend(
                 node, error, "a live client"
             ),
         )
@@ -98,7 +98,7 @@ class LiveFeedSession:
         match item:
             case StreamStart(stream_id=stream_id, first_seq=seq):
                 stream = self._node.streams.get(stream_id)
-                info = self._node.info if stream is None else stream.info
+                info = self._node.last_info if stream is None else stream.info
                 try:
                     self._encoder = ArrowEncoder(info, self._columns)
                 except UsageError as error:  # it came back with other tiles
@@ -120,7 +120,7 @@ class LiveFeedSession:
                 self._position = Position(stream_id, last + 1)
             case _:
                 assert self._encoder is not None  # noqa: S101  # a stream has begun before
-                for message, following in self._encoder.encode_rows(
+                for message, following in self._encoder.encode_rows_with_next_seq(
                     item, self._memory.encode_cache
                 ):
                     await self._send_message(message)

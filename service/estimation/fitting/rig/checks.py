@@ -15,11 +15,11 @@ from devices.errors import CalibrationError
 from service.estimation.fitting.rig.indentation import (
     Indentation,
     Strokes,
-    average_strokes,
-    compute_rest_pressures,
-    find_stroke_rows,
+    average_stroke_blocks,
+    compute_rest_before_strokes_kpa,
+    find_slow_stroke_rows,
     format_origin,
-    measure_unloaded,
+    measure_initial_unloaded,
 )
 from service.estimation.fitting.rig.recovery import fit_unloaded_recovery
 
@@ -46,7 +46,7 @@ _FLAT_NOISE = 0.6  # of the noise of a reading: block means scatter by less
 _RAIL_READINGS = 5  # fewer may be missing by chance
 
 
-def reject_unloaded(blocks: Strokes, where: str) -> None:
+def reject_insufficient_strokes(blocks: Strokes, where: str) -> None:
     """Reject no load, a load of the wrong sign, too small a range, or a single repeat.
 
     Raises:
@@ -110,13 +110,13 @@ def reject_saturated_reference(recordings: Sequence[Indentation], blocks: Stroke
                 remedy=remedy,
             )
     for recording in recordings:
-        zero = measure_unloaded(recording)
+        zero = measure_initial_unloaded(recording)
         silent = recording.is_under_indenter & np.isin(recording.phase, ("load", "unload"))
         silent &= np.isnan(recording.reference_n) & np.isfinite(recording.kpa)
-        if silent.sum() < _RAIL_READINGS or not find_stroke_rows(recording):
+        if silent.sum() < _RAIL_READINGS or not find_slow_stroke_rows(recording):
             continue
         above_kpa = float(np.median(recording.kpa[silent])) - zero.baseline_kpa
-        own = average_strokes(recording)
+        own = average_stroke_blocks(recording)
         if above_kpa > own.gauge_kpa.max():
             raise CalibrationError(
                 f"the reference has no reading above {own.force_n.max():.2f} N, "
@@ -133,7 +133,7 @@ def select_before_saturation(
     wrapped = any(
         bool(np.isinf(recording.kpa[begin:end]).any())
         for recording in recordings
-        for begin, _, end in find_stroke_rows(recording)
+        for begin, _, end in find_slow_stroke_rows(recording)
     )
     limit_kpa = np.inf
     full_n = float(blocks.force_n.max())
@@ -150,8 +150,8 @@ def select_before_saturation(
     return blocks, wrapped
 
 
-def compute_baseline_drift_kpa(recordings: Sequence[Indentation]) -> float:
-    """Compute the largest change of the unloaded pressure between repeats, from the second on.
+def check_baseline_drift_kpa(recordings: Sequence[Indentation]) -> float:
+    """Check the unloaded pressure's drift; return its largest change from repeat 2 on.
 
     Raises:
         CalibrationError: it, or the change from the first repeat, is larger than the limit and than
@@ -159,7 +159,7 @@ def compute_baseline_drift_kpa(recordings: Sequence[Indentation]) -> float:
     """
     drift_kpa = 0.0
     for recording in recordings:
-        all_kpa = compute_rest_pressures(recording)
+        all_kpa = compute_rest_before_strokes_kpa(recording)
         known = all_kpa[np.isfinite(all_kpa)]
         if len(known) < 2:
             continue
@@ -196,17 +196,17 @@ def _reject_lasting_drift(recording: Indentation, all_kpa: Floats, change_kpa: f
     )
 
 
-def reject_contradictions(gains: Floats, where: str) -> None:
+def reject_contradictions(repeat_gains: Floats, where: str) -> None:
     """Reject repeats that contradict one another.
 
     Args:
-        gains: force of each repeat over the curve's.
+        repeat_gains: force of each repeat over the curve's.
         where: file and tile.
 
     Raises:
         CalibrationError: a repeat is too far from the others.
     """
-    off = gains / np.median(gains) - 1.0
+    off = repeat_gains / np.median(repeat_gains) - 1.0
     worst = int(np.argmax(np.abs(off)))
     if abs(off[worst]) > GAIN_DEVIATION_MAX:
         raise CalibrationError(

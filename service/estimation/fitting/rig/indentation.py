@@ -97,8 +97,8 @@ class ThermalSoak:
     noise_kpa: float
 
 
-def measure_unloaded(recording: Indentation) -> UnloadedState:
-    """Measure baseline and noise of the tile, and zero of the reference, before the first loading.
+def measure_initial_unloaded(recording: Indentation) -> UnloadedState:
+    """Measure baseline, noise and reference zero in the last second before the first loading.
 
     Raises:
         CalibrationError: the tile is never loaded, or has too few readings before.
@@ -132,20 +132,20 @@ def measure_unloaded(recording: Indentation) -> UnloadedState:
     )
 
 
-def average_strokes(*recordings: Indentation) -> Strokes:
+def average_stroke_blocks(*recordings: Indentation) -> Strokes:
     """Average every slow stroke of a tile in blocks, in one file or several.
 
     Each file has its own baseline and its own zero of the reference. A file may have no stroke if
     another one has.
 
     Raises:
-        CalibrationError: as for `measure_unloaded`, or no file has a slow stroke.
+        CalibrationError: as for `measure_initial_unloaded`, or no file has a slow stroke.
     """
     blocks: list[_Block] = []
     count = 0
     for recording in recordings:
-        zero = measure_unloaded(recording)
-        for begin, turn, end in find_stroke_rows(recording):
+        zero = measure_initial_unloaded(recording)
+        for begin, turn, end in find_slow_stroke_rows(recording):
             for rows, loading in (
                 (np.arange(begin, turn), True),
                 (np.arange(turn, end), False),
@@ -165,7 +165,7 @@ def average_strokes(*recordings: Indentation) -> Strokes:
 _Block = tuple[float, float, int, bool]
 
 
-def find_stroke_rows(recording: Indentation) -> list[tuple[int, int, int]]:
+def find_slow_stroke_rows(recording: Indentation) -> list[tuple[int, int, int]]:
     """Return the rows of each slow stroke's first reading, turning point, and end (exclusive)."""
     label = np.where(recording.is_under_indenter, recording.phase, "")
     begins = np.flatnonzero(np.append(True, label[1:] != label[:-1]))
@@ -201,10 +201,10 @@ def _average_blocks(
     ]
 
 
-def compute_rest_pressures(recording: Indentation) -> Floats:
+def compute_rest_before_strokes_kpa(recording: Indentation) -> Floats:
     """Compute the mean pressure in the last half second of rest before each slow stroke, or NaN."""
     found = []
-    for begin, _, _ in find_stroke_rows(recording):
+    for begin, _, _ in find_slow_stroke_rows(recording):
         rest = np.arange(begin) >= _find_last_run(recording.phase[:begin] == "rest")
         rest &= recording.t_ns[:begin] >= recording.t_ns[begin] - REST_NS
         kpa = recording.kpa[:begin][rest]

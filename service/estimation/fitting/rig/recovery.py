@@ -15,8 +15,8 @@ from scipy.optimize import nnls
 from devices.arrays import Floats
 from service.estimation.fitting.rig.indentation import (
     Indentation,
-    compute_rest_pressures,
-    find_stroke_rows,
+    compute_rest_before_strokes_kpa,
+    find_slow_stroke_rows,
 )
 
 _CREEP_S = np.array([0.3, 1.0, 3.0, 10.0])
@@ -43,14 +43,14 @@ class UnloadedRecovery:
 
 
 def fit_unloaded_recovery(recording: Indentation) -> UnloadedRecovery | None:
-    """Fit creep to a tile's unloaded pressures; None if it is not unloaded for long enough."""
+    """Fit creep to a tile's unloaded pressures; None if its steady soak is too short."""
     t_s = (recording.t_ns - recording.t_ns[0]) * 1e-9
     alone_s, alone_kpa = _extract_steady_soak(t_s, recording)
     if not len(alone_s) or np.ptp(alone_s) < _ALONE_S:
         return None
-    begins_s = t_s[[begin for begin, _, _ in find_stroke_rows(recording)]]
+    begins_s = t_s[[begin for begin, _, _ in find_slow_stroke_rows(recording)]]
     at_s = np.append(begins_s, alone_s)
-    kpa = np.append(compute_rest_pressures(recording), alone_kpa)
+    kpa = np.append(compute_rest_before_strokes_kpa(recording), alone_kpa)
     known = np.isfinite(kpa)
     at_s, above_kpa = at_s[known], kpa[known] - kpa[known][0]
     crept = _compute_crept_forces(t_s, recording, at_s)

@@ -52,12 +52,12 @@ def encode_mat_file(variables: Mapping[str, object]) -> bytes:
     return content
 
 
-def encode_variable(name: str, value: object) -> bytes:
+def encode_mat_variable(name: str, value: object) -> bytes:
     """Return an encoded variable, without the file's header."""
     return encode_mat_file({name: value})[HEADER_BYTES:]
 
 
-def encode_matrix(
+def encode_mat_matrix(
     name: str, shape: tuple[int, int], number_type: npt.DTypeLike, chunks: Iterable[Array]
 ) -> Iterator[bytes]:
     """Yield an encoded variable of numbers while `pieces` is read.
@@ -120,7 +120,9 @@ class StructField:
         )
 
 
-def encode_struct_array(name: str, structs: Sequence[Mapping[str, StructField]]) -> Iterator[bytes]:
+def encode_mat_struct_array(
+    name: str, structs: Sequence[Mapping[str, StructField]]
+) -> Iterator[bytes]:
     """Yield an encoded array of structs; each has the fields of all, missing ones are empty.
 
     Args:
@@ -132,7 +134,7 @@ def encode_struct_array(name: str, structs: Sequence[Mapping[str, StructField]])
     for key in names:
         for i in range(len(structs)):
             plain[key][0, i] = _EMPTY
-    head = bytearray(encode_variable(name, plain))
+    head = bytearray(encode_mat_variable(name, plain))
     del head[len(head) - _MATRIX_HEAD_BYTES * plain.size * len(names) :]
     nothing = StructField.from_value(_EMPTY)
     fields = [element.get(key, nothing) for element in structs for key in names]
@@ -152,5 +154,5 @@ def estimate_struct_array_bytes(structs: Sequence[Mapping[str, StructField]]) ->
 
 def _encode_element(value: object) -> bytes:
     """Return a value encoded as in a struct, without a name."""
-    empty = len(encode_variable("s", {"f": _EMPTY})) - _MATRIX_HEAD_BYTES
-    return encode_variable("s", {"f": value})[empty:]
+    empty = len(encode_mat_variable("s", {"f": _EMPTY})) - _MATRIX_HEAD_BYTES
+    return encode_mat_variable("s", {"f": value})[empty:]

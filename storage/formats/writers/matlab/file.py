@@ -21,22 +21,22 @@ from storage.formats.writers.matlab.elements import (
     HEADER_BYTES,
     StructField,
     encode_mat_file,
-    encode_matrix,
-    encode_struct_array,
-    encode_variable,
+    encode_mat_matrix,
+    encode_mat_struct_array,
+    encode_mat_variable,
     estimate_struct_array_bytes,
 )
 from storage.formats.writers.matlab.variables import (
-    get_number_type,
-    list_quantities,
-    list_selected_columns,
+    choose_mat_number_type,
+    list_mat_quantities,
+    list_selected_columns_or_name,
     make_about_struct,
     make_marker_struct,
     make_tile_struct,
-    read_quantity,
-    read_quantity_chunks,
+    read_chunks_column_by_column,
+    read_mat_variables,
 )
-from storage.formats.writers.multi_session import get_frame_instants_ns
+from storage.formats.writers.multi_session import get_instants_on_export_clock_ns
 from storage.schema import SERVER_TIME_COLUMNS, Array, Column
 
 FRAMES_MAX = 6_000_000
@@ -47,22 +47,25 @@ _HEADER_TEXT_BYTES = 116
 
 
 def _encode(export: Export) -> Iterator[bytes]:
-    quantities = list_quantities(export)
+    quantities = list_mat_quantities(export)
     # Refuses too many frames before the first chunk.
     frames = len(_read_instants(export)["t_ns"])
-    yield _encode_header(export) + encode_variable("about", make_about_struct(export))
+    yield _encode_header(export) + encode_mat_variable("about", make_about_struct(export))
     yield from _encode_meanings(quantities)
-    yield encode_variable("tiles", make_tile_struct(export))
+    yield encode_mat_variable("tiles", make_tile_struct(export))
     if export.markers is not None:
-        yield encode_variable("markers", make_marker_struct(export))
+        yield encode_mat_variable("markers", make_marker_struct(export))
     for column in quantities:
         if pa.types.is_string(column.type):
-            for name, values in read_quantity(export, column).items():
-                yield encode_variable(name, values)
+            for name, values in read_mat_variables(export, column).items():
+                yield encode_mat_variable(name, values)
             continue
-        shape = frames, len(list_selected_columns(export, column))
-        yield from encode_matrix(
-            column.name, shape, get_number_type(column), read_quantity_chunks(export, column)
+        shape = frames, len(list_selected_columns_or_name(export, column))
+        yield from encode_mat_matrix(
+            column.name,
+            shape,
+            choose_mat_number_type(column),
+            read_chunks_column_by_column(export, column),
         )
 
 
@@ -77,11 +80,11 @@ def _encode_together(exports: Sequence[Export]) -> Iterator[bytes]:
     yield from _encode_meanings(
         [column for export in exports for column in _quantities_with_server_time(export)]
     )
-    yield from encode_struct_array("sessions", found)
+    yield from encode_mat_struct_array("sessions", found)
 
 
 def _make_struct_fields(export: Export) -> dict[str, StructField]:
-    rows = len(get_frame_instants_ns(export, _read_instants(export)))
+    rows = len(get_instants_on_export_clock_ns(export, _read_instants(export)))
     fields = {
         "node": StructField.from_value(export.array_info.node),
         "about": StructField.from_value(make_about_struct(export)),
@@ -92,24 +95,25 @@ def _make_struct_fields(export: Export) -> dict[str, StructField]:
     for column in _quantities_with_server_time(export):
         if pa.types.is_string(column.type):
             fields |= {
-                name: StructField.from_value(v) for name, v in read_quantity(export, column).items()
+                name: StructField.from_value(v)
+                for name, v in read_mat_variables(export, column).items()
             }
             continue
-        width = len(list_selected_columns(export, column))
+        width = len(list_selected_columns_or_name(export, column))
         make = partial(_read_values, export, column)
         fields[column.name] = StructField.from_matrix_function(
-            (rows, width), get_number_type(column), make
+            (rows, width), choose_mat_number_type(column), make
         )
     return fields
 
 
 def _quantities_with_server_time(export: Export) -> list[Column]:
     """Return the selected quantities, and always the server's time, the sessions' common axis."""
-    return list(dict.fromkeys([*list_quantities(export), *SERVER_TIME_COLUMNS]))
+    return list(dict.fromkeys([*list_mat_quantities(export), *SERVER_TIME_COLUMNS]))
 
 
 def _read_values(export: Export, column: Column) -> Array:
-    return read_quantity(export, column)[column.name]
+    return read_mat_variables(export, column)[column.name]
 
 
 def _read_instants(export: Export) -> dict[str, Array]:
@@ -121,8 +125,8 @@ def _read_instants(export: Export) -> dict[str, Array]:
 
 
 def _encode_meanings(quantities: Sequence[Column]) -> Iterator[bytes]:
-    yield encode_variable("units", {column.name: column.unit for column in quantities})
-    yield encode_variable("meaning", {column.name: column.description for column in quantities})
+    yield encode_mat_variable("units", {column.name: column.unit for column in quantities})
+    yield encode_mat_variable("meaning", {column.name: column.description for column in quantities})
 
 
 def _encode_header(export: Export) -> bytes:

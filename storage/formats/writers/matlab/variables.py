@@ -20,20 +20,20 @@ from storage.formats.export import Export
 from storage.schema import COLUMNS_BY_NAME, Array, Column, numpy_dtype_of
 
 
-def list_quantities(export: Export) -> list[Column]:
+def list_mat_quantities(export: Export) -> list[Column]:
     """Return the selected quantities in column order, without `marker` and `time_utc`."""
-    chosen = dict.fromkeys(export.select_columns().values())
+    chosen = dict.fromkeys(export.map_columns_to_quantities().values())
     return [COLUMNS_BY_NAME[of] for of in chosen if of not in ("time_utc", "marker")]
 
 
-def list_selected_columns(export: Export, quantity: Column) -> list[str]:
+def list_selected_columns_or_name(export: Export, quantity: Column) -> list[str]:
     """Return the selected columns of a quantity; its own name if no column is selected."""
-    return [name for name, of in export.select_columns().items() if of == quantity.name] or [
-        quantity.name
-    ]
+    return [
+        name for name, of in export.map_columns_to_quantities().items() if of == quantity.name
+    ] or [quantity.name]
 
 
-def get_number_type(quantity: Column) -> npt.DTypeLike:
+def choose_mat_number_type(quantity: Column) -> npt.DTypeLike:
     """Return the class of a quantity's numbers; for a text, of the codes of its kinds."""
     kind = quantity.type
     if pa.types.is_string(kind):
@@ -44,21 +44,21 @@ def get_number_type(quantity: Column) -> npt.DTypeLike:
     return np.float32 if kind.bit_width <= 16 else np.float64
 
 
-def read_quantity(export: Export, quantity: Column) -> Mapping[str, Array]:
+def read_mat_variables(export: Export, quantity: Column) -> Mapping[str, Array]:
     """Read a quantity as a variable by name, (frames, columns); for a text with its kinds."""
-    names = list_selected_columns(export, quantity)
+    names = list_selected_columns_or_name(export, quantity)
     pieces = list(_minimal_export(export, quantity).read_chunks(names))
     flat = [np.concatenate([piece[name] for piece in pieces]) for name in names]
     if pa.types.is_string(quantity.type):
         kinds, codes = np.unique(flat[0].astype(str), return_inverse=True)
-        numbers = (codes + 1).astype(get_number_type(quantity))[:, None]
+        numbers = (codes + 1).astype(choose_mat_number_type(quantity))[:, None]
         return {quantity.name: numbers, f"{quantity.name}_kinds": np.array(kinds, dtype=object)}
     return {quantity.name: np.stack([_to_number_type(quantity, values) for values in flat], axis=1)}
 
 
-def read_quantity_chunks(export: Export, quantity: Column) -> Iterator[Array]:
+def read_chunks_column_by_column(export: Export, quantity: Column) -> Iterator[Array]:
     """Read the numbers of a quantity in chunks, column after column."""
-    for name in list_selected_columns(export, quantity):
+    for name in list_selected_columns_or_name(export, quantity):
         for piece in _minimal_export(export, quantity).read_chunks([name]):
             yield _to_number_type(quantity, piece[name])
 
@@ -71,7 +71,7 @@ def _minimal_export(export: Export, column: Column) -> Export:
 
 def _to_number_type(column: Column, values: Array) -> Array:
     """Return the numbers in the quantity's class, NaN where unknown."""
-    found = values.astype(get_number_type(column))
+    found = values.astype(choose_mat_number_type(column))
     if column.missing_value is not None and found.dtype.kind == "f":
         found[values == column.missing_value] = np.nan
     return found
@@ -82,7 +82,7 @@ def make_about_struct(export: Export) -> dict[str, Any]:
     facts = {
         **export.metadata,
         "array_info": export.array_info.model_dump(mode="json"),
-        "notes": export.full_notes,
+        "notes": export.notes_with_clock_and_markers,
         "begin_t_ns": np.int64(export.frame_source.begin_t_ns),
         "software": export.array_info.software,
     }

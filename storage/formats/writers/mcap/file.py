@@ -47,7 +47,7 @@ def _encode_together(exports: Sequence[Export]) -> Iterator[bytes]:
             "messages of ROS 2 have fixed fields, and no columns can be selected",
             remedy="Leave columns out, or ask for messages=foxglove",
         )
-    needed = ros2.list_needed_columns if is_ros2 else foxglove.list_needed_columns
+    needed = ros2.list_ros2_columns if is_ros2 else foxglove.list_foxglove_columns
     pieces = [read_frame_chunks(export, needed(export)) for export in exports]
     firsts = [next(frames) for frames in pieces]  # errors are raised before the first chunk
     sink = DrainedBuffer()
@@ -112,7 +112,7 @@ def _metadata_texts(session: _ExportedSession, *, is_ros2: bool) -> dict[str, st
         f"{SATURATED_COLOUR_N:g} N on, the arrow {ARROW_METRES_PER_NEWTON:g} m for each newton",
         "serials": [tile.serial for tile in export.array_info.tiles],
         "array_info": export.array_info.model_dump(mode="json"),
-        "notes": export.full_notes,
+        "notes": export.notes_with_clock_and_markers,
     }
     if is_ros2:
         facts["filled"] = (

@@ -28,11 +28,11 @@ from storage.formats.writers.mcap.frame_chunks import (
     Message,
     compute_tile_colour,
     get_foot_frame_id,
-    to_floats,
+    to_floats_with_nan,
 )
 from storage.formats.writers.mcap.message_template import MessageTemplate
 from storage.formats.writers.row_place import NEEDED as POINT
-from storage.formats.writers.row_place import with_row_place
+from storage.formats.writers.row_place import fill_cop_across_tile_row
 from storage.schema import COLUMNS_BY_NAME, Array, Column
 
 _NS = 1_000_000_000
@@ -47,21 +47,21 @@ _SFIXED32 = FieldDescriptorProto.TYPE_SFIXED32, 5, "<i4"
 _SFIXED64 = FieldDescriptorProto.TYPE_SFIXED64, 1, "<i8"
 
 
-def list_frame_message_columns(export: Export) -> list[str]:
+def list_foxglove_frame_columns(export: Export) -> list[str]:
     """Return the flat columns of a frame message: selected numbers, `time_s` only if named."""
     return [
         name
-        for name, of in export.select_columns().items()
+        for name, of in export.map_columns_to_quantities().items()
         if pa.types.is_integer(COLUMNS_BY_NAME[of].type)
         or pa.types.is_floating(COLUMNS_BY_NAME[of].type)
         if name != "time_s" or "time_s" in export.selection.columns
     ]
 
 
-def list_needed_columns(export: Export) -> list[str]:
+def list_foxglove_columns(export: Export) -> list[str]:
     """Return the flat columns to read for Foxglove messages."""
     drawn = [name for name in _SCENE_COLUMNS if export.has_forces]
-    return [*list_frame_message_columns(export), *drawn]
+    return [*list_foxglove_frame_columns(export), *drawn]
 
 
 class FoxgloveEncoder:
@@ -75,9 +75,9 @@ class FoxgloveEncoder:
 
     def __init__(self, channels: ChannelRegistry, export: Export, topic_prefix: str) -> None:
         self._info, self._has_forces = export.array_info, export.has_forces
-        chosen = export.select_columns()
+        chosen = export.map_columns_to_quantities()
         self._columns = {
-            name: COLUMNS_BY_NAME[chosen[name]] for name in list_frame_message_columns(export)
+            name: COLUMNS_BY_NAME[chosen[name]] for name in list_foxglove_frame_columns(export)
         }
         self._frame_template = _make_frame_template(
             list(self._columns.values()), list(self._columns)
@@ -116,7 +116,7 @@ class FoxgloveEncoder:
         tiles = self._info.tiles
         rows = frames.drawn_rows
         if self._has_forces:
-            frames = replace(frames, columns=with_row_place(frames.columns, self._info))
+            frames = replace(frames, columns=fill_cop_across_tile_row(frames.columns, self._info))
         unknown = np.full((len(rows), len(tiles)), np.nan)
         forces_n = (
             frames.stack_tile_columns("force_n", len(tiles))[rows] if self._has_forces else unknown
@@ -183,7 +183,7 @@ def _field_type(column: Column) -> tuple[int, int, str]:
 
 def _to_field_values(column: Column, values: Array) -> Array:
     is_real = np.dtype(_field_type(column)[2]).kind == "f"
-    return to_floats(column.name, values) if is_real else values
+    return to_floats_with_nan(column.name, values) if is_real else values
 
 
 def _frame_descriptors(columns: dict[str, Column]) -> FileDescriptorSet:

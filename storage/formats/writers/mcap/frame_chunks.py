@@ -10,7 +10,7 @@ import numpy as np
 
 from devices.frames import ArrayInfo
 from storage.formats.export import Export
-from storage.formats.writers.multi_session import get_frame_instants_ns
+from storage.formats.writers.multi_session import get_instants_on_export_clock_ns
 from storage.schema import COLUMNS_BY_NAME, SERVER_TIME_COLUMNS, Array
 
 DRAWING_INTERVAL_NS = 50_000_000
@@ -65,13 +65,13 @@ class FrameChunk:
     def stack_tile_columns(self, quantity_name: str, tile_count: int) -> Array:
         """Return one quantity of all tiles, (n, tiles), NaN where unknown."""
         columns = [
-            to_floats(quantity_name, self.columns[f"{quantity_name}_{i}"])
+            to_floats_with_nan(quantity_name, self.columns[f"{quantity_name}_{i}"])
             for i in range(tile_count)
         ]
         return np.stack(columns, axis=1) if columns else np.empty((len(self.t_ns), 0))
 
 
-def to_floats(quantity_name: str, values: Array) -> Array:
+def to_floats_with_nan(quantity_name: str, values: Array) -> Array:
     """Return a column of any type as float64, NaN where unknown."""
     found = values.astype(np.float64)
     missing = COLUMNS_BY_NAME[quantity_name].missing_value
@@ -95,7 +95,7 @@ def read_frame_chunks(export: Export, columns: list[str]) -> Iterator[FrameChunk
     requested += ["marker"] if export.markers is not None else []
     last_shown = -1
     for piece in export.read_chunks(requested):
-        t_ns = get_frame_instants_ns(export, piece)
+        t_ns = get_instants_on_export_clock_ns(export, piece)
         turns = t_ns // DRAWING_INTERVAL_NS
         shown = np.flatnonzero(np.diff(turns, prepend=last_shown))
         last_shown = int(turns[-1]) if len(turns) else last_shown

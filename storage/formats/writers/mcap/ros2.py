@@ -30,7 +30,7 @@ from storage.formats.writers.mcap.frame_chunks import (
 )
 from storage.formats.writers.mcap.message_template import MessageTemplate
 from storage.formats.writers.row_place import NEEDED as POINT
-from storage.formats.writers.row_place import with_row_place
+from storage.formats.writers.row_place import fill_cop_across_tile_row
 from storage.schema import Array
 
 _NS = 1_000_000_000
@@ -42,7 +42,7 @@ _TEMPERATURE_HOLD_NS = _NS
 """Longest age of a chip's last temperature that is used for frames without one."""
 
 
-def list_needed_columns(export: Export) -> list[str]:
+def list_ros2_columns(export: Export) -> list[str]:
     """Return the quantities to read for ROS 2 messages."""
     return [*_READINGS, *(_FORCES if export.has_forces else ())]
 
@@ -103,7 +103,7 @@ class Ros2Encoder:
         t_ns = frames.t_ns.tolist()
         topics: list[tuple[int, list[bytes]]] = []
         if self._has_forces:
-            frames = replace(frames, columns=with_row_place(frames.columns, self._info))
+            frames = replace(frames, columns=fill_cop_across_tile_row(frames.columns, self._info))
             topics.append((self._wrenches, self._wrench.encode_messages(_wrench_columns(frames))))
         topics += zip(self._tiles, self._encode_pressures(frames), strict=True)
         beside: dict[int, list[Message]] = {}

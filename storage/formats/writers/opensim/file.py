@@ -22,19 +22,23 @@ import pyarrow.csv as pacsv
 from devices.arrays import Floats
 from devices.errors import UsageError
 from storage.formats.export import Export
-from storage.formats.writers.csv_text import write_csv_table
+from storage.formats.writers.csv_text import write_spreadsheet_safe_csv
 from storage.formats.writers.drained_buffer import DrainedBuffer
 from storage.formats.writers.format import ExportFormat
-from storage.formats.writers.ground_reaction import GroundReaction, read_ground_reactions
+from storage.formats.writers.ground_reaction import GroundReaction, read_reactions_on_common_axis
 from storage.formats.writers.multi_session import make_names_unique
 from storage.formats.writers.opensim.loads import (
     GROUND_X,
     LOAD_COLUMNS,
     FootLoads,
-    compute_foot_loads,
+    compute_gapless_foot_loads,
 )
-from storage.formats.writers.text_metadata import format_clock_bound, format_metadata, to_ascii
-from storage.formats.writers.xml_text import escape_invalid_xml
+from storage.formats.writers.text_metadata import (
+    format_largest_clock_bound,
+    format_metadata,
+    to_ascii_line,
+)
+from storage.formats.writers.xml_text import escape_xml_invalid_characters
 
 FRAMES_MAX = 2_000_000
 """Limit of frames of all sessions: an hour at 544 Hz."""
@@ -82,7 +86,7 @@ def _encode(export: Export) -> Iterator[bytes]:
 
 def _encode_together(exports: Sequence[Export]) -> Iterator[bytes]:
     feet = _make_feet(exports)
-    named = to_ascii(str(exports[0].metadata.get("session") or "session"))
+    named = to_ascii_line(str(exports[0].metadata.get("session") or "session"))
     stem = _INVALID_IN_NAMES.sub(
         "_", named if len(feet) == 1 else f"{named}-and-{len(feet) - 1}-more"
     )
@@ -114,7 +118,7 @@ def _encode_together(exports: Sequence[Export]) -> Iterator[bytes]:
 def _make_feet(exports: Sequence[Export]) -> list[ExportedFoot]:
     is_alone = len(exports) == 1
     nodes = make_names_unique(
-        [_INVALID_IN_NAMES.sub("_", to_ascii(each.array_info.node)) for each in exports]
+        [_INVALID_IN_NAMES.sub("_", to_ascii_line(each.array_info.node)) for each in exports]
     )
     names = [""] if is_alone else nodes
     bodies = [DEFAULT_BODY] if is_alone else [f"{node}_{DEFAULT_BODY}" for node in nodes]
@@ -126,9 +130,9 @@ def _make_feet(exports: Sequence[Export]) -> list[ExportedFoot]:
                 expected="one for each, in their order, with commas between: "
                 + ", ".join(each.display_name for each in exports),
             )
-    found = read_ground_reactions(exports, [GROUND_X], FRAMES_MAX // len(exports))
+    found = read_reactions_on_common_axis(exports, [GROUND_X], FRAMES_MAX // len(exports))
     loads = [
-        compute_foot_loads(each, export, is_only_foot=is_alone)
+        compute_gapless_foot_loads(each, export, is_only_foot=is_alone)
         for each, export in zip(found, exports, strict=True)
     ]
     return [
@@ -160,7 +164,8 @@ def _make_external_force_xml(foot: ExportedFoot) -> str:
         "torque_identifier": f"{foot.column_prefix}ground_torque_",
     }
     inside = "".join(
-        f"\t\t\t\t<{tag}>{escape(escape_invalid_xml(text))}</{tag}>\n" for tag, text in tags.items()
+        f"\t\t\t\t<{tag}>{escape(escape_xml_invalid_characters(text))}</{tag}>\n"
+        for tag, text in tags.items()
     )
     name = f"foottile_{foot.column_prefix}grf"
     return f'\t\t\t<ExternalForce name="{name}">\n{inside}\t\t\t</ExternalForce>\n'
@@ -181,11 +186,11 @@ def _make_notes(foot: ExportedFoot, filled: pa.Table) -> dict[str, object]:
     bound = (
         {}
         if foot.reaction.server_time_bound_s is None
-        else format_clock_bound(foot.reaction.server_time_bound_s)
+        else format_largest_clock_bound(foot.reaction.server_time_bound_s)
     )
     return {
         **format_metadata(foot.export, steady.begin_ns),
-        "AXES": to_ascii(axes),
+        "AXES": to_ascii_line(axes),
         "RESAMPLED": steady.describe(),
         "FILLED": "unknown numbers, as the format has no number for them: every stretch is in the "
         "table of filled stretches",
@@ -235,7 +240,7 @@ def _join_tables(tables: Sequence[pa.Table], feet: Sequence[ExportedFoot]) -> pa
 
 def _encode_csv(table: pa.Table) -> bytes:
     sink = BytesIO()
-    write_csv_table(sink, table)
+    write_spreadsheet_safe_csv(sink, table)
     return sink.getvalue()
 
 

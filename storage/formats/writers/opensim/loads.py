@@ -99,7 +99,7 @@ class FootLoads:
         )
 
 
-def compute_foot_loads(
+def compute_gapless_foot_loads(
     reaction: GroundReaction, export: Export, *, is_only_foot: bool
 ) -> FootLoads:
     """Compute the loads on the foot at each sample, with unknown numbers filled.
@@ -128,7 +128,7 @@ def compute_foot_loads(
         )
     contact = reaction.resample_column("contact")
     unloaded = contact == 0.0
-    known_n = reaction.resampling.interpolate(reaction.frame_grf_n)
+    known_n = reaction.resampling.interpolate(reaction.frame_contact_grf_n)
     known_n[unloaded] = 0.0
     known = np.isfinite(known_n)
     empty = ~reaction.resampling.has_frames

@@ -12,7 +12,11 @@ import pytest
 from devices.arrays import Floats
 from devices.chips.compensation import Compensation
 from service.estimation.calibration import Calibration
-from service.estimation.dead_weights import STANDARD_GRAVITY_M_S2, make_weight_labels, parse_weight
+from service.estimation.dead_weights import (
+    STANDARD_GRAVITY_M_S2,
+    check_and_label_weights,
+    parse_weight,
+)
 from service.estimation.fitting.rig.indentation import Indentation
 from service.estimation.fitting.weights_fit import fit_dead_weights
 from service.server import weighing, weighings
@@ -51,7 +55,7 @@ def follow(path: Path, weights: tuple[str, ...]) -> Indentation:
     begins: list[int] = []
     for begin in range(0, len(t_ns), 10):
         rows = slice(begin, begin + 10)
-        for action in guide.push(t_ns[rows], kpa[rows]):
+        for action in guide.feed_pressures(t_ns[rows], kpa[rows]):
             match action:
                 case Begin(label, _):
                     phase[begin:] = label.removeprefix("T01 ")
@@ -79,7 +83,7 @@ def test_another_load_lies_within_the_interval_that_five_weights_state(run: Run)
         put_on(Path(f"{name}.csv"), grams)
         asked = ("--scene", "one.toml", "--load", f"{name}.csv", "--truth", "--no-estimates")
         assert run("simulate", *asked, "--out", f"{name}.parquet").code == 0
-    weights = make_weight_labels(FIVE.split(","), 0.5)
+    weights = check_and_label_weights(FIVE.split(","), 0.5)
     tile = fit_dead_weights([follow(Path("five.parquet"), weights)])
     made = Calibration(name="five", reference="weights", date="2026-11-25", tiles=(tile,))
     write_calibration(Path("five.json"), made)
@@ -114,12 +118,12 @@ def test_the_command_guides_through_the_weights_and_writes_what_is_accepted(
 
         def push(self, t_ns: npt.NDArray[np.int64], kpa: Floats) -> list[Action]:
             # By now the prompt is there, and the markers before it are made.
-            known = parse_weight(self.weights[self.number]) if self.step == "put on" else None
+            known = parse_weight(self.weights[self.weight_index]) if self.step == "put on" else None
             if known is not None:
                 play.force_n = known.force_n
             elif self.step == "empty":
                 play.force_n = 0.0
-            return super().push(t_ns, kpa)
+            return super().feed_pressures(t_ns, kpa)
 
     monkeypatch.setattr(weighings, "Weighing", Followed)
     monkeypatch.setenv("FOOTTILE_TOKEN", tared.running.shown["Authorization"].split()[-1])

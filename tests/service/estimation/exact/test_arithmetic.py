@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from mpmath import mp, mpf
 
 from devices.frames import NOT_READ, FrameBatch, TileFlag
-from service.estimation.calibration import TileCalibration, make_paper_eq2_preset
+from service.estimation.calibration import TileCalibration, make_paper_shape_preset
 from service.estimation.estimates import Estimates
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from service.estimation.pipeline.smoothing_stage import BOUND_SIGMAS
@@ -132,7 +132,7 @@ def entries() -> list[TileCalibration]:
     """The paper's preset, a fit as the bench makes it, one as fitted, and a hard one."""
     covariance = ((4e-3, 1e-3, -2e-3), (1e-3, 2e-3, 0.0), (-2e-3, 0.0, 3e-3))
     return [
-        make_paper_eq2_preset().tiles[0].model_copy(update={"serial": "T01"}),
+        make_paper_shape_preset().tiles[0].model_copy(update={"serial": "T01"}),
         newton_tile(
             "T02",
             coefficients=(0.0, 13.25, 1.0 / 3.0, 4.7),

@@ -68,7 +68,7 @@ def test_rubber_is_within_a_nanonewton(
     t_ns = wild_instants(rng, 40)
     model = rubber.CreepModel(np.array([parts]), np.array([taus_s]))
     seen = apparent_n, t_ns, NAN, NAN
-    found = through(rubber.compensate, model.to_records(), rubber.initial_state(1), *seen)
+    found = through(rubber.compensate_creep, model.to_records(), rubber.initial_state(1), *seen)
     expected = smoothing_stage.rubber(
         digits.exact(apparent_n),
         t_ns.tolist(),
@@ -94,7 +94,7 @@ def test_flow_is_within_a_nanonewton(
     t_ns = wild_instants(rng, 40)
     model = flow.FlowModel(np.array([part]), np.array([stress_n]), np.array([power]))
     seen = apparent_n, t_ns, NAN, NAN
-    found = through(flow.compensate, model.to_records(), flow.initial_state(1), *seen)
+    found = through(flow.compensate_flow, model.to_records(), flow.initial_state(1), *seen)
     expected = smoothing_stage.flow(
         digits.exact(apparent_n), t_ns.tolist(), mpf(part), mpf(stress_n), mpf(power)
     )
@@ -116,7 +116,7 @@ def test_hysteresis_is_within_a_nanonewton(
     )
     model = hysteresis.HysteresisModel(np.array([parts], dtype=float))
     state = hysteresis.initial_state(1)
-    found = through(hysteresis.compensate, model.to_records(), state, apparent_n, NAN)
+    found = through(hysteresis.compensate_hysteresis, model.to_records(), state, apparent_n, NAN)
     expected = smoothing_stage.hysteresis(digits.exact(apparent_n), [mpf(w) for w in parts])
     assert digits.apart(found[:, None], expected) < GOAL * max(1.0, swing_n)
 
@@ -127,7 +127,7 @@ def test_temperature_is_within_a_billionth_of_a_count(lag_s: float, seed: int) -
     rng = np.random.default_rng(seed)
     temperature_raw = with_holes(rng, 480.0 - rng.integers(0, 40, 60))
     t_ns = wild_instants(rng, 60)
-    found = temperature.compute_gas_temperatures(
+    found = temperature.compute_gas_temperature_and_rise(
         temperature_raw[:, None], t_ns[:, None], np.array([lag_s])
     )
     exactly = sample_stage.temperature(digits.exact(temperature_raw), t_ns.tolist(), mpf(lag_s))
@@ -141,7 +141,7 @@ def test_ambient_is_within_a_micropascal(seed: int) -> None:
     rng = np.random.default_rng(seed)
     kpa = with_holes(rng, rng.normal(0, 1.0, 60))
     t_ns = wild_instants(rng, 60)
-    found = through(ambient.update_ambient_pressure, None, ambient.initial_state(), kpa, t_ns)
+    found = through(ambient.low_pass_ambient_kpa, None, ambient.initial_state(), kpa, t_ns)
     expected = sample_stage.smoothed(digits.exact(kpa), t_ns.tolist())
     assert digits.apart(found[:, None], expected) < GOAL
 

@@ -13,7 +13,7 @@ from service.estimation.fault_detection.baseline_loss import (
     TOLERANCE_SIGMAS,
     BaselineLossState,
     initial_state,
-    update_baseline_error,
+    update_baseline_error_bound_kpa,
 )
 from service.estimation.records import RecordArray
 
@@ -33,7 +33,7 @@ def _judge(
     states: RecordArray[BaselineLossState], gauge_kpa: Floats, variance: float, out: Floats
 ) -> None:
     for i in range(len(gauge_kpa)):
-        out[i] = update_baseline_error(
+        out[i] = update_baseline_error_bound_kpa(
             states[0], LEAK_ASYMMETRY, gauge_kpa[i], variance, 0.0, STEP_NS * i
         )
 

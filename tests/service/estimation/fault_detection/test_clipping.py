@@ -10,7 +10,10 @@ from scipy.signal import lfilter
 
 from devices.arrays import Bools, Floats, Times
 from devices.jit import jit_cached
-from service.estimation.fault_detection.clipping import at_rest, end_of_range
+from service.estimation.fault_detection.clipping import (
+    initial_clipping_state,
+    update_clipping_limit_kpa,
+)
 from service.estimation.records import Records
 
 RATE_HZ = 447.0
@@ -40,7 +43,9 @@ def judged(
     taken = np.full(len(kpa), True) if is_taken is None else is_taken
     end_kpa, evidence = np.empty((2, np.count_nonzero(taken)))
     others = np.broadcast_to(others_kpa, kpa.shape)[taken]
-    _judge(at_rest(1), t_ns[taken], kpa[taken], others, noise_left, end_kpa, evidence)
+    _judge(
+        initial_clipping_state(1), t_ns[taken], kpa[taken], others, noise_left, end_kpa, evidence
+    )
     return end_kpa, evidence
 
 
@@ -60,7 +65,7 @@ def _judge(
     evidence: Floats,
 ) -> None:
     for i in range(len(kpa)):
-        end_kpa[i] = end_of_range(
+        end_kpa[i] = update_clipping_limit_kpa(
             state[0], kpa[i], t_ns[i], 100.0, 4.0 * NOISE_KPA, NOISE_KPA, noise_left, others[i]
         )
         evidence[i] = state[0].evidence

@@ -16,10 +16,10 @@ from service.estimation.fault_detection.stuck import (
     StuckLimits,
     StuckParams,
     StuckState,
-    compute_share_apart,
+    compute_step_share,
     initial_state,
     make_stuck_limits,
-    update_stuck,
+    update_stuck_and_toggles,
 )
 from service.estimation.records import KernelRecord, RecordArray
 
@@ -83,7 +83,7 @@ def _judge(
     toggles = 0
     for i in range(n):
         for j in range(tiles):
-            out[i, j], toggles = update_stuck(
+            out[i, j], toggles = update_stuck_and_toggles(
                 limits[0], params[j], states[j], pressure_raw[i, j], kpa[i, j], unloaded_kpa,
                 toggles, tiles,
             )  # fmt: skip
@@ -162,5 +162,5 @@ def test_shares_of_neighbours_are_what_rounding_makes_of_them(step: float, count
     rng = np.random.default_rng(5)
     begin = rng.uniform(0.0, 1.0, 400_000)
     moved = np.rint(begin + step * rng.standard_normal(len(begin))) - np.rint(begin)
-    share = float(compute_share_apart(np.array([step]), counts)[0])
+    share = float(compute_step_share(np.array([step]), counts)[0])
     assert share == pytest.approx(float((np.abs(moved) == counts).mean()), abs=0.004)

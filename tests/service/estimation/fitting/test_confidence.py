@@ -7,8 +7,8 @@ import pytest
 
 from service.estimation.fitting.confidence import (
     compute_curve_n,
-    compute_mean_band_n,
-    compute_new_loading_band_n,
+    compute_mean_half_width_95_n,
+    compute_new_loading_half_width_95_n,
     compute_student_t_95,
 )
 from service.estimation.models.static import StaticCurves
@@ -39,17 +39,17 @@ def test_the_band_of_the_mean_is_t_times_the_standard_error() -> None:
     )
     gauge_kpa = np.linspace(0.0, tile.range_kpa[1], 7)
     expected_n = 3.182446 * 0.02 * compute_curve_n(tile, gauge_kpa)
-    np.testing.assert_allclose(compute_mean_band_n(tile, gauge_kpa), expected_n, rtol=1e-6)
+    np.testing.assert_allclose(compute_mean_half_width_95_n(tile, gauge_kpa), expected_n, rtol=1e-6)
 
 
 def test_the_band_of_a_new_loading_adds_its_own_gain_and_loop() -> None:
     tile = newton_tile("T01", relative_misfit=0.03, loop_misfit_n=0.5, repeats=4)
     gauge_kpa = np.array([0.0, tile.range_kpa[1]])
-    half_n = compute_new_loading_band_n(tile, gauge_kpa)
+    half_n = compute_new_loading_half_width_95_n(tile, gauge_kpa)
     assert half_n[0] == 0.0
     # 150 N: 4.5 N of gain and 0.5 N of a loop that is open to 150/151.
     assert half_n[1] == pytest.approx(3.182446 * np.hypot(4.5, 0.5 * 150 / 151), rel=1e-6)
-    assert (compute_mean_band_n(tile, gauge_kpa) == 0.0).all()
+    assert (compute_mean_half_width_95_n(tile, gauge_kpa) == 0.0).all()
 
 
 def test_a_new_loadings_band_is_t_times_what_the_estimate_takes_as_its_sigma() -> None:
@@ -63,5 +63,7 @@ def test_a_new_loadings_band_is_t_times_what_the_estimate_takes_as_its_sigma() -
     gauge_kpa = np.linspace(0.0, tile.range_kpa[1], 11)
     sigma_n = StaticCurves([tile]).compute_forces(gauge_kpa[:, None]).fit_sigma_n[:, 0]
     np.testing.assert_allclose(
-        compute_new_loading_band_n(tile, gauge_kpa), compute_student_t_95(4) * sigma_n, rtol=1e-9
+        compute_new_loading_half_width_95_n(tile, gauge_kpa),
+        compute_student_t_95(4) * sigma_n,
+        rtol=1e-9,
     )

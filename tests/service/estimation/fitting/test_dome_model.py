@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.estimation.fitting.dome_model import compute_pressures
+from service.estimation.fitting.dome_model import compute_pressures_and_force_lag
 from service.estimation.models import flow, gas, hysteresis, rubber
 from service.estimation.models.hysteresis import WIDTHS_N
 from tests.builders.readings import through
@@ -29,7 +29,7 @@ def modelled(
     flow: tuple[float, float, float] = (0.0, 1.0, 4.0),
 ) -> np.ndarray:
     return np.asarray(
-        compute_pressures(
+        compute_pressures_and_force_lag(
             t_ns * 1e-9,
             force_n,
             CURVE,
@@ -76,13 +76,17 @@ def test_creep_and_loop_come_back_to_a_nanonewton(seed: int) -> None:
     creep, nan = rubber.CreepModel(np.array([PART]), np.array([CREEP_S])), math.nan
     felt_n = apparent_n(out[:, 0])
     felt_n = through(
-        flow.compensate, sprung.to_records(), flow.initial_state(1), felt_n, t_ns, nan, nan
+        flow.compensate_flow, sprung.to_records(), flow.initial_state(1), felt_n, t_ns, nan, nan
     )
     felt_n = through(
-        hysteresis.compensate, loop.to_records(), hysteresis.initial_state(1), felt_n, nan
+        hysteresis.compensate_hysteresis,
+        loop.to_records(),
+        hysteresis.initial_state(1),
+        felt_n,
+        nan,
     )
     felt_n = through(
-        rubber.compensate, creep.to_records(), rubber.initial_state(1), felt_n, t_ns, nan, nan
+        rubber.compensate_creep, creep.to_records(), rubber.initial_state(1), felt_n, t_ns, nan, nan
     )
     assert felt_n == pytest.approx(force_n, abs=1e-9)
     assert out[:, 2] == pytest.approx(force_n - apparent_n(out[:, 0]), abs=1e-9)
@@ -123,7 +127,7 @@ def test_without_effects_it_is_the_curve_turned_round() -> None:
 
 
 def test_a_trial_curve_that_turns_over_still_has_pressures() -> None:
-    out = compute_pressures(
+    out = compute_pressures_and_force_lag(
         np.linspace(0, 0.098, 50), np.linspace(0, 60, 50), np.array([20.0, -40.0, 5.0]), SCALE_KPA,
         BASE_KPA, 1.3, 0.011, WALL, np.array(PART), np.array(CREEP_S), np.array(LOOP), WIDTHS_N,
         0.08, 0.3, 4.0,

@@ -13,8 +13,8 @@ import pytest
 from service.estimation.effects import WALL_PER_KPA, Effects
 from service.estimation.fitting.dome_model import DomeModel
 from service.estimation.fitting.effects_fit import (
-    collect_loadings,
-    convert_curve_to_range,
+    collect_loadings_and_baseline_kpa,
+    convert_centred_cubic_to_unit,
     fit_effects,
 )
 from service.estimation.fitting.output_error import OutputErrorProblem
@@ -160,15 +160,18 @@ def test_without_a_soak_at_two_temperatures_there_is_neither_temperature_nor_amb
     effects = found_in(recorded(soak_s=soak_s, strokes=2, holds=0, taps=0))
     assert effects.temperature is None
     assert (effects.refused["temperature"], effects.refused["ambient"]) == (reason, reason)
-    assert effects.wall_per_kpa == WALL_PER_KPA
+    assert effects.wall_compliance_per_kpa == WALL_PER_KPA
 
 
 def test_what_a_loading_is_off_by_if_it_is_held_out_is_what_a_fit_without_it_says() -> None:
     recording = recorded(strokes=3, holds=3, taps=6)
     tile = fit_static_curve(recording)
-    points, baseline_kpa = collect_loadings([recording])
+    points, baseline_kpa = collect_loadings_and_baseline_kpa([recording])
     static = DomeModel(
-        convert_curve_to_range(tile.coefficients), tile.range_kpa[1], baseline_kpa, WALL_PER_KPA
+        convert_centred_cubic_to_unit(tile.coefficients),
+        tile.range_kpa[1],
+        baseline_kpa,
+        WALL_PER_KPA,
     )
     problem, parts = OutputErrorProblem(points, static), FittedEffects(terms=2)
     fit = problem.fit(parts)
@@ -177,7 +180,7 @@ def test_what_a_loading_is_off_by_if_it_is_held_out_is_what_a_fit_without_it_say
         weight = np.where(points.loading == held, 0.0, points.weight)
         without = OutputErrorProblem(replace(points, weight=weight), static)
         model = without.fit(parts, fit.scatter).model
-        off = problem.compute_residual(model, fit.scatter)
+        off = problem.compute_pressure_and_gain_residuals(model, fit.scatter)
         rows = np.append(np.flatnonzero(points.loading == held), len(points.t_s) + held)
         assert seen.left_out_squares[held] == pytest.approx(
             float((off[rows] ** 2).sum()), rel=0.05, abs=1.0

@@ -10,7 +10,10 @@ from hypothesis import strategies as st
 
 from service.estimation.effects import WALL_PER_KPA
 from service.estimation.fitting.dome_model import DomeModel
-from service.estimation.fitting.effects_fit import collect_loadings, convert_curve_to_range
+from service.estimation.fitting.effects_fit import (
+    collect_loadings_and_baseline_kpa,
+    convert_centred_cubic_to_unit,
+)
 from service.estimation.fitting.least_squares import minimize_squares
 from service.estimation.fitting.output_error import OutputErrorProblem
 from service.estimation.fitting.static_fit import fit_static_curve
@@ -69,9 +72,12 @@ def test_it_gets_out_of_a_bent_valley() -> None:
 def test_a_tiles_fit_is_that_of_a_long_search_within_a_small_part_of_its_sigma() -> None:
     recording = recorded(seed=0)
     tile = fit_static_curve(recording)
-    points, baseline_kpa = collect_loadings([recording])
+    points, baseline_kpa = collect_loadings_and_baseline_kpa([recording])
     static = DomeModel(
-        convert_curve_to_range(tile.coefficients), tile.range_kpa[1], baseline_kpa, WALL_PER_KPA
+        convert_centred_cubic_to_unit(tile.coefficients),
+        tile.range_kpa[1],
+        baseline_kpa,
+        WALL_PER_KPA,
     )
     problem = OutputErrorProblem(points, static)
     fit = problem.fit(FittedEffects(terms=2, flow=False))
@@ -98,7 +104,10 @@ def test_a_tiles_fit_is_that_of_a_long_search_within_a_small_part_of_its_sigma()
             tau_s=np.exp(at[5]), part=at[6:8], creep_s=np.exp(at[8:10]), loop=at[10:],
         )  # fmt: skip
         return np.concatenate(
-            [problem.compute_residual(tried, fit.scatter), (at - likely) / within]
+            [
+                problem.compute_pressure_and_gain_residuals(tried, fit.scatter),
+                (at - likely) / within,
+            ]
         )
 
     other = scipy.optimize.least_squares(

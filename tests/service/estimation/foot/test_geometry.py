@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from devices.frames import ServoInfo
 from service.estimation.foot.geometry import (
     compute_grid_indices,
-    compute_hull,
-    compute_rad_per_count,
-    compute_tile_axes_rad,
+    compute_hull_half_planes,
+    compute_segment_rad_per_count,
     compute_tilt_loss,
+    fit_tile_axis_angles_rad,
     transform_to_ground_x_m,
 )
 from tests.builders.arrays import make_servo
@@ -27,14 +27,14 @@ points = st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=8, u
 
 def beyond_m(positions: list[tuple[float, float]], point: tuple[float, float]) -> float:
     """How far a point lies outside the hull; zero or less inside."""
-    normals, offsets_m = compute_hull(np.array(positions))
+    normals, offsets_m = compute_hull_half_planes(np.array(positions))
     assert normals.shape == (len(offsets_m), 2)
     np.testing.assert_allclose(np.hypot(*normals.T), 1.0, atol=1e-12)
     return float((normals @ np.array(point) - offsets_m).max(initial=-np.inf))
 
 
 def angle_at(info: ServoInfo, counts: float) -> float:
-    return (counts - info.zero_counts) * compute_rad_per_count(info)
+    return (counts - info.zero_counts) * compute_segment_rad_per_count(info)
 
 
 # --- hull -----------------------------------------------------------------------------------------
@@ -80,7 +80,7 @@ def test_a_single_tile_has_no_edge_to_be_beyond() -> None:
 
 def test_tiles_a_micrometre_out_of_line_are_in_line() -> None:
     crooked = [(0.0, 0.0), (0.01, 4e-7), (0.02, -4e-7)]
-    assert len(compute_hull(np.array(crooked))[0]) == 2
+    assert len(compute_hull_half_planes(np.array(crooked))[0]) == 2
 
 
 # --- grid -----------------------------------------------------------------------------------------
@@ -186,14 +186,16 @@ def test_where_the_ankle_goes_unknown_the_ground_frame_is_unknown() -> None:
 def test_tiles_on_an_arc_push_along_its_radii_and_on_a_plane_along_the_segment() -> None:
     arc_rad = np.array([-0.14, -0.047, 0.047, 0.14])
     arc_m = 0.15 * np.stack([np.sin(arc_rad), 0 * arc_rad, -np.cos(arc_rad)], axis=1)
-    assert compute_tilt_loss(compute_tile_axes_rad(arc_m)) == pytest.approx(
+    assert compute_tilt_loss(fit_tile_axis_angles_rad(arc_m)) == pytest.approx(
         1.0 - np.cos(arc_rad), rel=0.05, abs=1e-5
     )
     flat_m = arc_m * [1.0, 1.0, 0.0] - [0.0, 0.0, 0.15]
-    assert compute_tilt_loss(compute_tile_axes_rad(flat_m)) == pytest.approx(np.zeros(4), abs=1e-12)
+    assert compute_tilt_loss(fit_tile_axis_angles_rad(flat_m)) == pytest.approx(
+        np.zeros(4), abs=1e-12
+    )
 
 
 @pytest.mark.parametrize("x_m", [[0.0], [0.0, 0.02], [0.0, 0.0, 0.02, 0.02]])
 def test_too_few_places_do_not_show_how_a_sole_is_curved(x_m: list[float]) -> None:
     positions_m = np.array([[x, 0.01 * i, -0.15 + x] for i, x in enumerate(x_m)])
-    assert (compute_tile_axes_rad(positions_m) == 0.0).all()
+    assert (fit_tile_axis_angles_rad(positions_m) == 0.0).all()

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.errors import UsageError
-from service.estimation.models.ambient import SMOOTHING_S, initial_state, update_ambient_pressure
+from service.estimation.models.ambient import SMOOTHING_S, initial_state, low_pass_ambient_kpa
 from tests.builders.arrays import array_at
 from tests.builders.calibrations import make_effects, newton_tile
 from tests.builders.estimates import newton_plan
@@ -21,9 +21,7 @@ from tests.builders.readings import through
 def head(kpa: Any, t_s: Any) -> np.ndarray:
     """Averaged pressure around the foot."""
     t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
-    return through(
-        update_ambient_pressure, None, initial_state(), np.asarray(kpa, dtype=float), t_ns
-    )
+    return through(low_pass_ambient_kpa, None, initial_state(), np.asarray(kpa, dtype=float), t_ns)
 
 
 def test_water_that_comes_at_once_is_known_after_thirty_milliseconds_to_two_thirds() -> None:
@@ -70,8 +68,8 @@ def test_a_bare_tile_that_falls_silent_is_believed_for_a_fifth_of_a_second() -> 
     t_ns = np.arange(300, dtype=np.int64) * 2_000_000
     kpa = np.where(np.arange(300) < 100, 1.0, np.nan)
     state = initial_state()
-    head_kpa = through(update_ambient_pressure, None, state, kpa, t_ns)
+    head_kpa = through(low_pass_ambient_kpa, None, state, kpa, t_ns)
     assert head_kpa[:200] == pytest.approx(1.0)
     assert np.isnan(head_kpa[200:]).all()
-    later = through(update_ambient_pressure, None, state, 2.0, t_ns[-1] + t_ns[1:10])
+    later = through(low_pass_ambient_kpa, None, state, 2.0, t_ns[-1] + t_ns[1:10])
     assert np.isfinite(later).all(), "and again as soon as it speaks"

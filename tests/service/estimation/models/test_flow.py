@@ -33,7 +33,7 @@ def compensated(
     model = FlowModel(np.array([part]), np.array([stress_n]), np.array([power]))
     t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
     seen = np.asarray(apparent_n, dtype=float), t_ns, borne_n, away_n
-    return through(flow.compensate, model.to_records(), flow.initial_state(1), *seen)
+    return through(flow.compensate_flow, model.to_records(), flow.initial_state(1), *seen)
 
 
 def borne_by_branch(t_s: np.ndarray, force_n: np.ndarray, power: float) -> np.ndarray:

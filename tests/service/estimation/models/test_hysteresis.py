@@ -34,7 +34,9 @@ def looped(force_n: list[float], part: tuple[float, ...]) -> list[float]:
 def compensated(apparent_n: list[float], part: tuple[float, ...] = PART) -> np.ndarray:
     laws = hysteresis.HysteresisModel(np.array([part])).to_records()
     felt_n = np.array(apparent_n, dtype=float)
-    return through(hysteresis.compensate, laws, hysteresis.initial_state(1), felt_n, math.nan)
+    return through(
+        hysteresis.compensate_hysteresis, laws, hysteresis.initial_state(1), felt_n, math.nan
+    )
 
 
 @given(

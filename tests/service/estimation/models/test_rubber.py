@@ -20,7 +20,7 @@ def compensated(apparent_n: Any, t_s: Any, *, part: tuple[float, ...] = PART) ->
     model = rubber.CreepModel(np.array([part]), np.array([TAU_S]))
     t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
     seen = np.asarray(apparent_n, dtype=float), t_ns, math.nan, math.nan
-    return through(rubber.compensate, model.to_records(), rubber.initial_state(1), *seen)
+    return through(rubber.compensate_creep, model.to_records(), rubber.initial_state(1), *seen)
 
 
 def crept(t_s: Any) -> Any:

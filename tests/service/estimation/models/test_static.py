@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.estimation.calibration import TileCalibration, make_paper_eq2_preset
+from service.estimation.calibration import TileCalibration, make_paper_shape_preset
 from service.estimation.models.static import StaticCurves, StaticForce
 from tests.builders.calibrations import newton_tile
 
@@ -148,7 +148,7 @@ def test_every_tile_has_its_own_curve() -> None:
     curves = StaticCurves(
         [
             newton_tile("T01", **CURVE),
-            make_paper_eq2_preset().get_tile("T02"),
+            make_paper_shape_preset().get_tile("T02"),
             newton_tile("T03"),
         ]
     )

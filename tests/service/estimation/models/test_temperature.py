@@ -14,7 +14,7 @@ from service.estimation.models.temperature import (
     READING_NOISE_COUNTS,
     STARTUP_S,
     TemperatureModel,
-    compute_gas_noise_counts,
+    compute_gas_temperature_noise_counts,
     initial_state,
     refer_to_tare_temperature,
 )
@@ -81,7 +81,9 @@ def test_noise_of_a_chip_that_is_behind_its_gas_stays_below_that_of_a_reading(la
     )
     left = counts[10_000:].std()
     assert left < READING_NOISE_COUNTS
-    assert left == pytest.approx(compute_gas_noise_counts(np.array([lag_s]), 0.002)[0], rel=0.2)
+    assert left == pytest.approx(
+        compute_gas_temperature_noise_counts(np.array([lag_s]), 0.002)[0], rel=0.2
+    )
     assert np.median(sigma_kpa) >= 0.95 * abs(KPA_PER_COUNT) * left
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from devices.frames import NO_SERVO_COUNTS, FrameFlag
-from service.estimation.calibration import make_paper_eq2_preset
+from service.estimation.calibration import make_paper_shape_preset
 from service.estimation.estimates import EstimateFlag, Estimates
 from tests.builders.arrays import COUNT_KPA, array_at, make_servo
 from tests.builders.calibrations import newton_tile
@@ -33,7 +33,7 @@ def test_in_flight_the_sum_is_unbiased() -> None:
     # The paper's curve, 0.2 N a count, under 1.3 counts of noise: 0.5 N in all, so the mean of
     # 40,000 frames is good to 0.003 N. Clipped at zero it would be 0.4 N.
     noise = np.random.default_rng(5).normal(0, 1.3, (40_000, 4))
-    plan = newton_plan(array_at(SQUARE), tiles=make_paper_eq2_preset().tiles, sigma_n=1.3)
+    plan = newton_plan(array_at(SQUARE), tiles=make_paper_shape_preset().tiles, sigma_n=1.3)
     e = estimate(plan, loaded_frames(noise))
     assert abs(e.grf_n.mean()) < 0.01
     assert abs((e.grf_n < -0.1).mean() - (e.grf_n > 0.1).mean()) < 0.02

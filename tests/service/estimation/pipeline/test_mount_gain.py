@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from devices.frames import NO_SERVO_COUNTS, ArrayInfo
-from service.estimation.calibration import Calibration, make_paper_eq2_preset
+from service.estimation.calibration import Calibration, make_paper_shape_preset
 from service.estimation.effects import Parameter
 from service.estimation.estimates import EstimateFlag, Estimates
 from service.estimation.mounting import MountCalibration
@@ -108,10 +108,10 @@ def test_of_a_tile_that_hardly_faces_the_ground_nothing_is_told(shear: float) ->
 
 def test_newtons_that_a_plate_has_measured_are_assumed_no_more() -> None:
     array = array_at(ARC)
-    plan = newton_plan(array, tiles=make_paper_eq2_preset().tiles)
+    plan = newton_plan(array, tiles=make_paper_shape_preset().tiles)
     for serials, assumed in ((("T01", "T02", "T03", "T04"), False), (("T01", "T02"), True)):
         gains = {serial: Parameter(value=1.1, sigma=0.01) for serial in serials}
-        calibration = make_paper_eq2_preset().model_copy(
+        calibration = make_paper_shape_preset().model_copy(
             update={"mounted": MountCalibration(against="plate", gains=gains)}
         )
         again = make_plan(array, calibration, plan.tare, models=("static",))
@@ -121,7 +121,7 @@ def test_newtons_that_a_plate_has_measured_are_assumed_no_more() -> None:
 
 
 def test_the_mount_calibration_is_part_of_the_id() -> None:
-    calibration = make_paper_eq2_preset()
+    calibration = make_paper_shape_preset()
     mounted = calibration.model_copy(
         update={
             "mounted": MountCalibration(

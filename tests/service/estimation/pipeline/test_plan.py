@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from devices.errors import CalibrationError, FootTileError, UsageError
-from service.estimation.calibration import make_paper_eq2_preset
+from service.estimation.calibration import make_paper_shape_preset
 from service.estimation.pipeline.plan import make_plan
 from tests.builders.arrays import DATA_SHEET_CHIP, array_at
 from tests.builders.calibrations import newton_tile
@@ -52,7 +52,7 @@ def test_models_are_taken_in_the_order_of_the_ladder() -> None:
 
 
 def test_one_assumed_scale_makes_the_whole_sum_assumed() -> None:
-    paper = make_paper_eq2_preset().tiles[0].model_copy(update={"serial": "T02"})
+    paper = make_paper_shape_preset().tiles[0].model_copy(update={"serial": "T02"})
     tiles = [newton_tile("T01"), paper, newton_tile("T03")]
     assert newton_plan(array_at(LINE), tiles=tiles).is_scale_assumed
     assert not newton_plan(array_at(LINE)).is_scale_assumed

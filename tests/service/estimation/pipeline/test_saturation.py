@@ -21,7 +21,7 @@ from service.estimation.calibration import TileCalibration
 from service.estimation.effects import Effects, GasEffect, Parameter
 from service.estimation.estimates import EstimateFlag, Estimates
 from service.estimation.fitting.dome_model import DomeModel
-from service.estimation.models.gas import GasModel, bound_isothermal_pressure
+from service.estimation.models.gas import GasModel, compute_isothermal_lower_bound_kpa
 from tests.builders.arrays import COUNT_KPA, PERIOD_NS, UNLOADED_KPA, make_array
 from tests.builders.calibrations import make_effects, newton_tile
 from tests.builders.estimates import estimate, newton_plan
@@ -34,7 +34,9 @@ CURVE = np.array([22.0, 5.0, 5.0])  # newtons at the end of the range: 32
 def squeezed(force_n: Floats, gamma: float, tau_s: float, wall: float) -> tuple[Floats, Floats]:
     """Pressures that are read under a load every 2 ms, and those that the gas would settle at."""
     model = DomeModel(CURVE, SCALE_KPA, BASE_KPA, wall, gamma=gamma, tau_s=tau_s)
-    pressed = model.compute_pressures(STEP_S * np.arange(len(force_n), dtype=np.float64), force_n)
+    pressed = model.compute_pressures_and_force_lag(
+        STEP_S * np.arange(len(force_n), dtype=np.float64), force_n
+    )
     return pressed[:, 0], pressed[:, 1]
 
 
@@ -48,7 +50,7 @@ loads = st.lists(st.tuples(st.floats(0.0, 45.0), st.integers(1, 60)), min_size=1
 
 
 def at_least(gas: GasModel, kpa: float) -> float:
-    return float(bound_isothermal_pressure(gas.to_records()[0], float(kpa)))
+    return float(compute_isothermal_lower_bound_kpa(gas.to_records()[0], float(kpa)))
 
 
 @settings(max_examples=200, deadline=None)
@@ -93,9 +95,9 @@ NEWTON_KPA = 100 * COUNT_KPA
 def read_n(force_n: Floats) -> Floats:
     """What a tile of one newton a count seems to bear, its gas heated by being squeezed."""
     curve = np.array([100.0, 0.0, 0.0])
-    wall = GAS.wall_per_kpa
+    wall = GAS.wall_compliance_per_kpa
     model = DomeModel(curve, NEWTON_KPA, UNLOADED_KPA, wall, gamma=GAMMA, tau_s=TAU_S)
-    pressed = model.compute_pressures(
+    pressed = model.compute_pressures_and_force_lag(
         1e-9 * PERIOD_NS * np.arange(len(force_n), dtype=np.float64), force_n
     )
     return np.asarray((pressed[:, 0] - UNLOADED_KPA) / COUNT_KPA)

@@ -22,7 +22,7 @@ from service.estimation.estimates import EstimateFlag, Estimates
 from service.estimation.fitting.dome_model import DomeModel
 from service.estimation.pipeline.model_set import MODEL_NAMES
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
-from service.estimation.pipeline.saturation import is_after_long_gap, worst_case
+from service.estimation.pipeline.saturation import is_after_long_gap, select_farther_bound
 from tests.builders.arrays import UNLOADED_KPA, make_array
 from tests.builders.calibrations import make_calibration, make_effects, make_tare, newton_tile
 from tests.builders.estimates import estimate
@@ -110,7 +110,7 @@ def a_dome(rng: np.random.Generator, lag_ms: float) -> tuple[DomeModel, Estimati
     ]
     tare = make_tare(2, noise_kpa=NOISE_KPA)
     plan = make_plan(info, make_calibration(*tiles), tare, models=LADDER, lag_ms=lag_ms)
-    wall = effects.wall_per_kpa
+    wall = effects.wall_compliance_per_kpa
     dome = DomeModel(
         np.array(CURVE), SCALE_KPA, UNLOADED_KPA, wall, gamma, tau_s, part, creep_s, loop
     )
@@ -134,7 +134,9 @@ def saturated_run(seed: int, *, lag_ms: float, stops_kpa: float = np.inf) -> Run
     rng = np.random.default_rng(seed)
     dome, plan = a_dome(rng, lag_ms)
     true_n = a_load(rng)
-    kpa = dome.compute_pressures(STEP_S * np.arange(len(true_n), dtype=np.float64), true_n)[:, 0]
+    kpa = dome.compute_pressures_and_force_lag(
+        STEP_S * np.arange(len(true_n), dtype=np.float64), true_n
+    )[:, 0]
     e = estimate(plan, read(np.minimum(kpa, stops_kpa), rng))
     return Run(true_n, (e.estimate_flags & EstimateFlag.SATURATED) > 0, e)
 
@@ -144,7 +146,9 @@ def away_run(seed: int, *, lag_ms: float) -> Run:
     rng = np.random.default_rng(seed)
     dome, plan = a_dome(rng, lag_ms)
     true_n = np.minimum(a_load(rng), 25.0)
-    kpa = dome.compute_pressures(STEP_S * np.arange(len(true_n), dtype=np.float64), true_n)[:, 0]
+    kpa = dome.compute_pressures_and_force_lag(
+        STEP_S * np.arange(len(true_n), dtype=np.float64), true_n
+    )[:, 0]
     away = np.zeros(len(true_n), dtype=bool)
     for _ in range(4):
         begin = rng.integers(200, len(true_n) - 800)
@@ -228,7 +232,9 @@ def test_any_batches_give_the_same_bits_through_what_is_unseen(
     rng = np.random.default_rng(seed)
     dome, plan = a_dome(rng, lag_ms)
     true_n = a_load(rng)[:1500]
-    kpa = dome.compute_pressures(STEP_S * np.arange(len(true_n), dtype=np.float64), true_n)[:, 0]
+    kpa = dome.compute_pressures_and_force_lag(
+        STEP_S * np.arange(len(true_n), dtype=np.float64), true_n
+    )[:, 0]
     away = np.zeros(len(true_n), dtype=bool)
     begin = rng.integers(0, 1400)
     away[begin : begin + 60] = True
@@ -239,7 +245,7 @@ def test_any_batches_give_the_same_bits_through_what_is_unseen(
 
 
 def test_the_farthest_of_two_is_found_on_either_side() -> None:
-    assert [worst_case(of, 0.0, 10.0) for of in (1.0, 9.0)] == [10.0, 0.0]
+    assert [select_farther_bound(of, 0.0, 10.0) for of in (1.0, 9.0)] == [10.0, 0.0]
 
 
 def test_a_tile_was_away_if_more_than_50_ms_passed_between_its_readings() -> None:

@@ -17,7 +17,7 @@ import pytest
 from devices.chips.compensation import Compensation
 from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from devices.frames import NOT_READ, ArrayInfo, FrameBatch
-from service.estimation.calibration import Calibration, make_paper_eq2_preset
+from service.estimation.calibration import Calibration, make_paper_shape_preset
 from service.estimation.tare.automatic import (
     RECOVERY_NS,
     RENEWAL_NS,
@@ -26,8 +26,8 @@ from service.estimation.tare.automatic import (
     TOTAL_SHIFT_MAX_KPA,
     WINDOW_NS,
     FlightTareResult,
-    compute_first_flight_tare,
-    compute_flight_tare,
+    propose_first_flight_tare,
+    propose_flight_tare,
 )
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded_windows import TareFrames
@@ -72,7 +72,7 @@ class Bench:
         bears: tuple[bool, ...] = (True,) * TILES,
     ) -> FlightTareResult:
         """A look at frames of a foot that has had no contact for `free_s`."""
-        return compute_flight_tare(
+        return propose_flight_tare(
             self._seen(frames),
             present=present,
             last_manual=present if anchor is None else anchor,
@@ -82,7 +82,7 @@ class Bench:
 
     def first(self, frames: FrameBatch) -> FlightTareResult:
         """A look at frames of a foot that was never tared."""
-        return compute_first_flight_tare(self._seen(frames))
+        return propose_first_flight_tare(self._seen(frames))
 
     def _seen(self, frames: FrameBatch) -> TareFrames:
         return TareFrames(frames, self._compensation, self.calibration, self.info.serials)
@@ -287,7 +287,7 @@ def test_a_foot_that_rests_far_from_the_bench_is_not_tared_unasked(bench: Bench)
 
 
 def test_without_a_bench_nobody_knows_what_unloaded_is(bench: Bench) -> None:
-    preset = Bench(bench.info, make_paper_eq2_preset())
+    preset = Bench(bench.info, make_paper_shape_preset())
     assert preset.first(preset.frames(20.0, stepping(0.0))) == FlightTareResult()
 
 

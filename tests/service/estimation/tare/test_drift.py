@@ -15,8 +15,8 @@ from service.estimation.tare.tare import (
     Tare,
     compute_thermal_shift_kpa,
     compute_warming_k,
-    fit_trend,
-    has_warmed,
+    fit_recent_baseline_trend,
+    has_temperature_changed,
 )
 from tests.builders.arrays import UTC_NS
 from tests.builders.calibrations import make_tare
@@ -50,14 +50,17 @@ def test_five_kelvin_are_27_counts_less_and_1_7_kilopascals_more() -> None:
 
 def test_a_tile_has_warmed_once_its_chip_has_moved_by_more_than_the_bound() -> None:
     at, beyond = TEMPERATURE_CHANGE_MAX_COUNTS, TEMPERATURE_CHANGE_MAX_COUNTS + 0.5
-    assert has_warmed(tare(), [480.0 - at, 500.0 + at]).tolist() == [False, False]
-    assert has_warmed(tare(), [480.0 - beyond, 500.0 + beyond]).tolist() == [True, True]
-    assert has_warmed(tare(), [[480.0, np.nan], [400.0, 500.0]]).tolist() == [
+    assert has_temperature_changed(tare(), [480.0 - at, 500.0 + at]).tolist() == [False, False]
+    assert has_temperature_changed(tare(), [480.0 - beyond, 500.0 + beyond]).tolist() == [
+        True,
+        True,
+    ]
+    assert has_temperature_changed(tare(), [[480.0, np.nan], [400.0, 500.0]]).tolist() == [
         [False, False],
         [True, False],
     ]
     unknown = tare(temperature_raw=(np.nan, 500.0))
-    assert has_warmed(unknown, [0.0, 0.0]).tolist() == [False, True]
+    assert has_temperature_changed(unknown, [0.0, 0.0]).tolist() == [False, True]
 
 
 def test_a_trend_is_the_straight_line_through_the_baselines() -> None:
@@ -66,7 +69,7 @@ def test_a_trend_is_the_straight_line_through_the_baselines() -> None:
         tare(h, kpa=(100 + 0.3 * h, 96.0), temperature_raw=(480 - 2 * h, 500.0))
         for h in (0, 0.5, 2, 3)
     ]
-    found = fit_trend(tares, tiles=2)
+    found = fit_recent_baseline_trend(tares, tiles=2)
     assert found.kpa_per_hour == pytest.approx([0.3, 0.0], abs=1e-9)
     assert found.kelvin_per_hour == pytest.approx([-2.0 / TADC_PER_KELVIN, 0.0], abs=1e-9)
     # least squares: sigma / sqrt(sum of squared distances from the mean of 1.375 h)
@@ -77,14 +80,16 @@ def test_a_trend_is_the_straight_line_through_the_baselines() -> None:
 def test_a_trend_needs_ten_minutes_and_two_tares() -> None:
     short = (TREND_SPAN_MIN_NS - 1e9) / HOUR_NS
     for tares in ([], [tare()], [tare(), tare(short)], [tare(), tare()]):
-        found = fit_trend(tares, tiles=2)
+        found = fit_recent_baseline_trend(tares, tiles=2)
         for values in (found.kpa_per_hour, found.sigma_kpa_per_hour, found.kelvin_per_hour):
             assert np.isnan(values).tolist() == [True, True]
-    assert np.isfinite(fit_trend([tare(), tare(short + 1 / 60)], tiles=2).kpa_per_hour).all()
+    assert np.isfinite(
+        fit_recent_baseline_trend([tare(), tare(short + 1 / 60)], tiles=2).kpa_per_hour
+    ).all()
 
 
 def test_a_tare_of_unknown_temperature_leaves_the_pressure_trend() -> None:
-    found = fit_trend([tare(temperature_raw=(np.nan, np.nan)), tare(1.0)], tiles=2)
+    found = fit_recent_baseline_trend([tare(temperature_raw=(np.nan, np.nan)), tare(1.0)], tiles=2)
     assert np.isfinite(found.kpa_per_hour).all()
     assert np.isnan(found.kelvin_per_hour).all()
 
@@ -92,4 +97,6 @@ def test_a_tare_of_unknown_temperature_leaves_the_pressure_trend() -> None:
 def test_what_was_before_the_last_hours_does_not_count() -> None:
     old = TREND_OVER_NS / HOUR_NS + 1.5
     tares = [tare(-old, kpa=(50.0, 50.0)), tare(-1.0), tare(0.0, kpa=(100.5, 96.0))]
-    assert fit_trend(tares, tiles=2).kpa_per_hour == pytest.approx([0.5, 0.0], abs=1e-9)
+    assert fit_recent_baseline_trend(tares, tiles=2).kpa_per_hour == pytest.approx(
+        [0.5, 0.0], abs=1e-9
+    )

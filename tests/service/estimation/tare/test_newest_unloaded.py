@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from devices.chips.compensation import Compensation
 from devices.errors import TareError
 from devices.frames import FrameBatch
-from service.estimation.calibration import Calibration, make_paper_eq2_preset
+from service.estimation.calibration import Calibration, make_paper_shape_preset
 from service.estimation.tare.automatic import HISTORY_NS, WINDOW_NS, compute_newest_unloaded_tare
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded_windows import FRAMES_MIN, TareFrames
@@ -153,7 +153,7 @@ def test_where_the_frames_begin_in_time_does_not_matter() -> None:
 def test_a_preset_without_a_bench_takes_what_is_lowest() -> None:
     frames = loaded_frames(stretches(["pressed", "unloaded", "moving"]))
     for before in (None, present()):
-        tare = flight_of(frames, calibration=make_paper_eq2_preset(), present=before)
+        tare = flight_of(frames, calibration=make_paper_shape_preset(), present=before)
         assert 1.0 <= tare.begin_s < tare.end_s <= 2.0
         assert_unloaded(tare)
 
@@ -206,7 +206,7 @@ def test_a_foot_that_moves_all_the_time_is_refused(hertz: float, known: str) -> 
     frames = loaded_frames(noise(3000) + (10.0 * np.sin(2 * np.pi * hertz * t_s))[:, None])
     options: dict[str, Any] = {"present": None if known == "bench" else present()}
     if known == "preset and present":
-        options["calibration"] = make_paper_eq2_preset()
+        options["calibration"] = make_paper_shape_preset()
     with pytest.raises(TareError, match=MOVED) as caught:
         flight_of(frames, **options)
     assert "Lift the foot" in caught.value.remedy
@@ -218,7 +218,7 @@ def test_with_a_preset_and_without_a_tare_a_foot_that_moves_is_refused_too(hertz
     t_s = np.arange(3000) / RATE_HZ
     frames = loaded_frames(noise(3000) + (20.0 + 20.0 * np.sin(2 * np.pi * hertz * t_s))[:, None])
     with pytest.raises(TareError, match=MOVED):
-        flight_of(frames, calibration=make_paper_eq2_preset())
+        flight_of(frames, calibration=make_paper_shape_preset())
 
 
 @pytest.mark.parametrize("newtons_per_second", [1.0, -1.0])

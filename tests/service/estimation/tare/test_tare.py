@@ -16,9 +16,12 @@ from hypothesis import strategies as st
 from devices.chips.compensation import Compensation
 from devices.errors import TareError
 from devices.frames import FrameBatch, FrameFlag, TileFlag
-from service.estimation.calibration import Calibration, make_paper_eq2_preset
+from service.estimation.calibration import Calibration, make_paper_shape_preset
 from service.estimation.tare.tare import Tare
-from service.estimation.tare.unloaded_windows import compute_recording_tare, compute_window_starts
+from service.estimation.tare.unloaded_windows import (
+    compute_nonempty_window_starts,
+    compute_recording_tare,
+)
 from tests.builders.arrays import COUNT_KPA, DATA_SHEET_CHIP, UNLOADED_KPA, array_at, make_array
 from tests.builders.calibrations import make_calibration, newton_tile
 from tests.builders.frames import loaded_frames
@@ -209,7 +212,7 @@ def test_a_tile_without_noise_on_the_bench_may_stand_still_in_the_lead() -> None
     frames = loaded_frames(np.zeros((120, 2)), frame_flags=lead(120, 120))
     assert tare_of(frames, noise_kpa=0.29 * COUNT_KPA).source == "lead"
     with pytest.raises(TareError, match="in a row"):
-        tare_of(frames, calibration=make_paper_eq2_preset())
+        tare_of(frames, calibration=make_paper_shape_preset())
 
 
 def test_frames_marked_as_lead_later_on_are_none() -> None:
@@ -260,7 +263,7 @@ def test_a_tile_that_seems_loaded_is_no_tare_even_if_somebody_says_so(how: str) 
 
 def test_a_preset_does_not_know_what_an_unloaded_tile_reads() -> None:
     loaded = loaded_frames(np.full((100, 2), 60.0) + noise_counts(100, 2))
-    assert tare_of(loaded, (0.0, 0.1), calibration=make_paper_eq2_preset()).source == "interval"
+    assert tare_of(loaded, (0.0, 0.1), calibration=make_paper_shape_preset()).source == "interval"
 
 
 def stretches(kinds: list[str]) -> np.ndarray:
@@ -309,7 +312,7 @@ def test_no_loaded_moving_or_faulty_stretch_is_recognised_as_unloaded(kinds: lis
 def test_a_leg_that_stands_still_is_not_in_flight() -> None:
     # The paper's leg weighs 8.92 N (0.909 kg): 2.23 N on each of four tiles, which by eq. 2 at the
     # assumed scale is 1.41 kPa, 11 counts. It stands for two seconds, then is lifted for two.
-    paper = make_paper_eq2_preset().tiles[0]
+    paper = make_paper_shape_preset().tiles[0]
     slope_n_per_kpa = paper.f_scale_n * 0.5702 / 15.0
     counts = 8.92 / 4 / slope_n_per_kpa / COUNT_KPA
     forces_n = noise_counts(2000, 4)
@@ -359,7 +362,7 @@ def test_one_tile_without_a_bench_baseline_is_enough_to_recognise_nothing() -> N
 
 def test_a_calibration_without_bench_baselines_cannot_recognise_anything() -> None:
     with pytest.raises(TareError, match=r"paper-eq2-shape .*--tare-s"):
-        tare_of(loaded_frames(np.zeros((500, 2))), calibration=make_paper_eq2_preset())
+        tare_of(loaded_frames(np.zeros((500, 2))), calibration=make_paper_shape_preset())
 
 
 def test_a_baseline_may_have_drifted_by_some_kelvin_since_the_bench() -> None:
@@ -403,11 +406,11 @@ def test_windows_are_those_of_the_lattice_that_hold_a_frame(
     since_ns = np.cumsum([0, *steps_ns])
     lattice = np.arange(begin_ns % step_ns, since_ns[-1] + 1, step_ns)
     held = [at for at in lattice.tolist() if ((since_ns >= at) & (since_ns < at + length_ns)).any()]
-    found = compute_window_starts(since_ns, begin_ns, step_ns, length_ns).tolist()
+    found = compute_nonempty_window_starts(since_ns, begin_ns, step_ns, length_ns).tolist()
     assert set(held) <= set(found) <= set(lattice.tolist())
 
 
 @pytest.mark.parametrize("gap_ns", [10**12, 10**18])
 def test_a_clock_that_was_set_makes_no_windows(gap_ns: int) -> None:
     since_ns = np.array([0, 10, 20, gap_ns, gap_ns + 10])
-    assert len(compute_window_starts(since_ns, 0, 5, 10)) < 20
+    assert len(compute_nonempty_window_starts(since_ns, 0, 5, 10)) < 20

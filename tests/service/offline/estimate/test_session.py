@@ -13,7 +13,7 @@ from service.offline.estimate.request import EstimateRequest
 from service.offline.estimate.session import estimate_session
 from service.sessions.pipeline import EstimateStream
 from service.sessions.stances import load_stances
-from storage.formats.export import make_frame_source
+from storage.formats.export import make_one_pass_frame_source
 from storage.formats.slice import Slice
 from storage.schema import ESTIMATE_COLUMNS
 from storage.sessions.reader import SealedFileReader
@@ -118,7 +118,7 @@ def test_a_session_estimated_in_its_folder_has_its_stances_beside_it(
 def test_exports_say_to_what_their_columns_were_rounded(raw: Path, tmp_path: Path) -> None:
     with estimated(raw, tmp_path / "s.parquet") as reader:
         columns = [column.name for column in ESTIMATE_COLUMNS]
-        content = make_frame_source(reader.read_batches(*columns))
+        content = make_one_pass_frame_source(reader.read_batches(*columns))
         part = Slice(columns=("grf_n", "contact"))
         out = tmp_path / "export.parquet"
         out.write_bytes(b"".join(export(content, reader.info, reader.notes, "parquet", part)))

@@ -81,7 +81,7 @@ def test_not_a_number_is_neither_smaller_nor_greater(a: float, b: float) -> None
 def test_every_frame_is_in_one_span_with_its_force_between_least_and_greatest(
     runs: list[tuple[int, int]],
 ) -> None:
-    rows = filled(runs).get_spans(SECONDS_MAX)
+    rows = filled(runs).get_newest_spans(SECONDS_MAX)
     sent = np.concatenate(
         [
             np.arange(at, at + n)
@@ -111,7 +111,7 @@ def test_what_is_told_next_goes_on_where_it_ends(sizes: list[int], data: st.Data
     recent = filled([(0, n) for n in sizes])
     ends = np.cumsum([0, *sizes])
     told = data.draw(st.integers(max(0, len(sizes) - 30), len(sizes) - 1))  # of the last second
-    rows = recent.get_spans(SECONDS_MAX, before_seq=int(ends[told]))
+    rows = recent.get_newest_spans(SECONDS_MAX, end_before_seq=int(ends[told]))
     if told:
         assert rows["seq"][-1] == ends[told] - 1
         assert rows["seq_first"][0] == 0
@@ -120,7 +120,7 @@ def test_what_is_told_next_goes_on_where_it_ends(sizes: list[int], data: st.Data
 
 def test_older_spans_are_joined_and_the_newest_are_as_they_were_told() -> None:
     recent = filled([(0, 1)] * 5000)
-    rows = recent.get_spans(SECONDS_MAX)
+    rows = recent.get_newest_spans(SECONDS_MAX)
     apart_ns = np.diff(rows["t_ns_first"])
     assert (rows["n"][-100:] == 1).all()
     assert (apart_ns[:-130] >= SPAN_PERIOD_NS).all()
@@ -130,7 +130,7 @@ def test_older_spans_are_joined_and_the_newest_are_as_they_were_told() -> None:
 @pytest.mark.parametrize("seconds", [0.5, 5.0, 10.0, 60.0])
 def test_so_many_seconds_are_given_as_were_asked_for(seconds: float) -> None:
     recent = filled([(0, 10)] * int(70e9 / (10 * PERIOD_NS)))
-    rows = recent.get_spans(seconds)
+    rows = recent.get_newest_spans(seconds)
     covered_s = (rows["t_ns"][-1] - rows["t_ns_first"][0]) * 1e-9
     assert seconds - 0.1 < covered_s < seconds + 0.1
 
@@ -139,13 +139,13 @@ def test_a_new_stream_begins_anew() -> None:
     recent = filled([(0, 10)] * 300)
     recent.add_span(OTHER, span(0, 10))
     assert recent.stream_id == OTHER
-    assert recent.get_spans(SECONDS_MAX)["seq"].tolist() == [9]
+    assert recent.get_newest_spans(SECONDS_MAX)["seq"].tolist() == [9]
 
 
 def test_nothing_was_told_yet() -> None:
     assert (
-        len(ForceHistory().get_spans(SECONDS_MAX))
-        == len(ForceHistory().get_spans(1.0, before_seq=5))
+        len(ForceHistory().get_newest_spans(SECONDS_MAX))
+        == len(ForceHistory().get_newest_spans(1.0, end_before_seq=5))
         == 0
     )
 
@@ -160,5 +160,5 @@ def test_a_node_costs_180_kb_however_long_it_streams(frames: int, gap: int) -> N
         forces = dict.fromkeys(ForceSpan._fields[5:], float(at))
         recent.add_span(ONE, base._replace(seq_first=at, seq=at + frames - 1, **(times | forces)))
     kept = [recent._merged, *recent._as_published, *chain(*recent._as_published)]
-    assert len(recent.get_spans(SECONDS_MAX)) > 900
+    assert len(recent.get_newest_spans(SECONDS_MAX)) > 900
     assert 120_000 < sum(map(sys.getsizeof, kept)) < 180_000

@@ -38,7 +38,7 @@ def filled(runs: list[tuple[int, int]], tiles: int = 2) -> TileHistory:
 def test_least_and_greatest_are_those_of_the_frames_to_half_a_part_in_a_thousand(
     runs: list[tuple[int, int]], unit: str
 ) -> None:
-    rows, least, greatest = filled(runs).get_spans(60.0, unit)
+    rows, least, greatest = filled(runs).get_newest_spans(60.0, unit)
     by = 7 if unit == "gauge_kpa" else 1
     assert rows["n"].sum() == sum(n for _, n in runs)
     assert (rows["seq_first"][1:] > rows["seq"][:-1]).all()
@@ -62,13 +62,13 @@ def ends(runs: list[tuple[int, int]]) -> list[tuple[int, int, int]]:
 
 def test_it_is_a_minute_in_tenths_of_a_second_and_no_more_of_it_than_is_asked_for() -> None:
     recent = filled([(0, 10)] * int(80e9 / (10 * PERIOD_NS)))
-    rows, *_ = recent.get_spans(60.0, "force_n")
+    rows, *_ = recent.get_newest_spans(60.0, "force_n")
     assert 590 <= len(rows) <= 602
     assert (np.diff(rows["t_ns"]) >= SPAN_PERIOD_NS - 10 * PERIOD_NS).all()
-    some, *_ = recent.get_spans(10.0, "force_n")
+    some, *_ = recent.get_newest_spans(10.0, "force_n")
     assert 98 <= len(some) <= 101
     before = int(rows["seq_first"][300])
-    older, *_ = recent.get_spans(60.0, "force_n", before_seq=before)
+    older, *_ = recent.get_newest_spans(60.0, "force_n", begin_before_seq=before)
     assert older["seq"][-1] == before - 1
 
 
@@ -81,10 +81,10 @@ def test_what_it_costs_does_not_grow(tiles: int, most: int) -> None:
 
 def test_without_estimates_and_without_frames_nothing_is_known() -> None:
     recent = TileHistory(BOOT, 2)
-    assert [len(each) for each in recent.get_spans(60.0, "force_n")] == [0, 0, 0]
+    assert [len(each) for each in recent.get_newest_spans(60.0, "force_n")] == [0, 0, 0]
     frames = make_frames(5)
     recent.add_frames(summarize_force(frames, {}), {})
-    rows, least, greatest = recent.get_spans(60.0, "gauge_kpa")
+    rows, least, greatest = recent.get_newest_spans(60.0, "gauge_kpa")
     assert rows["n"].tolist() == [5]
     assert np.isnan(least).all()
     assert np.isnan(greatest).all()
@@ -94,5 +94,5 @@ def test_what_no_half_can_hold_is_the_greatest_it_can() -> None:
     recent = TileHistory(BOOT, 1)
     columns = {"force_n": np.array([[1e9]]), "gauge_kpa": np.array([[-1e9]])}
     recent.add_frames(summarize_force(make_frames(1, 1), columns), columns)
-    assert np.isfinite(recent.get_spans(1.0, "force_n")[2]).all()
-    assert np.isfinite(recent.get_spans(1.0, "gauge_kpa")[1]).all()
+    assert np.isfinite(recent.get_newest_spans(1.0, "force_n")[2]).all()
+    assert np.isfinite(recent.get_newest_spans(1.0, "gauge_kpa")[1]).all()

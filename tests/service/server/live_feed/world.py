@@ -111,7 +111,7 @@ class World:
         self.present.taken += n
         self.present.lost.add(first, first + n - 1)
         if self._is_there:
-            self.node.present_stream.set_losses({LOST: tuple(self.present.lost)})
+            self.node.present_stream.set_node_losses({LOST: tuple(self.present.lost)})
 
     def send_newest(self, n: int) -> None:
         """It takes frames, which come at once if the link is there."""
@@ -124,7 +124,7 @@ class World:
         """It sends all that the server has asked for, the present stream's last."""
         if not self._is_there:
             return
-        for each in self.node.missing_ranges(self.needed()):
+        for each in self.node.frames_to_request(self.needed()):
             stream = self.streams[each.stream_id]
             wanted = Intervals((a, NO_END if b is None else b) for a, b in each.numbers)
             for first, last in wanted & stream.held:
@@ -175,19 +175,19 @@ class World:
         self.start()
 
     def _end_server(self) -> None:
-        self.node.save()
+        self.node.save_hello()
         for stream in self.node.streams.values():
             stream.close()
 
     def tare(self, t_ns: int, counts: int = 0) -> None:
         """A tare is taken at this instant of the node's UTC, of a foot that bears so much."""
         tare = make_tare(t_ns=t_ns, baseline_kpa=UNLOADED_KPA + counts * COUNT_KPA)
-        self.node.estimator.tare_history.add_tare(tare, self.present.info)
+        self.node.estimator.tare_history.store_tare(tare, self.present.info)
         self.node.estimator.live.set_tare(tare)
 
     def connect(self) -> None:
         """The node connects."""
-        self.node.on_hello(self._hello(), UTC_NS)
+        self.node.apply_hello(self._hello(), UTC_NS)
         self._is_there = True
 
     def leave(self) -> None:

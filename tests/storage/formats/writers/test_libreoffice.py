@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from storage.formats.export import make_frame_source
+from storage.formats.export import make_one_pass_frame_source
 from storage.formats.markers import PlacedMarker, PlacedMarkers
 from storage.formats.options import NO_OPTIONS, FormatOptions
 from storage.formats.slice import Slice
@@ -38,7 +38,7 @@ def exported(to: str, options: FormatOptions) -> bytes:
         PlacedMarker(Marker(id=str(i), label=label, t_ns=0), (0, first + i), 0, 0)
         for i, label in enumerate(LABELS)
     ]
-    content = make_frame_source(cut(frames(), extra(), 20))
+    content = make_one_pass_frame_source(cut(frames(), extra(), 20))
     chunks = export(
         *(content, make_array(), NOTES, to, Slice()),
         markers=PlacedMarkers(markers),

@@ -22,7 +22,7 @@ from devices.errors import UsageError
 from devices.frames import NOT_READ, TileFlag
 from storage.clock.bounds import OffsetRows
 from storage.clock.table import ClockTable, StreamClockFacts
-from storage.formats.export import make_frame_source
+from storage.formats.export import make_one_pass_frame_source
 from storage.formats.markers import PLACEMENT_COLUMNS, PlacedMarkers, place_markers
 from storage.formats.options import NO_OPTIONS, FormatOptions
 from storage.formats.slice import Slice
@@ -69,7 +69,9 @@ def written(
     *,
     every: int = 20,
 ) -> bytes:
-    content = make_frame_source(cut(frames(), estimates() if columns is None else columns, every))
+    content = make_one_pass_frame_source(
+        cut(frames(), estimates() if columns is None else columns, every)
+    )
     info = make_array(2, node=node)
     chunks = export(
         content, info, NOTES, "mcap", part or Slice(), None, markers(), {"session": "s"}, options
@@ -298,7 +300,7 @@ def test_columns_of_ros_messages_cannot_be_chosen() -> None:
 
 def test_frames_without_the_servers_time_are_refused_when_it_is_asked_for() -> None:
     clock = ClockTable({}, [StreamClockFacts("a", 0, True)], ["a"])
-    content = make_frame_source(cut(frames(), estimates(), 20))
+    content = make_one_pass_frame_source(cut(frames(), estimates(), 20))
     chunks = export(content, make_array(2), NOTES, "mcap", Slice(), clock, options=NO_OPTIONS)
     with pytest.raises(UsageError, match="the server's time is not known"):
         next(chunks)

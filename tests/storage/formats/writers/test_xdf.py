@@ -15,7 +15,7 @@ from devices.arrays import Bools
 from devices.frames import NO_SERVO_COUNTS, NOT_READ
 from storage.clock.bounds import OffsetRows
 from storage.clock.table import ClockTable, StreamClockFacts
-from storage.formats.export import make_frame_source
+from storage.formats.export import make_one_pass_frame_source
 from storage.formats.options import NO_OPTIONS, FormatOptions
 from storage.formats.slice import Slice
 from storage.schema import Array
@@ -38,7 +38,7 @@ def written(
 ) -> bytes:
     rows = np.flatnonzero(np.full(ROWS, True) if taken is None else taken)
     of_rows = {name: v[rows] for name, v in (extra() if columns is None else columns).items()}
-    content = make_frame_source(cut(frames().select_rows(rows), of_rows, every))
+    content = make_one_pass_frame_source(cut(frames().select_rows(rows), of_rows, every))
     source = {"session": "s <&> 🦶"}
     chunks = export(
         content,
@@ -167,7 +167,7 @@ def test_a_pause_of_years_has_one_clock_offset_behind_it(monkeypatch: pytest.Mon
     clock = ClockTable({BOOTS[0]: ahead}, [StreamClockFacts(BOOTS[0], 10**18, True)], BOOTS)
     found = {}
     for each in (batch, late):
-        content = make_frame_source(cut(each, extra(), ROWS))
+        content = make_one_pass_frame_source(cut(each, extra(), ROWS))
         chunks = export(
             content, make_array(node="left"), NOTES, "xdf", Slice(), clock, options=NO_OPTIONS
         )
@@ -181,7 +181,7 @@ def test_what_xml_cannot_hold_is_an_escape_and_the_file_is_read(odd: str) -> Non
     info = make_array()
     tiles = tuple(tile.model_copy(update={"serial": f"T{odd}1"}) for tile in info.tiles)
     info = info.model_copy(update={"tiles": tiles})
-    content = make_frame_source(cut(frames(), extra(), 20))
+    content = make_one_pass_frame_source(cut(frames(), extra(), 20))
     found = b"".join(
         export(content, info, NOTES, "xdf", Slice(), None, None, {"session": odd}, NO_OPTIONS)
     )
