@@ -112,18 +112,20 @@ def node_costs(recording: Recording, folder: Path) -> dict[str, Cost]:
     with ExitStack() as stack:
         raw = _raw_file(folder / "raw.arrows", stack)
         keeper = NodeJournal(folder, "bench")
-        keeper.retention_requests.set_local_numbers(
+        keeper.retention_requests.set_own_session_numbers(
             {recording.info.stream_id: Intervals([(0, 2**61)])}
         )
         before = set(threading.enumerate())
         keeper.start_writer()
-        stack.callback(keeper.close)
+        stack.callback(keeper.end_streams_and_close)
         (thread,) = set(threading.enumerate()) - before
         clock = time.pthread_getcpuclockid(thread.ident or 0)
-        stream = keeper.begin_stream(recording.info)
+        stream = keeper.switch_to_new_stream(recording.info)
 
         def put(batch: FrameBatch, payload: bytes) -> None:
-            keeper.queue_batch(stream, EncodedBatch.from_frames_and_payload(batch, payload))
+            keeper.queue_batch_and_limit_memory(
+                stream, EncodedBatch.from_frames_and_payload(batch, payload)
+            )
 
         bare, node = "bare write", "NodeJournal.put and its thread"
         of_thread: list[float] = []

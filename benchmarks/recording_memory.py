@@ -83,7 +83,7 @@ def generate(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
             journal.append_new_frames(frames.rows(begin, min(begin + BATCH_FRAMES, len(frames))))
         journal.sync()
     journal.close()
-    return {"frames": journal.stored.count, "bytes": journal.size_bytes}
+    return {"frames": journal.stored.number_count, "bytes": journal.size_bytes}
 
 
 def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
@@ -91,7 +91,7 @@ def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
     from service.sessions.inputs import SessionInputs
     from service.sessions.sealing import seal_session
     from storage.journal.journal import Journal
-    from storage.parquet_hash import embed_file_hashes
+    from storage.parquet_hash import fill_hash_placeholders_and_sync
     from storage.sessions import writer as session_file
     from storage.sessions.content_hash import ContentDigest
     from storage.sessions.folder import Part, Session, SessionsFolder
@@ -103,13 +103,13 @@ def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
         def feed(self, table: Any) -> None:
             nonlocal hash_s
             begin = time.perf_counter()
-            super().add_table(table)
+            super().add_table_and_check_order(table)
             hash_s += time.perf_counter() - begin
 
     def timed(path: Path) -> None:
         nonlocal hash_s
         begin = time.perf_counter()
-        embed_file_hashes(path)
+        fill_hash_placeholders_and_sync(path)
         hash_s += time.perf_counter() - begin
 
     vars(session_file).update(ContentDigest=Timed, write_file_hash=timed)

@@ -271,7 +271,7 @@ class ReplayedNode:
             later, later_ns = later + lap_frames, later_ns + lap_ns
 
     def _put(self, batch: EncodedBatch) -> None:
-        self.stream.queue_batch(batch)
+        self.stream.queue_batch_and_record_gap(batch)
         self.publisher.notify_new_frames()
         # What the server has on its disk is let go of: there is no other place for it here.
         self._kept.append(batch.numbers)
@@ -304,7 +304,9 @@ async def _load(played: Played, count: int, server: str, control: Connection) ->
     failed = [each for each in await asyncio.gather(*taking, return_exceptions=True) if each]
     failed = [each for each in failed if not isinstance(each, asyncio.CancelledError)]
     end_s = loop.time() + DRAIN_S
-    while loop.time() < end_s and any(n.stream.acked.count < n.stream.next_seq for n in nodes):
+    while loop.time() < end_s and any(
+        n.stream.acked.number_count < n.stream.next_seq for n in nodes
+    ):
         await asyncio.sleep(0.05)
     cpu_s = time.process_time()
     for task in publishing:
@@ -314,7 +316,7 @@ async def _load(played: Played, count: int, server: str, control: Connection) ->
     said = [text for node in nodes for text in node.said if not text.startswith("connected")]
     return Sent(
         taken=sum(node.stream.next_seq for node in nodes),
-        acknowledged=sum(node.stream.acked.count for node in nodes),
+        acknowledged=sum(node.stream.acked.number_count for node in nodes),
         late_ms=float(np.percentile(late_ms, 99)) if len(late_ms) else float("nan"),
         cpu_s=cpu_s,
         said=(*said, *map(repr, failed)),

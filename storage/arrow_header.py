@@ -43,8 +43,8 @@ class BatchHeader:
     body_bytes: int
 
 
-def read_batch_header(message: pa.ipc.Message) -> BatchHeader:
-    """Parse the header of a message.
+def parse_uncompressed_batch_header(message: pa.ipc.Message) -> BatchHeader:
+    """Parse the header of a record batch; refuse compression and columns of variable length.
 
     Raises:
         HeaderError: it is no record batch, or is compressed or otherwise unlike ours.

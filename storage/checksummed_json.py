@@ -32,7 +32,7 @@ def write_checksummed_json(path: Path, text: bytes, *, mode: int = 0o666) -> Non
     Raises:
         StorageError: the disk is full or not writable; raises as `open_for_atomic_write`.
     """
-    write_atomically(path, append_checksum(text), mode=mode)
+    write_atomically(path, append_json_checksum(text), mode=mode)
 
 
 def read_checksummed_json(path: Path) -> bytes:
@@ -46,10 +46,10 @@ def read_checksummed_json(path: Path) -> bytes:
         DamagedFileError: its checksum is wrong or missing, or it is no file.
         StorageError: it cannot be read now.
     """
-    return parse_checksummed_json(read_small_file(path), where=str(path))
+    return verify_and_strip_json_checksum(read_small_file(path), where=str(path))
 
 
-def parse_checksummed_json(text: bytes, *, where: str) -> bytes:
+def verify_and_strip_json_checksum(text: bytes, *, where: str) -> bytes:
     """Verify the checksum of JSON text and return the text without it.
 
     Raises:
@@ -68,7 +68,7 @@ def parse_checksummed_json(text: bytes, *, where: str) -> bytes:
     raise DamagedFileError(what, where=where, expected="the bytes as they were written")
 
 
-def append_checksum(text: bytes) -> bytes:
+def append_json_checksum(text: bytes) -> bytes:
     """Return the JSON object with its checksum as the last key.
 
     Args:

@@ -142,7 +142,7 @@ def make_temporary_path(path: Path) -> Path:
     return path.with_name(name)
 
 
-def remove_stale_temporaries(folder: Path) -> list[Path]:
+def remove_dead_process_temporaries(folder: Path) -> list[Path]:
     """Delete half-written files of dead processes in a folder tree; return their paths.
 
     Files of living processes stay: they may still be written. If a process number was given to
@@ -155,7 +155,7 @@ def remove_stale_temporaries(folder: Path) -> list[Path]:
     with translate_storage_errors(folder):
         folder.stat()  # fails if the folder is missing, where rglob just finds no files
         for path in sorted(folder.rglob(".*.tmp")):
-            if is_stale_temporary(path.name) and path.is_file():
+            if is_dead_process_temporary(path.name) and path.is_file():
                 path.unlink(missing_ok=True)
                 removed.append(path)
         for parent in {path.parent for path in removed}:
@@ -163,7 +163,7 @@ def remove_stale_temporaries(folder: Path) -> list[Path]:
     return removed
 
 
-def is_stale_temporary(name: str) -> bool:
+def is_dead_process_temporary(name: str) -> bool:
     """Return whether `name` is a temporary file of a process of this machine that has ended."""
     if match := _TEMPORARY.fullmatch(name):
         return _read_start_ticks(int(match["process"])) != int(match["started"])
@@ -322,15 +322,15 @@ _exclusive_locks: dict[Path, int] = {}
 """Folders that this process has locked exclusively, with the locks' descriptors."""
 
 
-def is_still_locked_folder(folder: Path) -> bool:
-    """Return whether `folder` is still the folder that this process has locked.
+def is_locked_folder_in_place(folder: Path) -> bool:
+    """Return whether the folder that this process has locked is still at this path.
 
     It is not if it was moved, deleted or unmounted: files that are open then still accept writes,
     but under another name or none.
     """
     try:
         there, ours = os.stat(folder / LOCK_NAME), os.fstat(_exclusive_locks[folder])
-    except OSError:  # or another thread has just replaced the lock by the new folder's
+    except (KeyError, OSError):  # another thread has just ended or replaced the lock
         return False
     return (there.st_dev, there.st_ino) == (ours.st_dev, ours.st_ino)
 
@@ -342,7 +342,7 @@ def raise_if_locked_folder_gone(path: Path) -> None:
         FolderGoneError: `path` is in a folder that this process has locked, and the folder is gone.
     """
     for folder in list(_exclusive_locks):
-        if path.is_relative_to(folder) and not is_still_locked_folder(folder):
+        if path.is_relative_to(folder) and not is_locked_folder_in_place(folder):
             raise FolderGoneError(
                 "this is not the folder that was opened: it was moved, deleted or unmounted",
                 where=str(folder),
@@ -355,8 +355,8 @@ ASIDE_SUFFIX = ".damaged"
 """Suffix, before a number, of a file that was set aside."""
 
 
-def get_original_name(name: str) -> str:
-    """Return the original name of a set-aside or temporary file."""
+def strip_damaged_or_temporary_marks(name: str) -> str:
+    """Return a file's name without the marks of a set-aside or temporary one, if any."""
     if match := _TEMPORARY.fullmatch(name):
         return match["name"]
     return name.partition(ASIDE_SUFFIX)[0]

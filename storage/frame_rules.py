@@ -34,7 +34,7 @@ ViolationMask = npt.NDArray[np.bool_]
 """Mask of the rows that break a rule."""
 
 
-def find_broken_rule(frames: FrameBatch, info: ArrayInfo) -> str:
+def describe_first_broken_rule(frames: FrameBatch, info: ArrayInfo) -> str:
     """Return a text that names the first broken rule and frame; empty if there is none.
 
     Args:
@@ -90,7 +90,7 @@ def _rules(frames: FrameBatch, info: ArrayInfo) -> Iterator[tuple[str, Violation
         (offset_us > _MAX_SAMPLE_OFFSET_US) | (offset_us < -_MAX_SAMPLE_OFFSET_US),
     )
     yield "servo_age_us is negative", frames.servo_age_us < NO_SERVO_AGE
-    yield "status has undefined bits", (frames.tile_flags & ~np.uint8(_TILE_BITS)) != 0
+    yield "tile_flags has undefined bits", (frames.tile_flags & ~np.uint8(_TILE_BITS)) != 0
     yield (
         "frame_flags has undefined bits",
         (frames.frame_flags & ~np.uint8(_FRAME_BITS)) != 0,

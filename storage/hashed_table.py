@@ -21,7 +21,7 @@ from storage.parquet_hash import (
     HASH_PLACEHOLDER,
     check_file_hash,
     compute_stated_and_actual_hash,
-    embed_hashes,
+    fill_hash_placeholders,
 )
 
 
@@ -48,7 +48,7 @@ def write_hashed_table(
     with pq.ParquetWriter(sink, table.schema, write_page_checksum=True, **options) as file:
         file.write_table(table, row_group_size=max_group_rows)
         file.add_key_value_metadata({FILE_HASH_KEY.decode(): HASH_PLACEHOLDER.decode()})
-    embed_hashes(sink, where=str(path))
+    fill_hash_placeholders(sink, where=str(path))
     write_atomically(path, sink.getvalue())
 
 

@@ -50,7 +50,7 @@ class Intervals:
     __hash__ = None  # type: ignore[assignment]  # it changes
 
     @property
-    def count(self) -> int:
+    def number_count(self) -> int:
         """Number of integers in the set."""
         return sum(last - first + 1 for first, last in self._intervals)
 
@@ -223,7 +223,7 @@ class Losses:
     def __init__(self, pairs: Mapping[str, Iterable[tuple[int, int]]] | None = None) -> None:
         self.by_reason: dict[str, Intervals] = {}
         for reason, intervals in (pairs or {}).items():
-            self.add(Intervals(intervals), reason)
+            self.add_if_new(Intervals(intervals), reason)
 
     def __bool__(self) -> bool:
         return any(self.by_reason.values())
@@ -238,7 +238,7 @@ class Losses:
         """Union of all lost numbers."""
         return union(self.by_reason.values())
 
-    def add(self, numbers: Intervals, reason: str) -> None:
+    def add_if_new(self, numbers: Intervals, reason: str) -> None:
         """Add lost numbers; numbers that already have a reason keep it."""
         if new := numbers - self.numbers:
             self.by_reason[reason] = new | self.by_reason.get(reason, Intervals())

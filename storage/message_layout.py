@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import pyarrow as pa
 
 from devices.errors import FileFormatError
-from storage.arrow_header import HeaderError, read_batch_header
+from storage.arrow_header import HeaderError, parse_uncompressed_batch_header
 from storage.schema import frames_from_record_batch
 
 MAX_MESSAGE_FRAMES = 4096
@@ -57,7 +57,7 @@ def compute_layout(message: pa.ipc.Message, schema: pa.Schema) -> MessageLayout:
         FileFormatError: it has no frames, or too many.
         HeaderError: columns or buffers do not fit that many frames.
     """
-    header = read_batch_header(message)
+    header = parse_uncompressed_batch_header(message)
     rows = header.rows
     if not 0 < rows <= MAX_MESSAGE_FRAMES:
         raise FileFormatError(

@@ -31,7 +31,7 @@ _TAIL = 8
 _BLOCK = 1 << 20
 
 
-def embed_file_hashes(path: Path) -> None:
+def fill_hash_placeholders_and_sync(path: Path) -> None:
     """Fill in the hashes of a Parquet file's footer and bytes, where placeholders stand.
 
     The footer's is optional. The file is on the disk when this returns.
@@ -41,13 +41,13 @@ def embed_file_hashes(path: Path) -> None:
         FileFormatError: the file has no placeholder for its hash.
     """
     with path.open("r+b") as file:
-        embed_hashes(file, where=str(path))
+        fill_hash_placeholders(file, where=str(path))
         file.flush()
         os.fsync(file.fileno())
 
 
-def embed_hashes(file: BinaryIO, *, where: str) -> None:
-    """Fill in the hashes of an open or in-memory Parquet file.
+def fill_hash_placeholders(file: BinaryIO, *, where: str) -> None:
+    """Fill in the hashes of an open or in-memory Parquet file, where placeholders stand.
 
     Raises:
         OSError: it cannot be written.
@@ -100,18 +100,18 @@ def check_file_hash(hashes: tuple[str, str] | None, *, where: str) -> None:
     )
 
 
-def read_footer(path: Path) -> bytes:
+def read_footer_or_empty(path: Path) -> bytes:
     """Return the footer of a Parquet file, without the eight bytes behind it; empty if it has none.
 
     Raises:
         OSError: it cannot be read.
     """
     with path.open("rb") as file:
-        return read_footer_from(file)
+        return read_footer_or_empty_from(file)
 
 
-def read_footer_from(file: BinaryIO) -> bytes:
-    """Read the footer of an open Parquet file, and nothing else of it.
+def read_footer_or_empty_from(file: BinaryIO) -> bytes:
+    """Read only the footer of an open Parquet file; empty if it has none.
 
     Raises:
         OSError: it cannot be read.

@@ -11,8 +11,8 @@ from devices.errors import StorageError
 from devices.text import is_utf8_encodable
 from storage.durable_files import (
     LOCK_NAME,
-    get_original_name,
     make_synced_folder,
+    strip_damaged_or_temporary_marks,
     translate_storage_errors,
 )
 
@@ -28,8 +28,8 @@ _CHMOD_UNSUPPORTED = {
 """Errors of `chmod` on another user's folder, or without permissions, such as vfat and CIFS."""
 
 
-def restrict_to_owner(folder: Path) -> None:
-    """Set umask and folder permissions so that only this user can read the files.
+def set_umask_and_restrict_folder(folder: Path) -> None:
+    """Set the umask, create the folder, and close it to other users if it is only ours.
 
     A folder is closed to others if it is created here, is empty, or holds only files of ours. One
     that its owner has opened to its group only stays so, and the group can read new files.
@@ -68,4 +68,4 @@ def restrict_to_owner(folder: Path) -> None:
 
 def _has_only_our_files(folder: Path) -> bool:
     """Return whether the folder holds only files of ours; a home folder must stay as it is."""
-    return {get_original_name(path.name) for path in folder.iterdir()} <= _OUR_NAMES
+    return {strip_damaged_or_temporary_marks(path.name) for path in folder.iterdir()} <= _OUR_NAMES

@@ -27,7 +27,7 @@ class _PandasBlocker(MetaPathFinder):
         return None
 
 
-def block_pandas_import() -> None:
+def skip_pyarrow_pandas_import() -> None:
     """Make pyarrow's one attempt to import pandas fail; no effect if pandas is loaded already."""
     if "pandas" in sys.modules:
         return

@@ -26,9 +26,9 @@ from devices.frames import (
     ArrayInfo,
     FrameBatch,
 )
-from storage.pyarrow_startup import block_pandas_import
+from storage.pyarrow_startup import skip_pyarrow_pandas_import
 
-block_pandas_import()  # here: every process of ours imports a schema before it makes an array
+skip_pyarrow_pandas_import()  # here: a schema is imported before any array is made
 
 ARRAY_INFO_KEY = b"foottile.array_info"
 ARRAY_HASH_KEY = b"foottile.array_info_sha256"

@@ -21,7 +21,7 @@ _OWNER_ONLY = 0o600
 """File permissions, also in a folder that its owner has opened to a group."""
 
 
-def read_secrets(path: Path) -> dict[str, str]:
+def read_secrets_or_empty(path: Path) -> dict[str, str]:
     """Return the secrets by name, 64 hex digits each; empty if there is no file.
 
     Raises:

@@ -110,5 +110,5 @@ class Decoder:
 
 
 def decode_message(payload: bytes | memoryview, schema: pa.Schema) -> FrameBatch:
-    """Decode a single message; raises as `Decoder.decode_message`."""
+    """Decode a single message; raises as `Decoder.decode`."""
     return Decoder(schema).decode(payload)

@@ -188,7 +188,7 @@ class FrameSender:
         if stream is not None:
             has_failed, damaged = False, Intervals()
             try:
-                found.extend(stream.read_batches(first, last))
+                found.extend(stream.read_overlapping_batches(first, last))
             except DamagedFramesError as error:
                 damaged = Intervals([(error.seq_first, error.seq_last)])
                 self._link.callbacks.on_damaged_frames(stream, damaged)
@@ -240,7 +240,7 @@ class Backlog:
         with self._lock:
             for stream_id, numbers in self._missing:
                 streams[stream_id] = numbers | streams.get(stream_id, Intervals())
-        return sum(numbers.count for numbers in streams.values())
+        return sum(numbers.number_count for numbers in streams.values())
 
     def add_frames(self, stream_id: str, first: int, last: int) -> None:
         """Add frames that could not be sent when they were new."""

@@ -16,15 +16,15 @@ from service.estimation.calibration import Calibration
 from service.server_clock import server_utc_ns
 from service.sessions.creation import continue_session, create_session, split_number
 from service.sessions.part_end import SessionStream, close_at_stream_end, close_unfinished
-from storage.durable_files import remove_stale_temporaries
+from storage.durable_files import remove_dead_process_temporaries
 from storage.intervals import NO_END, Intervals
 from storage.journal.node.journal import NodeJournal
 from storage.journal.node.stream import NodeStream
 from storage.sessions.folder import Part, Session, SessionsFolder
 from storage.sessions.ledger import (
-    adjust_states_to_session,
     compute_ledger,
     group_numbers_by_stream,
+    settle_losses,
 )
 
 
@@ -166,11 +166,9 @@ class LocalRecording:
         session = close_unfinished(session, streams).model_copy(update={"state": "sealing"})
         self._folder.save(session)
         folder = self._folder.get_path(session.id)
-        remove_stale_temporaries(folder)
+        remove_dead_process_temporaries(folder)
         sources = make_inputs(session, streams, load_tares=None, emulated=self._emulated)
-        ledger = compute_ledger(
-            session.parts, adjust_states_to_session(session, streams), is_finished=True
-        )
+        ledger = compute_ledger(session.parts, settle_losses(session, streams), is_finished=True)
         sealed = seal_session(sources, folder, ledger)
         self._folder.save(sealed)
         return sealed
@@ -188,7 +186,7 @@ class LocalRecording:
             needed = {
                 stream.stream_id: Intervals([(0, NO_END)]) for stream in self._journal.streams
             }
-        self._journal.retention_requests.set_local_numbers(needed)
+        self._journal.retention_requests.set_own_session_numbers(needed)
 
 
 def _make_session_stream(stream: NodeStream) -> SessionStream:

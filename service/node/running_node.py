@@ -86,7 +86,7 @@ async def run_node(
         finally:
             await node.close()
     finally:
-        await asyncio.to_thread(journal.close)
+        await asyncio.to_thread(journal.end_streams_and_close)
 
 
 class RunningNode:
@@ -147,11 +147,11 @@ class RunningNode:
                 elif isinstance(message, AcquiredBatch) and self._current_stream is not None:
                     self._store_batch(self._current_stream, message)
             if self._current_stream is not None:
-                self._current_stream.mark_ended()
+                self._current_stream.mark_ended_in_memory()
             await self._wait_for_delivery()
             # A session sealed before all frames are on disk would lack those in flight.
             outcome = NodeOutcome(is_lossy=self._options.session_name is not None)
-            if await asyncio.to_thread(self._journal.wait_until_on_disk):
+            if await asyncio.to_thread(self._journal.wait_for_ended_streams_on_disk):
                 outcome = await asyncio.to_thread(self._make_outcome)
             else:
                 self._report("the disk does not take the last frames: nothing is sealed yet")
@@ -205,13 +205,15 @@ class RunningNode:
         self._report(f"{len(info.tiles)} tiles at {info.nominal_rate_hz:.0f} frames/s")
         for remark in started.startup_messages:
             self._report(remark)
-        self._current_stream = self._journal.begin_stream(info)
+        self._current_stream = self._journal.switch_to_new_stream(info)
         await asyncio.to_thread(self._recording.add_stream, self._current_stream)
         if self._publisher is not None:
             self._publisher.reconnect_for_new_stream()
 
     def _store_batch(self, stream: NodeStream, message: AcquiredBatch) -> None:
-        self._journal.queue_batch(stream, message.encoded_batch, message.missed_slots)
+        self._journal.queue_batch_and_limit_memory(
+            stream, message.encoded_batch, message.missed_slots
+        )
         self._health = message.health
         if self._publisher is not None:
             self._publisher.notify_new_frames()
@@ -230,7 +232,7 @@ class RunningNode:
                 get_secret=ServerSecrets(self._journal.folder, self._report).get_or_create_secret,
                 make_status=self._make_status,
                 on_retention_request=self._on_retention_request,
-                on_damaged_frames=self._journal.report_damage,
+                on_damaged_frames=self._journal.queue_invalidation,
             ),
             token=self._options.token,
             ca_path=self._options.ca_path,
@@ -251,7 +253,7 @@ class RunningNode:
             warnings=(
                 *self._stall_warnings(),
                 *self._health.warnings,
-                *self._journal.warnings,
+                *self._journal.disk_warnings,
                 *(problem[:_PROBLEM_LENGTH] for problem in self._journal.problems[:_PROBLEMS_MAX]),
             ),
             counts={serial: dict(counts) for serial, counts in self._health.fault_counts.items()},
@@ -275,7 +277,7 @@ class RunningNode:
         """Report stalls of acquisition and problems of the disk, and their end."""
         while True:
             await asyncio.sleep(_WARNINGS_INTERVAL_S)
-            warnings = (*self._stall_warnings(), *self._journal.warnings)
+            warnings = (*self._stall_warnings(), *self._journal.disk_warnings)
             kinds = tuple(warning.partition(";")[0] for warning in warnings)
             for kind in kinds:
                 if kind not in self._reported_warnings:
@@ -303,16 +305,18 @@ class RunningNode:
         streams = self._journal.streams
         if counts_unneeded and self._current_stream is not None:
             present = self._current_stream
-            behind = (present.available - present.acked).count
+            behind = (present.available - present.acked).number_count
             return behind + sum(
-                self._journal.undelivered_numbers(stream).count
+                self._journal.available_undelivered_numbers(stream).number_count
                 for stream in streams
                 if stream != present
             )
-        return sum(self._journal.undelivered_numbers(stream).count for stream in streams)
+        return sum(
+            self._journal.available_undelivered_numbers(stream).number_count for stream in streams
+        )
 
     def _seal_earlier_sessions(self) -> None:
-        if self._journal.wait_until_on_disk():
+        if self._journal.wait_for_ended_streams_on_disk():
             self._recording.seal_earlier_sessions()
 
     def _make_outcome(self) -> NodeOutcome:
@@ -320,7 +324,9 @@ class RunningNode:
         lost = 0
         for stream in self._journal.streams:
             wanted = self._journal.retention_requests.required_numbers_of(stream.stream_id)
-            lost += sum(numbers.count for numbers in stream.lost.restricted_to(wanted).values())
+            lost += sum(
+                numbers.number_count for numbers in stream.lost.restricted_to(wanted).values()
+            )
         return NodeOutcome(
             undelivered_frames=self._count_undelivered()
             if self._options.server_url is not None

@@ -12,7 +12,7 @@ from pathlib import Path
 from devices.errors import DamagedFileError, StorageError
 from service.node_identity import generate_secret
 from storage.durable_files import set_aside_and_describe
-from storage.secret_file import SECRETS_NAME, read_secrets, write_secrets
+from storage.secret_file import SECRETS_NAME, read_secrets_or_empty, write_secrets
 
 _SERVERS_MAX = 256
 """Most secrets; the oldest is dropped, as a server's address may answer with ever new ids."""
@@ -50,7 +50,7 @@ class ServerSecrets:
 
     def _read(self) -> dict[str, str]:
         try:
-            return read_secrets(self._path)
+            return read_secrets_or_empty(self._path)
         except DamagedFileError as error:
             self._report_once(
                 f"{set_aside_and_describe(self._path, error)}; servers that know this node refuse "

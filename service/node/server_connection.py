@@ -161,7 +161,7 @@ def make_hello(options: NodeOptions, journal: NodeJournal, present_stream: NodeS
     # Another stream may have begun meanwhile; it has not ended.
     others = list(takewhile(lambda stream: stream is not present_stream, journal.streams))
     # Streams that a session waits for come first, then the newest.
-    waited_for = [stream for stream in others if journal.undelivered_numbers(stream)]
+    waited_for = [stream for stream in others if journal.available_undelivered_numbers(stream)]
     rest = [stream for stream in others if stream not in waited_for]
     chosen = (*waited_for[:_EARLIER_MAX], *rest[-_EARLIER_MAX:])[:_EARLIER_MAX]
     earlier = [stream for stream in others if stream in chosen]
@@ -184,7 +184,9 @@ def make_hello(options: NodeOptions, journal: NodeJournal, present_stream: NodeS
 
 def _read_first_t_ns(stream: NodeStream) -> int:
     journal = stream.journal
-    return (journal.find_t_ns_near(0, is_upper=False) if journal is not None else None) or 0
+    return (
+        journal.find_batch_t_ns_near(0, at_or_before=False) if journal is not None else None
+    ) or 0
 
 
 def _make_earlier_stream(stream: NodeStream) -> EarlierStream:

@@ -207,7 +207,7 @@ def _read_columns(session: SealedFileReader) -> tuple[Columns, Floats]:
         wanted.append("part")
     if session.has_columns(ANGLE_COLUMN):
         wanted.append(ANGLE_COLUMN)
-    pieces = list(session.read_columns(*wanted))
+    pieces = list(session.read_quantities(*wanted))
     if not pieces:
         raise FileFormatError("the session has no frames", where=str(session.path))
     columns = {name: np.concatenate([piece[name] for piece in pieces]) for name in wanted}
@@ -266,7 +266,7 @@ def _compute_server_offset_ns(path: Path, at_ns: int) -> tuple[int, int] | None:
             return None
         wanted = ("t_mono_ns", "t_ns", *(("part",) if session.has_columns("part") else ()))
         nearest: dict[str, npt.NDArray[Any]] | None = None
-        for piece in session.read_columns(*wanted):
+        for piece in session.read_quantities(*wanted):
             piece["axis_ns"] = session.time_axis.shift_to_axis(piece["t_ns"], piece.get("part"))
             row = int(np.argmin(np.abs(piece["axis_ns"] - at_ns)))
             one = {name: values[row : row + 1] for name, values in piece.items()}
@@ -274,7 +274,7 @@ def _compute_server_offset_ns(path: Path, at_ns: int) -> tuple[int, int] | None:
             if nearest is None or apart_ns < abs(int(nearest["axis_ns"][0]) - at_ns):
                 nearest = one
     assert nearest is not None  # noqa: S101  # both have been compared
-    server_times = clock.compute_server_time(
+    server_times = clock.compute_server_time_columns(
         nearest["t_mono_ns"], nearest["t_ns"], nearest.get("part")
     )
     server_ns = int(server_times["t_server_ns"][0])

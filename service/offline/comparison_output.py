@@ -24,7 +24,7 @@ from storage.sessions.comparisons import (
     REPORT_NAME,
     SERIES_NAME,
     SERIES_SCHEMA,
-    write_series,
+    write_comparison_series,
 )
 
 _MISSING_FIGURE_HINTS = {
@@ -103,7 +103,7 @@ def write_comparison(
     write_atomically(folder / "compare.md", text.encode())
     write_atomically(folder / "compare.png", png)
     if len(found.pairs.t_s) <= MAX_SERIES_ROWS:
-        write_series(folder / SERIES_NAME, _build_series(found.pairs))
+        write_comparison_series(folder / SERIES_NAME, _build_series(found.pairs))
     else:  # of an earlier comparison
         (folder / SERIES_NAME).unlink(missing_ok=True)
     return WrittenComparison(content, text, missed)

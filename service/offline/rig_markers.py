@@ -53,8 +53,8 @@ def read_rig_programme(session: SealedFileReader) -> RigProgramme | None:
         return None
     clock = load_clock_table(session)
     pieces = [
-        clock.compute_server_time(piece["t_mono_ns"], piece["t_ns"], None)["t_server_ns"]
-        for piece in session.read_columns("t_mono_ns", "t_ns")
+        clock.compute_server_time_columns(piece["t_mono_ns"], piece["t_ns"], None)["t_server_ns"]
+        for piece in session.read_quantities("t_mono_ns", "t_ns")
     ]
     t_server_ns = np.concatenate(pieces)
     if (t_server_ns == UNKNOWN_T_NS).any():

@@ -30,7 +30,7 @@ from service.rig.array_info import make_array_info
 from service.rig.frame_rate import FrameRateMonitor, estimate_undisturbed_rate_hz
 from service.rig.load_trigger import LoadTrigger
 from service.rig.options import RigOptions
-from storage.journal.node.in_flight import InFlightWriter, create_in_flight_writer
+from storage.journal.node.in_flight import InFlightWriter, try_create_in_flight_writer
 
 if TYPE_CHECKING:
     from devices.emulation.world import World
@@ -158,7 +158,7 @@ class Rig:
             self._in_flight.close()
         streams = self._options.journals_folder
         folder = None if streams is None else streams / self.info.stream_id
-        self._in_flight = create_in_flight_writer(folder, self.info)
+        self._in_flight = try_create_in_flight_writer(folder, self.info)
         if folder is not None and self._in_flight is None:
             self.startup_messages.append(
                 "no room for frames in flight: a crash may cost the last batches"

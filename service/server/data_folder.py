@@ -10,7 +10,7 @@ from pathlib import Path
 
 from devices.errors import DamagedFileError, FolderGoneError
 from storage.durable_files import (
-    is_still_locked_folder,
+    is_locked_folder_in_place,
     lock_folder,
     make_synced_folder,
     set_aside_and_describe,
@@ -65,7 +65,7 @@ class DataFolder:
             FolderGoneError: it is not; the error names the folder that is there now.
             StorageError: that cannot be checked, or the id not be read.
         """
-        if is_still_locked_folder(self.path):
+        if is_locked_folder_in_place(self.path):
             return
         with translate_storage_errors(self.path, _REMEDY):
             place = self._describe_path()
@@ -85,7 +85,7 @@ class DataFolder:
             FolderGoneError: no folder with its id is there.
             StorageError: another server has locked it.
         """
-        if is_still_locked_folder(self.path) or self._read_id_at_path() != self.id:
+        if is_locked_folder_in_place(self.path) or self._read_id_at_path() != self.id:
             self.check_still_in_place()
             return
         lock = self._acquire_lock()

@@ -14,7 +14,7 @@ from devices.errors import ChangedError, DamagedFileError, StateError, StorageEr
 from service.node_identity import compute_fingerprint, generate_secret, is_proof_valid
 from service.protocol import PROTOCOL, Challenge, CloseConnection, LinkCloseCode, Proof
 from storage.durable_files import set_aside_and_describe
-from storage.secret_file import SECRETS_NAME, read_secrets, write_secrets
+from storage.secret_file import SECRETS_NAME, read_secrets_or_empty, write_secrets
 
 log = logging.getLogger("foottile.nodes")
 
@@ -82,7 +82,7 @@ class NodeIdentities:
         """
         path = self._path(node)
         try:
-            return read_secrets(path).get(node)
+            return read_secrets_or_empty(path).get(node)
         except DamagedFileError as error:
             # The true node sends it again. Otherwise a flipped bit would lock it out.
             self.problems.append(

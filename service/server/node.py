@@ -140,17 +140,17 @@ class ServerNode:
     @property
     def backlog_frames(self) -> int:
         """Number of missing frames that the node can still send."""
-        return (self.present_stream_missing & self.present_stream.obtainable).count
+        return (self.present_stream_missing & self.present_stream.obtainable).number_count
 
     @property
     def present_stream_lost_by_reason(self) -> dict[str, int]:
         """Number of lost frames of the present stream, by reason; unexplained: node_restarted."""
         unobtainable = self.present_stream_missing - self.present_stream.obtainable
         named = {
-            why: lost.count
+            why: lost.number_count
             for why, lost in self.present_stream.lost.restricted_to(unobtainable).items()
         }
-        if unnamed := unobtainable.count - sum(named.values()):
+        if unnamed := unobtainable.number_count - sum(named.values()):
             named[NODE_RESTARTED] = named.get(NODE_RESTARTED, 0) + unnamed
         return named
 

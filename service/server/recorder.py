@@ -317,7 +317,7 @@ class Recorder:
                     and stream.clock_offset is not None
                     and (stream.clock_offset.t_mono_ns > max(times_ns, default=-1))
                 ):
-                    session = session.with_clock_rows(stream.read_clock_offsets())
+                    session = session.with_newer_clock_rows(stream.read_clock_offsets())
         except StorageError as error:  # frames matter more than clock measurements
             log.warning("session %s: %s", session.id, error)
         return session

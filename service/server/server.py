@@ -31,7 +31,7 @@ from service.server.weighings import Weighings
 from service.server_clock import server_utc_ns
 from service.sessions.comparison_series import ComparisonSeriesCache
 from service.sessions.preview import SessionPreviews
-from storage.durable_files import remove_stale_temporaries
+from storage.durable_files import remove_dead_process_temporaries
 from storage.intervals import Intervals
 from storage.sessions.folder import Session, SessionsFolder
 
@@ -97,7 +97,7 @@ class Server:
         self._nodes_with_storage_error: set[str] = set()
         """Nodes whose storage error has been reported."""
         try:
-            remove_stale_temporaries(data)
+            remove_dead_process_temporaries(data)
             self.check_writable()
             self.broadcaster = Broadcaster()
             self.calibrations = CalibrationStore(data / "calibrations")

@@ -28,9 +28,9 @@ from storage.clock.log import ClockOffset
 from storage.intervals import NO_END, Intervals
 from storage.sessions.folder import Ledger, Part, Session
 from storage.sessions.ledger import (
-    adjust_states_to_session,
     compute_ledger,
     group_numbers_by_stream,
+    settle_losses,
 )
 
 _UNSENT_NS = 1_000_000_000
@@ -60,9 +60,9 @@ def make_initial_part(node: ServerNode, last_seq: int, last_t_ns: int, pre_roll_
     seq_first, journal = last_seq + 1, node.journal
     if pre_roll_s > 0 and journal is not None:
         since_t_ns = last_t_ns - round(pre_roll_s * 1e9)
-        reached = journal.find_first_seq_since(since_t_ns)
+        reached = journal.find_first_batch_seq_since(since_t_ns)
         seq_first = min(seq_first, reached if reached is not None else seq_first)
-        reached_t_ns = journal.find_t_ns_near(seq_first, is_upper=False)
+        reached_t_ns = journal.find_batch_t_ns_near(seq_first, at_or_before=False)
         if reached_t_ns is not None and reached_t_ns > since_t_ns:
             back = round((reached_t_ns - since_t_ns) * 1e-9 * node.last_info.nominal_rate_hz)
             coming = node.present_stream_missing & node.present_stream.obtainable
@@ -172,7 +172,7 @@ def iterate_needed_parts(session: Session, node: ServerNode | None) -> Iterator[
 def list_clock_offsets_since(node: ServerNode, part: Part) -> tuple[ClockOffset, ...]:
     """Return the present stream's clock measurements since a part begins, and the last before."""
     begin_t_ns = (
-        journal.find_t_ns_near(part.seq_first, is_upper=False)
+        journal.find_batch_t_ns_near(part.seq_first, at_or_before=False)
         if (journal := node.journal)
         else None
     )
@@ -229,7 +229,7 @@ def _later_streams(session: Session, node: ServerNode) -> Iterable[str]:
     if stream_id in order:
         return order[order.index(stream_id) + 1 :]
     # Hello no longer lists it: streams that began after its last frame are later.
-    newest = make_session_streams(session, node)[stream_id].find_t_ns_near(
+    newest = make_session_streams(session, node)[stream_id].find_batch_t_ns_near(
         NO_END, at_or_before=True
     )
 
@@ -292,7 +292,7 @@ def _began_before_stop(session: Session, node: ServerNode, stream_id: str) -> bo
     oldest = next(iter(stream.stored), None)
     if oldest is None or journal is None or offset_ns is None:
         return None
-    taken_t_ns = journal.find_t_ns_near(oldest[0], is_upper=False)
+    taken_t_ns = journal.find_batch_t_ns_near(oldest[0], at_or_before=False)
     if taken_t_ns is None:
         return None
     if taken_t_ns + offset_ns <= stop_t_ns:
@@ -308,9 +308,7 @@ def current_ledger(session: Session, node: ServerNode | None) -> Ledger:
         return session.ledger
     finished = session.stopped_t_ns is not None and session.parts[-1].seq_last is not None
     likely, streams = _with_likely_end(session, node)
-    return compute_ledger(
-        likely.parts, adjust_states_to_session(likely, streams), is_finished=finished
-    )
+    return compute_ledger(likely.parts, settle_losses(likely, streams), is_finished=finished)
 
 
 def current_inputs(session: Session, node: ServerNode, *, exact: bool = False) -> SessionInputs:

@@ -17,7 +17,7 @@ from service.protocol import ClockSample, EarlierStream, Hello, SeqIntervalsByRe
 from service.server.stream_limit import StreamLimit
 from service.sessions.part_end import SessionStream, find_seqs_around
 from storage.clock.log import ClockLog, ClockOffset
-from storage.frame_rules import find_broken_rule
+from storage.frame_rules import describe_first_broken_rule
 from storage.intervals import CORRUPT, NO_END, REFUSED, Intervals, Losses
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
@@ -79,7 +79,7 @@ class ServerStream:
             FileFormatError: nothing in its folder is readable.
             StorageError: it cannot be read.
         """
-        journal = Journal.open(folder, is_write_deferred=True)
+        journal = Journal.open_and_recover(folder, is_write_deferred=True)
         stream = cls(folder, journal.info)
         stream.journal = journal
         stream.problems = list(journal.problems)
@@ -91,7 +91,7 @@ class ServerStream:
             stream.missed_slots = notes.missed_slots
             stream._refused = Intervals(notes.lost.get(REFUSED, ()))
         with suppress(StorageError):
-            lines = stream._clock_log.read_content()
+            lines = stream._clock_log.read_rows_and_damage()
             stream.clock_offsets.extend(lines.rows)
             if lines.damaged_lines:
                 log.warning("%s: %d damaged clock rows are left out", folder, lines.damaged_lines)
@@ -119,7 +119,7 @@ class ServerStream:
         Raises:
             StorageError: the log cannot be read.
         """
-        return self._clock_log.read_rows()
+        return self._clock_log.read_undamaged_rows()
 
     def record_clock_offset(self, row: ClockSample) -> None:
         """Record a measurement of the node's clock.
@@ -149,7 +149,7 @@ class ServerStream:
         lost = Losses(self.notes.lost)
         if self.journal is not None:
             for reason, numbers in self.journal.lost.by_reason.items():
-                lost.add(numbers - self.obtainable, reason)
+                lost.add_if_new(numbers - self.obtainable, reason)
         return lost
 
     def make_session_stream(self, offset_ns: int | None) -> SessionStream:
@@ -193,7 +193,7 @@ class ServerStream:
                 last < min_seq or stored.restricted_to(last, last)
             )
             missing = stored.missing_in(last + 1, after - 1) if after > last + 1 else Intervals()
-            none_came = missing.count == after - last - 1
+            none_came = missing.number_count == after - last - 1
             if ends and (none_came or (wait_for_missing and missing & self.obtainable)):
                 return found
         found = find_seqs_around(self.journal, t_ns, min_seq=min_seq)
@@ -250,7 +250,7 @@ class ServerStream:
         """Retire the stream, which hello lacks: nothing more will come; the next sync closes it."""
         self.node_ranges = Intervals()
         if self.journal is not None:
-            self.journal.retire_open_segments()
+            self.journal.close_segments_at_next_sync()
 
     def set_node_losses(self, lost: SeqIntervalsByReason) -> None:
         """Replace the losses that the node has reported for this stream."""
@@ -260,7 +260,7 @@ class ServerStream:
         )
 
     def check_or_refuse_frames(self, frames: FrameBatch, now_t_ns: int) -> str:
-        """Check received frames; those that break a rule are lost as refused: never request them.
+        """Check received frames; frames that break a rule are lost and never requested again.
 
         Args:
             frames: of one message.
@@ -276,7 +276,7 @@ class ServerStream:
         """
         first, last = int(frames.seq[0]), int(frames.seq[-1])
         end = self.notes.next_seq
-        wrong = find_broken_rule(frames, self.info)
+        wrong = describe_first_broken_rule(frames, self.info)
         if not wrong and self.limit is not None:
             ahead = self.limit.find_violation(frames, now_t_ns)
             if ahead:
@@ -284,7 +284,7 @@ class ServerStream:
         if not wrong and end is not None and last >= end:
             wrong = f"the stream has ended with frame {end - 1}"
         if not wrong and self.journal is not None:
-            wrong = self.journal.find_time_conflict(frames)
+            wrong = self.journal.describe_time_conflict(frames)
         if wrong:
             refused = Intervals([(first, last)]) - self.stored
             self._refused = self._refused | refused
@@ -332,21 +332,21 @@ class ServerStream:
     def needs_sync(self) -> bool:
         """True if anything has to be synced or acknowledged."""
         unsaved = self._current_notes != self._notes_on_disk and self.journal is not None
-        closing = self.journal is not None and self.journal.has_closing_segment
+        closing = self.journal is not None and self.journal.has_segment_to_close
         return bool(self.unsynced or self.unacked or unsaved or self._is_clock_unsynced or closing)
 
     @property
     def has_open_files(self) -> bool:
         """True if a file of the stream is open."""
-        return self.journal is not None and self.journal.has_open_segment
+        return self.journal is not None and self.journal.has_unclosed_segment
 
     def invalidate(self, frames: Intervals, *, are_corrupt: bool = False) -> None:
         """Remove frames from the stored ones: the disk may not have them."""
         if self.journal is None:
             return
-        self.journal.invalidate(frames)
+        self.journal.invalidate_whole_batches(frames)
         if are_corrupt:
-            self.journal.lost.add(frames - self.stored, CORRUPT)
+            self.journal.lost.add_if_new(frames - self.stored, CORRUPT)
 
     def delete_older(self, before_t_ns: int, keep: Intervals) -> None:
         """Delete frames older than `before_t_ns` and not in `keep`.
@@ -385,7 +385,7 @@ class ServerStream:
         self, lost: SeqIntervalsByReason, *, next_seq: int | None, max_lost_tail_frames: int = 0
     ) -> None:
         losses = Losses(lost)
-        losses.add(self._refused, REFUSED)
+        losses.add_if_new(self._refused, REFUSED)
         self.notes = StreamNotes(
             array_info=self.info,
             next_seq=next_seq,

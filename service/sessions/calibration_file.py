@@ -11,8 +11,8 @@ from devices.input_files import decode_text
 from service.estimation.calibration import EDITED_REMEDY, Calibration
 from storage.checksummed_json import (
     CHECKSUM_KEY,
-    append_checksum,
-    parse_checksummed_json,
+    append_json_checksum,
+    verify_and_strip_json_checksum,
     write_checksummed_json,
 )
 
@@ -29,7 +29,7 @@ def parse_calibration(content: bytes, *, where: str) -> Calibration:
         content = decode_text(content).encode()  # encodings of editors
     try:
         if f'"{CHECKSUM_KEY}"'.encode() in content:
-            content = parse_checksummed_json(content, where=where)
+            content = verify_and_strip_json_checksum(content, where=where)
         else:  # by hand; a deleted line leaves the comma before it
             content = _LAST_COMMA.sub(b"\n}", content)
     except DamagedFileError as error:
@@ -47,7 +47,7 @@ def make_calibration_error(what: str, where: str) -> CalibrationError:
 
 def encode_calibration(calibration: Calibration) -> bytes:
     """Return all bytes of a calibration's file."""
-    return append_checksum(calibration.to_json().encode())
+    return append_json_checksum(calibration.to_json().encode())
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:

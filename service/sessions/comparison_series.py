@@ -17,11 +17,11 @@ from storage.formats.slice import Slice
 from storage.schema import Array
 from storage.sessions.comparisons import (
     SERIES_NAME,
-    read_series,
-    read_series_footer,
-    read_series_range,
+    read_comparison_series,
+    read_comparison_series_footer,
+    read_comparison_series_range,
 )
-from storage.sessions.footer import read_file_stamps
+from storage.sessions.footer import read_file_stamps_or_empty
 from storage.sessions.pyramid import (
     BINS_PER_COARSER_BIN,
     FRAMES_PER_FINEST_BIN,
@@ -49,7 +49,7 @@ class ComparisonSeries:
     """
 
     def __init__(self, folder: Path, table: pa.Table) -> None:
-        self._folder, self._footer = folder, read_series_footer(folder)
+        self._folder, self._footer = folder, read_comparison_series_footer(folder)
         steps = np.diff(table["t_ns"].to_numpy())
         self._gap_ns = GAP_STEPS * float(np.median(steps)) if len(steps) else np.inf
         frames = _make_bins(table, self._gap_ns)
@@ -79,7 +79,9 @@ class ComparisonSeries:
             found = _slice_bins(self._levels[above], *bounds_ns)
             if len(found["frames"]) >= min_bins:
                 return found, FRAMES_PER_FINEST_BIN * BINS_PER_COARSER_BIN**above
-        bins = _make_bins(read_series_range(self._folder, self._footer, *bounds_ns), self._gap_ns)
+        bins = _make_bins(
+            read_comparison_series_range(self._folder, self._footer, *bounds_ns), self._gap_ns
+        )
         size = 1
         while len(bins["frames"]) // (size * BINS_PER_COARSER_BIN) >= min_bins:
             size *= BINS_PER_COARSER_BIN
@@ -102,10 +104,10 @@ class ComparisonSeriesCache:
         """
         path = folder / SERIES_NAME
         with self._one_at_a_time:
-            stamps = read_file_stamps(path)
+            stamps = read_file_stamps_or_empty(path)
             cached = self._entries.pop(path, None)
             if cached is None or cached[0] != stamps:
-                table = read_series(folder)
+                table = read_comparison_series(folder)
                 if table is None:
                     return None
                 cached = stamps, ComparisonSeries(folder, table)

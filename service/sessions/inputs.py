@@ -18,7 +18,7 @@ from storage.clock.table import ClockTable, StreamClockFacts, group_rows_by_stre
 from storage.intervals import NO_END
 from storage.journal.journal import Journal
 from storage.sessions.folder import Session
-from storage.sessions.ledger import adjust_states_to_session, find_lost_numbers
+from storage.sessions.ledger import find_lost_numbers, settle_losses
 from storage.sessions.time_axis import NODE_AXIS, PartSpan, TimeAxis, compute_time_axis
 
 
@@ -124,7 +124,7 @@ def make_inputs(
         in_force, problem = _tares_during(session, streams, load_tares(), info)
     notes: dict[str, object] = {
         "scene": session.scene_content,
-        "lost": find_lost_numbers(session.parts, adjust_states_to_session(session, streams)),
+        "lost": find_lost_numbers(session.parts, settle_losses(session, streams)),
     }
     if emulated is not None:
         notes["emulated"] = emulated
@@ -163,8 +163,8 @@ def _tares_during(
     """
     first, last = session.parts[0], session.parts[-1]
     seq_last = last.seq_last if last.seq_last is not None else NO_END
-    begin_t_ns = streams[first.stream_id].find_t_ns_near(first.seq_first, at_or_before=False)
-    end_t_ns = streams[last.stream_id].find_t_ns_near(seq_last, at_or_before=True)
+    begin_t_ns = streams[first.stream_id].find_batch_t_ns_near(first.seq_first, at_or_before=False)
+    end_t_ns = streams[last.stream_id].find_batch_t_ns_near(seq_last, at_or_before=True)
     if begin_t_ns is None or end_t_ns is None:
         return (), None
     tares = history.tares_in_force_between(info, begin_t_ns, end_t_ns)

@@ -32,7 +32,7 @@ from storage.sessions.pyramid import (
     PyramidBuilder,
     bin_column_types,
     concatenate_bins,
-    make_frame_bins,
+    make_single_frame_bins,
     merge_bins,
     required_frame_columns,
     shift_bins_to_axis,
@@ -183,8 +183,8 @@ def _bins_from_frames(
     types = bin_column_types(len(session.info.tiles), has_estimates=estimated)
     found: list[Bins] = [{name: np.empty(0, type_) for name, type_ in types.items()}]
     last: tuple[int, int] | None = None
-    groups = session.find_row_groups(*part.compute_bounds_ns(begin_ns))
-    for piece in session.read_columns(*names, row_groups=groups, max_values=_VALUES_MAX):
+    groups = session.find_overlapping_row_groups(*part.compute_bounds_ns(begin_ns))
+    for piece in session.read_quantities(*names, row_groups=groups, max_values=_VALUES_MAX):
         inside = part.compute_row_mask(
             session.time_axis.shift_to_axis(piece["t_ns"], piece.get("part")), begin_ns
         )
@@ -193,7 +193,7 @@ def _bins_from_frames(
             continue
         first_part = int(frames["part"][0]) if "part" in frames else 0
         before = last[1] if last is not None and last[0] == first_part else None
-        found.append(make_frame_bins(frames, before))
+        found.append(make_single_frame_bins(frames, before))
         last = int(frames["part"][-1]) if "part" in frames else 0, int(frames["seq"][-1])
     bins = shift_bins_to_axis(
         concatenate_bins([{name: piece[name] for name in types} for piece in found]),
@@ -205,7 +205,9 @@ def _bins_from_frames(
 def _build_pyramid(session: SealedFileReader) -> PyramidBuilder:
     pyramid = PyramidBuilder()
     names = required_frame_columns(has_estimates=session.has_columns("grf_n"))
-    for piece in session.read_columns(*names, *(("part",) if session.has_columns("part") else ())):
+    for piece in session.read_quantities(
+        *names, *(("part",) if session.has_columns("part") else ())
+    ):
         pyramid.add_frames(piece)
     return pyramid
 

@@ -53,10 +53,10 @@ class SessionStream(StreamState):
     offset_ns: int | None = None
     last_seen_t_ns: int | None = None
 
-    def find_t_ns_near(self, seq: int, *, at_or_before: bool) -> int | None:
+    def find_batch_t_ns_near(self, seq: int, *, at_or_before: bool) -> int | None:
         """Return the node's time of the newest frame up to `seq` or the oldest from it, or None."""
         return (
-            self.journal.find_t_ns_near(seq, is_upper=at_or_before)
+            self.journal.find_batch_t_ns_near(seq, at_or_before=at_or_before)
             if self.journal is not None
             else None
         )
@@ -79,7 +79,7 @@ def find_seqs_around(
     Raises:
         DamagedFramesError: the frames at that time are damaged.
     """
-    last = journal.find_last_seq_until(t_ns, min_seq=min_seq)
+    last = journal.find_last_seq_once_passed(t_ns, min_seq=min_seq)
     if last is None:
         return None
     # If the clock steps back, frames after that time may have lower numbers than earlier ones.
@@ -157,7 +157,9 @@ def close_unfinished(session: Session, streams: Streams, now_t_ns: int | None = 
     session = close_at_stream_end(close_at_stop(session, streams), streams, now_t_ns)
     if session.stopped_t_ns is None:
         stream = streams[session.parts[-1].stream_id]
-        newest_t_ns = stream.find_t_ns_near(session.parts[-1].seq_last or 0, at_or_before=True)
+        newest_t_ns = stream.find_batch_t_ns_near(
+            session.parts[-1].seq_last or 0, at_or_before=True
+        )
         stopped_t_ns = session.started_t_ns
         if newest_t_ns is not None:
             stopped_t_ns = newest_t_ns + (stream.offset_ns or 0)
@@ -201,7 +203,7 @@ def _seq_at_stop(
     if waiting and stream.obtainable & Intervals([(last + 1, after - 1)]):
         return None
     # The stop lies among lost frames: the rate gives the number of those after it.
-    after_t_ns = stream.find_t_ns_near(after, at_or_before=False) or stop_t_ns
+    after_t_ns = stream.find_batch_t_ns_near(after, at_or_before=False) or stop_t_ns
     late = math.ceil((after_t_ns - stop_t_ns) * 1e-9 * _rate_hz(stream))
     return min(after - 1, max(last, after - late))
 
@@ -215,7 +217,10 @@ def _max_unsent_frames(session: Session, stream: SessionStream, now_t_ns: int | 
     if not limits_ns:
         return bound_lost_tail_frames(stream)
     # Arrival times of delayed frames are too late.
-    newest_t_ns, seen_t_ns = stream.find_t_ns_near(NO_END, at_or_before=True), stream.last_seen_t_ns
+    newest_t_ns, seen_t_ns = (
+        stream.find_batch_t_ns_near(NO_END, at_or_before=True),
+        stream.last_seen_t_ns,
+    )
     if newest_t_ns is not None and (stream.offset_ns is not None or seen_t_ns is None):
         seen_t_ns = newest_t_ns + (stream.offset_ns or 0)
     silent_s = (min(limits_ns) - (seen_t_ns or session.started_t_ns)) / 1e9

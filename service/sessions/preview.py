@@ -113,7 +113,7 @@ class SessionPreview:
     def rewind_to_valid_checkpoint(self, inputs: SessionInputs) -> None:
         """Drop everything after the last valid checkpoint."""
         all_, true = self.checkpoints.checkpoints, self.valid_checkpoints(inputs)
-        kept_frames = self._bins.truncate(true[-1].estimated_frames)
+        kept_frames = self._bins.truncate_to_full_bins(true[-1].estimated_frames)
         # Repeat one frame at least: its number shows whether the next one follows it.
         index = max(
             0, bisect_left(true, max(kept_frames, 1), key=lambda place: place.estimated_frames) - 1
@@ -169,9 +169,9 @@ class SessionPreview:
         for estimated, columns in due:
             fields = {name: getattr(estimated, name) for name in names if name not in columns}
             fields |= {name: columns[name] for name in (*names, "part") if name in columns}
-            self._repeated_frames -= self._bins.add_frames(
-                fields, already_added=self._repeated_frames
-            )
+            repeated = min(self._repeated_frames, len(estimated))
+            self._bins.add_frames(fields, already_added=repeated)
+            self._repeated_frames -= repeated
             self.checkpoints.extend_newest_span(estimated.t_ns)
             position.estimated_frames += len(estimated)
             position.last_estimated = int(columns["part"][-1]), int(estimated.t_ns[-1])
@@ -206,7 +206,7 @@ class SessionPreview:
             ends += [each.seq_last] if each.seq_last is not None else []
             last = min(ends, default=-1)
             if journal is not None and last >= each.seq_first:
-                stored_frames += journal.stored.restricted_to(each.seq_first, last).count
+                stored_frames += journal.stored.restricted_to(each.seq_first, last).number_count
         return stored_frames == checkpoint.fed_frames
 
 

@@ -119,7 +119,8 @@ class PreviewFrames:
             for index, part in enumerate(self._inputs.session.parts)
             if index >= number
             and (journal := self._inputs.journals.get(part.stream_id)) is not None
-            and (t_ns := journal.find_t_ns_near(part.seq_first, is_upper=False)) is not None
+            and (t_ns := journal.find_batch_t_ns_near(part.seq_first, at_or_before=False))
+            is not None
         ]
         return min(begins, default=NO_END)
 

@@ -34,15 +34,15 @@ from service.sessions.sealing import seal_session
 from service.sessions.session_rebuild import rebuild_session
 from service.sessions.tares import TareHistory
 from storage.clock.log import ClockLog
-from storage.durable_files import remove_stale_temporaries, set_aside_damaged
+from storage.durable_files import remove_dead_process_temporaries, set_aside_damaged
 from storage.intervals import NO_END, Intervals
 from storage.journal.node.journal import recover_node_journals
 from storage.journal.segment import UNREAD_SUFFIX
 from storage.sessions.folder import Ledger, Part, Session, SessionsFolder, make_session_id
 from storage.sessions.ledger import (
-    adjust_states_to_session,
     compute_ledger,
     group_numbers_by_stream,
+    settle_losses,
 )
 from storage.sessions.sidecars import MARKERS_NAME, read_markers, write_markers
 from storage.verify.session import verify_session
@@ -132,7 +132,7 @@ def recover_folder(
     """
     recovery = RecoveryReport()
     sessions = SessionsFolder(data / "sessions")
-    recovery.removed_temporaries += remove_stale_temporaries(data)
+    recovery.removed_temporaries += remove_dead_process_temporaries(data)
     before = _find_cut_files(data)
     if _is_node_folder(data):
         recover_node_journals(data)  # frames in flight of a killed node
@@ -186,7 +186,9 @@ def _seal_if_possible(
     for stream in own_streams.values():
         if stream is not None:
             with suppress(StorageError):  # frames matter more than clock measurements
-                session = session.with_clock_rows(ClockLog(stream.journal.folder).read_rows())
+                session = session.with_newer_clock_rows(
+                    ClockLog(stream.journal.folder).read_undamaged_rows()
+                )
     is_local, abandon_missing = _is_node_folder(data), abandon_missing or session.given_up
     session = _close_parts(session, own_streams, is_local=is_local, abandon_missing=abandon_missing)
     if any(part.seq_last is None for part in session.parts):
@@ -197,9 +199,7 @@ def _seal_if_possible(
             stream.read_and_invalidate_damaged(part.seq_first, part.seq_last)
             stream.save_damage()
     streams = _find_streams(session, own_streams, is_local=is_local)
-    ledger = compute_ledger(
-        session.parts, adjust_states_to_session(session, streams), is_finished=True
-    )
+    ledger = compute_ledger(session.parts, settle_losses(session, streams), is_finished=True)
     if pending := ledger.pending:
         text = f"{pending} frames may still come from node {session.node}"
         return RecoveredSession(session, "waiting", text, ledger)
@@ -250,9 +250,9 @@ def _invalidate(streams: Iterable[OpenedStream | None], error: DamagedFramesErro
     """
     for stream in streams:
         if stream is not None and stream.journal.folder == Path(error.where).parent:
-            before = stream.journal.stored.count
+            before = stream.journal.stored.number_count
             stream.read_and_invalidate_damaged(error.seq_first, error.seq_last)
-            if stream.journal.stored.count < before:
+            if stream.journal.stored.number_count < before:
                 return
     raise error
 
@@ -300,8 +300,8 @@ def _make_sessions(
                 id=make_session_id(now()),
                 node=node,
                 state="sealing",
-                started_t_ns=journal.find_t_ns_near(first, is_upper=False) or 0,
-                stopped_t_ns=journal.find_t_ns_near(last, is_upper=True),
+                started_t_ns=journal.find_batch_t_ns_near(first, at_or_before=False) or 0,
+                stopped_t_ns=journal.find_batch_t_ns_near(last, at_or_before=True),
             )
             session = session.model_copy(update={"calibration": hello.get("calibration")})
             if last == journal.stored.last and (

@@ -13,7 +13,7 @@ from devices.errors import DamagedFramesError, FileFormatError
 from devices.text import escape_control_chars
 from service.sessions.part_end import SessionStream, find_seqs_around
 from storage.checksummed_json import read_checksummed_json
-from storage.durable_files import ASIDE_SUFFIX, remove_stale_temporaries
+from storage.durable_files import ASIDE_SUFFIX, remove_dead_process_temporaries
 from storage.intervals import CORRUPT, NO_END, Intervals, Losses
 from storage.journal.journal import Journal
 from storage.journal.segment import SUFFIX
@@ -43,7 +43,7 @@ class OpenedStream:
         """Frames that cannot come any more, by reason."""
         lost = Losses(self.notes.lost if self.notes is not None else None)
         if self.is_node_folder:
-            lost.add(self.damaged, CORRUPT)
+            lost.add_if_new(self.damaged, CORRUPT)
         lost.remove(self.journal.stored)
         return lost
 
@@ -97,11 +97,11 @@ class OpenedStream:
         seq = first_seq
         while seq <= last_seq:
             try:
-                for _ in self.journal.read_messages(seq, last_seq):
+                for _ in self.journal.read_overlapping_messages(seq, last_seq):
                     pass
             except DamagedFramesError as error:
                 damaged = Intervals([(error.seq_first, error.seq_last)])
-                self.journal.invalidate(damaged)
+                self.journal.invalidate_whole_batches(damaged)
                 self.damaged = self.damaged | (damaged - self.journal.stored)
                 seq = error.seq_last + 1
             else:
@@ -132,9 +132,9 @@ def open_and_mend_streams(
         ):
             continue
         report_step(f"journal {folder.parent.name}/{folder.name}")
-        remove_stale_temporaries(folder)
+        remove_dead_process_temporaries(folder)
         try:
-            journal = Journal.open(folder)
+            journal = Journal.open_and_recover(folder)
             problems += journal.problems
             notes = StreamNotes.load_or_set_aside(folder, problems)
         except FileFormatError as error:

@@ -80,8 +80,8 @@ def overlay_stances(
         begins_ns, ends_ns = (
             session.time_axis.shift_to_axis(t_ns, part) for t_ns in (begin_ns, end_ns)
         )
-        groups = session.find_row_groups(int(begins_ns.min()), int(ends_ns.max()) + 1)
-        for piece in session.read_columns(*names, row_groups=groups):
+        groups = session.find_overlapping_row_groups(int(begins_ns.min()), int(ends_ns.max()) + 1)
+        for piece in session.read_quantities(*names, row_groups=groups):
             gathered.add_frames(piece["t_ns"].astype(np.int64), piece)
     overlay = gathered.build_overlay()
     return SessionOverlay(

@@ -146,7 +146,7 @@ def compute_stances(session: SealedFileReader) -> pa.Table:
         )
     names = (*STANCE_INPUT_COLUMNS, "part") if session.has_columns("part") else STANCE_INPUT_COLUMNS
     found = StancesWriter()
-    for columns in session.read_columns("seq", "t_ns", *names):
+    for columns in session.read_quantities("seq", "t_ns", *names):
         found.add_frames(columns["seq"], columns["t_ns"], columns)
     if found.problem is not None:
         raise FileFormatError(found.problem, where=str(session.path))

@@ -18,7 +18,7 @@ from typing import Any
 from devices.errors import DamagedFileError
 from devices.frames import ArrayInfo
 from service.estimation.tare.tare import Tare
-from storage.checksummed_json import parse_checksummed_json, write_checksummed_json
+from storage.checksummed_json import verify_and_strip_json_checksum, write_checksummed_json
 from storage.durable_files import ASIDE_SUFFIX, read_small_file
 
 REASONS = {
@@ -100,7 +100,7 @@ def read_tares(path: Path) -> TareFileContent:
         return TareFileContent((LOST,), f"{error.what}: all of its tares are lost", is_damaged=True)
     is_intact, what = True, "not a complete list of tares"
     try:
-        parse_checksummed_json(text, where=str(path))
+        verify_and_strip_json_checksum(text, where=str(path))
     except DamagedFileError as error:
         is_intact, what = False, error.what
     entries, lost = _parse_intact(text)

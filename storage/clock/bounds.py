@@ -135,8 +135,8 @@ class OffsetStretch:
         return int(self.rows.t_mono_ns[-1])
 
     @property
-    def drift_bounds(self) -> tuple[float, float] | None:
-        """Bounds of the mean rate; None if the rows do not narrow it beyond a crystal's."""
+    def narrowed_mean_rate_bounds(self) -> tuple[float, float] | None:
+        """Bounds of the mean rate, ns per ns; None if the rows do not narrow the limit."""
         return (
             None if self.mean_rate_bounds == (-self._limit, self._limit) else self.mean_rate_bounds
         )
@@ -195,7 +195,7 @@ class ClockOffsets:
         self._begins_ns = np.array([s.begin_t_mono_ns for s in self.stretches], dtype=np.int64)
         self._ends_ns = np.array([s.end_t_mono_ns for s in self.stretches], dtype=np.int64)
 
-    def offset_at(self, t_mono_ns: Int64) -> tuple[Int64, Int64]:
+    def offset_and_bound_at(self, t_mono_ns: Int64) -> tuple[Int64, Int64]:
         """Compute the offset and its bound at each instant, in ns; every instant independently.
 
         Between two stretches the instant of the step is unknown, and the bound covers both
@@ -221,28 +221,32 @@ class ClockOffsets:
         offset = (low >> 1) + (high >> 1) + (low & high & 1)  # the sum might not fit
         return offset, np.maximum(high - offset, offset - low)
 
-    def bound_ranges(
-        self, begins_ns: Int64, ends_ns: Int64
+    def bound_offset_in_ranges(
+        self, begins_t_mono_ns: Int64, ends_t_mono_ns: Int64
     ) -> tuple[Int64, Int64, npt.NDArray[np.bool_]]:
-        """Compute bounds of the offset over n time ranges.
+        """Compute bounds of the offset in ns over n time ranges, and where they are certain.
 
         Args:
-            begins_ns: int64[n], `t_mono_ns`, absolute values below `T_MONO_NS_END`.
-            ends_ns: int64[n], the same, not before them.
+            begins_t_mono_ns: int64[n], `t_mono_ns`, absolute values below `T_MONO_NS_END`.
+            ends_t_mono_ns: int64[n], the same, not before them.
 
         Returns:
             Least and greatest offset, int64[n], and whether they are certain, bool[n]: a step that
                 may lie in the range has no bound.
         """
-        sure = np.ones(len(begins_ns), dtype=np.bool_)
+        sure = np.ones(len(begins_t_mono_ns), dtype=np.bool_)
         if len(self.stretches) > 1:
             for begun_ns, ended_ns in zip(self._begins_ns, self._ends_ns, strict=True):
-                sure &= (ends_ns < begun_ns) | (begins_ns >= begun_ns)
-                sure &= (ends_ns <= ended_ns) | (begins_ns > ended_ns)
-        one, other = self.offset_at(begins_ns)[0], self.offset_at(ends_ns)[0]
+                sure &= (ends_t_mono_ns < begun_ns) | (begins_t_mono_ns >= begun_ns)
+                sure &= (ends_t_mono_ns <= ended_ns) | (begins_t_mono_ns > ended_ns)
+        one, other = (
+            self.offset_and_bound_at(begins_t_mono_ns)[0],
+            self.offset_and_bound_at(ends_t_mono_ns)[0],
+        )
         # Within a stretch the offset has no jumps, and no clock gains faster than this limit.
         slack_ns = (
-            np.ceil(DISCIPLINE_RATE_LIMIT * (ends_ns - begins_ns)).astype(np.int64) + _ROUNDING_NS
+            np.ceil(DISCIPLINE_RATE_LIMIT * (ends_t_mono_ns - begins_t_mono_ns)).astype(np.int64)
+            + _ROUNDING_NS
         )
         return np.minimum(one, other) - slack_ns, np.maximum(one, other) + slack_ns, sure
 
@@ -325,7 +329,7 @@ def _find_certain_end(rows: OffsetRows, begin: int, end: int, later: OffsetStret
     """Return the end of the rows that cannot belong to the later stretch."""
     part = rows.slice_rows(begin, end)
     low, high = later.offset_bounds_at(part.t_mono_ns)
-    half = part.uncertainty_ns + part.uncertainty_ns // 2000 + 2  # as in _intervals, rounded up
+    half = part.uncertainty_ns + part.uncertainty_ns // 2000 + 2  # as _offset_intervals, rounded up
     foreign = (part.offset_ns - half > high) | (part.offset_ns + half < low)
     last = np.flatnonzero(foreign)
     return begin + (int(last[-1]) + 1 if len(last) else 1)

@@ -60,7 +60,7 @@ class ClockLog:
         self.path = folder / CLOCK_LOG_NAME
 
     def append(self, row: ClockOffset) -> None:
-        """Append a row in constant time; it is on the disk after `sync`.
+        """Append a row, after cutting off a torn end; it is on the disk after `sync`.
 
         Raises:
             StorageError: the disk is full or not writable. Earlier rows are untouched.
@@ -101,15 +101,15 @@ class ClockLog:
                 os.close(descriptor)
             sync_folder(self.path.parent)
 
-    def read_rows(self) -> tuple[ClockOffset, ...]:
+    def read_undamaged_rows(self) -> tuple[ClockOffset, ...]:
         """Read all readable rows in the order of the file; empty if there is no log.
 
         Raises:
             StorageError: the log cannot be read.
         """
-        return self.read_content().rows
+        return self.read_rows_and_damage().rows
 
-    def read_content(self) -> ClockLogContent:
+    def read_rows_and_damage(self) -> ClockLogContent:
         """Read the rows, with the number of damaged lines and whether the end is torn.
 
         Raises:

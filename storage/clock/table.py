@@ -70,10 +70,10 @@ class ClockTable:
                 check_rows_in_range(own, stream.stream_id, where)
                 self._maps[stream.stream_id] = ClockOffsets(own)
 
-    def compute_server_time(
+    def compute_server_time_columns(
         self, t_mono_ns: Int64, t_ns: Int64, part: Array | None
     ) -> dict[str, Array]:
-        """Compute the server's time of frames; every frame independently of the others.
+        """Compute the server's time of frames and its bound, as two columns.
 
         Args:
             t_mono_ns: int64[n], of one or several parts, in any order.
@@ -92,7 +92,7 @@ class ClockTable:
             here = np.flatnonzero(sane if part is None else sane & (part == number))
             if clock is None or not len(here) or (part is None and number):
                 continue
-            offset, bound = clock.offset_at(t_mono_ns[here])
+            offset, bound = clock.offset_and_bound_at(t_mono_ns[here])
             sums = t_ns[here] + offset
             fits = ((t_ns[here] ^ sums) & (offset ^ sums)) >= 0
             t_server_ns[here[fits]] = sums[fits]
@@ -100,24 +100,26 @@ class ClockTable:
         return {"t_server_ns": t_server_ns, "t_server_uncertainty_ns": uncertainty_ns}
 
     def bound_offset_in_ranges(
-        self, begins_ns: Int64, ends_ns: Int64, part: int
+        self, begins_t_mono_ns: Int64, ends_t_mono_ns: Int64, part: int
     ) -> tuple[Int64, Int64, npt.NDArray[np.bool_]] | None:
         """Compute bounds of `t_server_ns - t_ns` over n time ranges of a part.
 
         Args:
-            begins_ns: int64[n], `t_mono_ns` of each begin.
-            ends_ns: int64[n], `t_mono_ns` of each end, not before its begin.
+            begins_t_mono_ns: int64[n], `t_mono_ns` of each begin.
+            ends_t_mono_ns: int64[n], `t_mono_ns` of each end, not before its begin.
             part: number of the part.
 
         Returns:
-            As of `ClockOffsets.bound_ranges`; None: this part's clock was never measured.
+            As of `ClockOffsets.bound_offset_in_ranges`; None: this part's clock was never measured.
         """
         clock = self._maps.get(self._parts[part]) if part < len(self._parts) else None
         if clock is None:
             return None
-        sane = _mask_within(begins_ns, T_MONO_NS_END) & _mask_within(ends_ns, T_MONO_NS_END)
-        least, greatest, sure = clock.bound_ranges(
-            np.where(sane, begins_ns, 0), np.where(sane, ends_ns, 0)
+        sane = _mask_within(begins_t_mono_ns, T_MONO_NS_END) & _mask_within(
+            ends_t_mono_ns, T_MONO_NS_END
+        )
+        least, greatest, sure = clock.bound_offset_in_ranges(
+            np.where(sane, begins_t_mono_ns, 0), np.where(sane, ends_t_mono_ns, 0)
         )
         return least, greatest, sure & sane
 
@@ -193,7 +195,7 @@ def _mask_within(values: Int64, end: int) -> npt.NDArray[np.bool_]:
 def _summarize_stretch(stretch: OffsetStretch, stream: StreamClockFacts) -> StretchSummary:
     middle_ns = (stretch.begin_t_mono_ns + stretch.end_t_mono_ns) // 2
     low, high = _bounds_at(stretch, middle_ns)
-    drift = stretch.drift_bounds
+    drift = stretch.narrowed_mean_rate_bounds
     return StretchSummary(
         begin_t_ns=_to_utc_ns(stretch.begin_t_mono_ns, stream),
         end_t_ns=_to_utc_ns(stretch.end_t_mono_ns, stream),

@@ -226,7 +226,7 @@ class Export:
             values = _select_rows(flat, self.selection.compute_row_mask(at_ns, content.begin_t_ns))
             if self.clock is not None:
                 times = (values["t_mono_ns"], values["t_ns"], values.get("part"))
-                values |= self.clock.compute_server_time(*times)
+                values |= self.clock.compute_server_time_columns(*times)
             if self.markers is not None:
                 values["marker"] = self.markers.get_frame_labels(values["seq"], values.get("part"))
             values["time_s"] = (self.to_session_axis_ns(values) - content.begin_t_ns) * 1e-9

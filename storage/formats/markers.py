@@ -124,7 +124,9 @@ def place_markers(
         if not len(piece["t_ns"]):
             continue
         begin_t_ns = int(piece["t_ns"][0]) if begin_t_ns is None else begin_t_ns
-        times = clock.compute_server_time(piece["t_mono_ns"], piece["t_ns"], piece.get("part"))
+        times = clock.compute_server_time_columns(
+            piece["t_mono_ns"], piece["t_ns"], piece.get("part")
+        )
         at_ns = axis.shift_to_axis(piece["t_ns"], piece.get("part"))
         nearest.add_frames(piece, times, selection.compute_row_mask(at_ns, begin_t_ns))
     return PlacedMarkers([nearest.make_placed_marker(i, event) for i, event in enumerate(ordered)])

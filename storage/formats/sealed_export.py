@@ -45,7 +45,7 @@ def place_session_markers(
             [PlacedMarker(event, exclusion_reason=error.what) for event in markers]
         )
     names = (*PLACEMENT_COLUMNS, "part") if reader.has_columns("part") else PLACEMENT_COLUMNS
-    pieces = reader.read_columns(
+    pieces = reader.read_quantities(
         *names, row_groups=_row_groups_near_markers(reader, clock, markers)
     )
     return place_markers(
@@ -116,7 +116,7 @@ def make_sealed_export(
     return Export(
         FrameSource(
             names,
-            lambda flat: reader.read_flat_columns(flat, *bounds_ns),
+            lambda flat: reader.read_overlapping_row_groups(flat, *bounds_ns),
             begin_t_ns,
             end_t_ns,
             reader.time_axis,

@@ -23,7 +23,7 @@ from storage.journal.segment_format import (
     RECORD_DTYPE,
     Records,
     make_message_batch,
-    read_payload,
+    read_verified_payload,
     seq_range_of,
 )
 from storage.message_batch import MessageBatchDecoder
@@ -51,7 +51,7 @@ class BatchIndex:
 
     @classmethod
     def from_segments(cls, records_by_path: Sequence[tuple[Path, Records]]) -> BatchIndex:
-        """Merge the records of several segments."""
+        """Merge the records of several segments, in order of their frames."""
         records = np.concatenate(
             [np.zeros(0, RECORD_DTYPE), *(records for _, records in records_by_path)]
         )
@@ -69,7 +69,7 @@ class BatchIndex:
         keep = self.records["seq_first"] + self.records["count"] > seq
         return BatchIndex(self.records[keep], self.paths, self.segment_number[keep])
 
-    def split(self) -> Iterator[BatchIndex]:
+    def split_by_frame_count(self) -> Iterator[BatchIndex]:
         """Split the batches into groups of up to `PIECE_FRAMES` frames."""
         frames = np.cumsum(self.records["count"], dtype=np.int64)
         begin = before = 0
@@ -110,7 +110,7 @@ class BatchReader:
             path = batches.paths[at]
             first, last = seq_range_of(record)
             with translate_storage_errors(path):
-                payload = read_payload(self._open_segment(path), record)
+                payload = read_verified_payload(self._open_segment(path), record)
             if payload is None:
                 raise _damage_error(path, record, "the bytes that were written, by their CRC-32")
             t_ns = int(record["t_ns_first"]), int(record["t_ns_last"])
@@ -124,7 +124,7 @@ class BatchReader:
             FileFormatError: a batch is undamaged but holds no frames of this stream.
             StorageError: as for `read_messages`.
         """
-        for piece in batches.split():
+        for piece in batches.split_by_frame_count():
             try:
                 content = self._read_bytes(piece)
             except StorageError:  # a bad sector is in one batch: read those before it

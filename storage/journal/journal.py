@@ -28,10 +28,10 @@ from storage.journal.open_segments import OpenSegments
 from storage.journal.segment import (
     SUFFIX,
     Segment,
-    has_indexed_batches,
-    make_unread_path,
+    make_free_unread_path,
+    may_have_indexed_batches,
     recover_segment,
-    set_aside_unreadable_segments,
+    set_aside_unopenable_segments,
 )
 from storage.journal.segment_format import INDEX_SUFFIX, read_schema_and_first_offset
 from storage.journal.stream_notes import StreamNotes
@@ -53,7 +53,7 @@ class Journal:
     Args:
         folder: the stream's own folder; created if absent.
         info: description of the stream's array.
-        is_write_deferred: `append` never waits for the disk. Appended batches wait in memory until
+        is_write_deferred: appending never waits for the disk. Appended batches wait in memory until
             they are synced or read; batches that the disk then refuses count as stored until
             `disown`.
     """
@@ -73,16 +73,16 @@ class Journal:
         self._open = OpenSegments(folder, header, is_write_deferred=is_write_deferred)
         self._runs = MessageBatchDecoder(self._schema)
         self._instants = TimeIndex(
-            lambda seq, is_upper: self.find_t_ns_near(seq, is_upper=is_upper)
+            lambda seq, is_upper: self.find_batch_t_ns_near(seq, at_or_before=is_upper)
         )
         with translate_storage_errors(folder):
             make_synced_folder(folder)
-            self.problems += set_aside_unreadable_segments(folder)
+            self.problems += set_aside_unopenable_segments(folder)
             for path in sorted(folder.glob("*" + SUFFIX)):
                 index = path.with_suffix(INDEX_SUFFIX)
-                is_indexed = index.exists() and has_indexed_batches(path, self._schema)
+                is_indexed = index.exists() and may_have_indexed_batches(path, self._schema)
                 segment, damaged = recover_segment(path, self._schema)
-                self.lost.add(damaged, CORRUPT)
+                self.lost.add_if_new(damaged, CORRUPT)
                 if segment is not None:
                     self._add_segment(segment)
                 elif is_indexed:  # else its process was killed just after creating it
@@ -94,12 +94,12 @@ class Journal:
                 # frames was promised then; but a person may have deleted it: set the index aside.
                 if not path.with_suffix(SUFFIX).exists():
                     with suppress(OSError):
-                        path.rename(make_unread_path(path))
+                        path.rename(make_free_unread_path(path))
         self.lost.remove(self.stored)
 
     @classmethod
-    def open(cls, folder: Path, *, is_write_deferred: bool = False) -> Journal:
-        """Open an existing journal; its array's description is in its notes or segments.
+    def open_and_recover(cls, folder: Path, *, is_write_deferred: bool = False) -> Journal:
+        """Open an existing journal and recover its segments on disk.
 
         Raises:
             DamagedFileError: it has no readable segment.
@@ -116,7 +116,7 @@ class Journal:
         journal = cls(folder, info, is_write_deferred=is_write_deferred)
         journal.problems[:0] = problems
         if notes is not None:
-            journal.lost.add(Intervals(notes.damaged) - journal.stored, CORRUPT)
+            journal.lost.add_if_new(Intervals(notes.damaged) - journal.stored, CORRUPT)
         return journal
 
     @property
@@ -125,23 +125,23 @@ class Journal:
         return sum(segment.size_bytes for segment in self._segments)
 
     @property
-    def has_open_segment(self) -> bool:
-        """True if a segment is open, or not closed yet."""
+    def has_unclosed_segment(self) -> bool:
+        """True if a segment accepts batches, or is not closed yet."""
         return bool(self._open.paths)
 
     @property
-    def has_closing_segment(self) -> bool:
+    def has_segment_to_close(self) -> bool:
         """True if the next sync closes a segment."""
-        return self._open.has_closing_segment
+        return self._open.has_segment_to_close
 
-    def find_time_conflict(self, frames: FrameBatch) -> str:
+    def describe_time_conflict(self, frames: FrameBatch) -> str:
         """Return a message if time would run back between `frames` and stored ones; else empty.
 
         Raises:
             StorageError: an index cannot be read.
         """
         with translate_storage_errors(self.folder):
-            return self._instants.find_time_conflict(frames, self.stored)
+            return self._instants.describe_time_conflict(frames, self.stored)
 
     def append_new_frames(self, batch: FrameBatch, payload: bytes | None = None) -> Intervals:
         """Append the frames of `batch` that are not stored yet; return their numbers.
@@ -167,8 +167,8 @@ class Journal:
                 )
         return new
 
-    def append_message(self, message: EncodedBatch) -> None:
-        """Append a message that this machine has encoded, without decoding it.
+    def append_new_encoded_frames(self, message: EncodedBatch) -> None:
+        """Append a message encoded here; decode it only if some frames are stored already.
 
         Raises:
             StorageError: as for `append_new_frames`.
@@ -186,8 +186,8 @@ class Journal:
         """
         self._open.sync()
 
-    def invalidate(self, doubtful_numbers: Intervals) -> None:
-        """Remove batches within `doubtful_numbers`, unsynced or damaged, from the stored ones.
+    def invalidate_whole_batches(self, doubtful_numbers: Intervals) -> None:
+        """Remove batches wholly within `doubtful_numbers`; later frames go into new segments.
 
         In a closed segment they are removed from the index on disk, so that a later copy is the
         valid one after a restart.
@@ -196,15 +196,15 @@ class Journal:
         for segment in self._segments:
             if not segment.stored & doubtful_numbers:
                 continue
-            segment.invalidate(doubtful_numbers)
+            segment.invalidate_batches_in_memory(doubtful_numbers)
             if segment.path in written:
                 segment.has_invalidated_frames = True
             else:
                 with suppress(StorageError, OSError):
-                    segment.rewrite_index()
+                    segment.rewrite_and_close_index()
         self._segments = [segment for segment in self._segments if segment.stored]
         self._recompute_stored()
-        self._open.retire_all()
+        self._open.close_segments_at_next_sync()
 
     def read_frames(self, seq_first: int, seq_last: int) -> Iterator[FrameBatch]:
         """Yield the stored frames from `seq_first` to `seq_last`, in order, in pieces.
@@ -219,7 +219,7 @@ class Journal:
                     begin, end = np.searchsorted(frames.seq, (seq_first, seq_last + 1)).tolist()
                     yield frames.slice_rows(begin, end)
 
-    def read_messages(self, seq_first: int, seq_last: int) -> Iterator[EncodedBatch]:
+    def read_overlapping_messages(self, seq_first: int, seq_last: int) -> Iterator[EncodedBatch]:
         """Yield the complete batches with any of these frames, in order, as they came.
 
         Raises:
@@ -230,42 +230,42 @@ class Journal:
             for batches in self._find_batches(seq_first, seq_last):
                 yield from reader.read_messages(batches)
 
-    def find_first_seq_since(self, t_ns: int) -> int | None:
+    def find_first_batch_seq_since(self, t_ns: int) -> int | None:
         """Return the first stored number at `t_ns` (node's UTC) or later, to a batch.
 
         It is up to one batch earlier; None if no stored frame is that young.
         """
         self._open.write_waiting()
-        return time_index.find_first_seq_since(self._segments, t_ns)
+        return time_index.find_first_batch_seq_since(self._segments, t_ns)
 
-    def find_t_ns_near(self, seq: int, *, is_upper: bool) -> int | None:
-        """Return the node's UTC of the newest frame up to `seq`, or of the oldest from `seq` on.
+    def find_batch_t_ns_near(self, seq: int, *, at_or_before: bool) -> int | None:
+        """Return the end of the newest batch up to `seq`, or the begin of the oldest from it.
 
         To a batch; None if there is no such frame.
         """
         near = (
             self.stored.restricted_to(0, seq).last
-            if is_upper
+            if at_or_before
             else self.stored.restricted_to(seq, NO_END).first
         )
         if near is None:
             return None
         self._open.write_waiting()
-        return time_index.find_t_ns_near(self._segments, near, is_upper=is_upper)
+        return time_index.find_batch_t_ns_near(self._segments, near, at_or_before=at_or_before)
 
-    def find_last_seq_until(self, t_ns: int, *, min_seq: int) -> int | None:
+    def find_last_seq_once_passed(self, t_ns: int, *, min_seq: int) -> int | None:
         """Return the last number at `t_ns` or before, if later frames are stored too.
 
-        None while the stream has not passed `t_ns`. Batches before `at_least` are skipped;
-        `at_least` - 1 if all others are later.
+        None while the stream has not passed `t_ns`. Batches before `min_seq` are skipped;
+        `min_seq` - 1 if all others are later.
         """
         self._open.write_waiting()
-        return time_index.find_last_seq_until(
+        return time_index.find_last_seq_once_passed(
             self._segments, t_ns, min_seq=min_seq, read_frames=self.read_frames
         )
 
     def delete_old_segments(self, before_t_ns: int, keep_numbers: Intervals) -> Intervals:
-        """Delete segments that end before `before_t_ns` and have no number of `keep`.
+        """Delete closed segments that end before `before_t_ns`, without any of `keep_numbers`.
 
         Returns:
             The deleted numbers.
@@ -288,8 +288,8 @@ class Journal:
             self._recompute_stored()
         return gone
 
-    def delete_oldest_segment(self, keep_numbers: Intervals) -> Intervals:
-        """Delete the oldest segment without a number of `keep`; return its numbers, if any.
+    def delete_oldest_unneeded_segment(self, keep_numbers: Intervals) -> Intervals:
+        """Delete the oldest closed segment without any of `keep_numbers`; return its numbers.
 
         Raises:
             StorageError: it cannot be deleted.
@@ -306,9 +306,9 @@ class Journal:
         self.stored = Intervals()
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    def retire_open_segments(self) -> None:
+    def close_segments_at_next_sync(self) -> None:
         """Stop appending to the open segments: the next sync closes them."""
-        self._open.retire_all()
+        self._open.close_segments_at_next_sync()
 
     def close(self) -> None:
         """Sync and close the open segments; a later append opens a new one.
@@ -316,13 +316,13 @@ class Journal:
         Raises:
             StorageError: the disk refused.
         """
-        self.retire_open_segments()
+        self.close_segments_at_next_sync()
         self.sync()
 
     def _add_segment(self, segment: Segment) -> None:
         """Add a recovered segment; after an invalidation two segments may have equal numbers."""
         if segment.stored & self.stored:
-            segment.invalidate(self.stored)
+            segment.invalidate_batches_in_memory(self.stored)
         if segment.stored:
             self._segments.append(segment)
             self.stored = self.stored | segment.stored
@@ -350,7 +350,7 @@ class Journal:
             for segment in list(self._segments):
                 if segment.stored and segment.seq_range[0] < end and segment.seq_range[1] >= at:
                     try:
-                        records = segment.read_records()
+                        records = segment.read_stored_batch_records()
                     except StorageError as error:
                         if error.errno == errno.ENOENT and segment not in self._segments:
                             continue  # pruned meanwhile

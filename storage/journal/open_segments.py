@@ -27,7 +27,7 @@ class OpenSegments:
     Args:
         folder: the journal's folder.
         header: schema message with which a segment begins.
-        is_write_deferred: `append` does not write; `write` and `sync` do, in any thread.
+        is_write_deferred: `append` does not write; `write_waiting` and `sync` do, in any thread.
     """
 
     def __init__(self, folder: Path, header: bytes, *, is_write_deferred: bool) -> None:
@@ -47,7 +47,7 @@ class OpenSegments:
             return {writer.segment.path for writer in (*self._open, *self._closing)}
 
     @property
-    def has_closing_segment(self) -> bool:
+    def has_segment_to_close(self) -> bool:
         """True if the next sync closes a file."""
         return bool(self._closing)
 
@@ -108,7 +108,7 @@ class OpenSegments:
             if failed is not None:
                 raise failed
 
-    def retire_all(self) -> None:
+    def close_segments_at_next_sync(self) -> None:
         """Stop appending to these segments; the next sync closes them."""
         with self._lock:
             self._closing += self._open

@@ -26,16 +26,16 @@ from storage.journal.segment_format import (
     INDEX_SUFFIX,
     RECORD_DTYPE,
     Records,
+    encode_closing_record,
+    encode_index_record,
     find_end_offset,
     is_index_closed,
     is_record_valid,
-    make_closing_record,
-    make_record,
     read_index,
-    read_messages_from,
-    read_payload,
+    read_messages_until_damage,
     read_schema_and_first_offset,
-    select_batches,
+    read_verified_payload,
+    select_valid_batch_records,
     seq_range_of,
 )
 from storage.wire import EncodedBatch
@@ -89,14 +89,14 @@ class Segment:
         self.t_ns_last = end if fresh else max(self.t_ns_last, end)
         self.size_bytes += len(message.payload) + RECORD_DTYPE.itemsize
 
-    def read_records(self) -> Records:
-        """Read the index of the batches that count, in order of their frames.
+    def read_stored_batch_records(self) -> Records:
+        """Read the valid index records of the stored batches, in order of their frames.
 
         Raises:
             StorageError: the index cannot be read.
         """
         try:
-            found = select_batches(read_index(self.path))
+            found = select_valid_batch_records(read_index(self.path))
         except OSError as error:
             raise StorageError(
                 f"cannot be read: {error}", where=str(self.path), errno=error.errno
@@ -104,26 +104,26 @@ class Segment:
         found = found[self.stored.contains_ranges(found["seq_first"], found["count"])]
         return found[np.argsort(found["seq_first"], kind="stable")]
 
-    def invalidate(self, doubtful_numbers: Intervals) -> None:
-        """Remove batches within these numbers, also batches that are not in the index.
+    def invalidate_batches_in_memory(self, doubtful_numbers: Intervals) -> None:
+        """Remove batches within these numbers from `stored`, also ones not in the index.
 
         The file under its name may be a copy that was made before they were written.
         """
         records: Records | tuple[()] = ()
         with suppress(StorageError):  # gone, or no descriptor is left
-            records = self.read_records()
+            records = self.read_stored_batch_records()
         batches = [Intervals([seq_range_of(record)]) for record in records]
         self.stored = (self.stored - doubtful_numbers) | union(
             b for b in batches if b - doubtful_numbers
         )
 
-    def rewrite_index(self) -> None:
+    def rewrite_and_close_index(self) -> None:
         """Write an index of only the batches that count, and mark it as closed.
 
         Raises:
             StorageError: the disk is full or not writable; the old index is still there then.
         """
-        _write_index(self.path, self.read_records())
+        _write_index(self.path, self.read_stored_batch_records())
 
     def delete_files(self) -> None:
         """Delete the segment and its index.
@@ -136,7 +136,7 @@ class Segment:
         self.path.unlink(missing_ok=True)
 
 
-def set_aside_unreadable_segments(folder: Path) -> list[str]:
+def set_aside_unopenable_segments(folder: Path) -> list[str]:
     """Set aside segments and indexes that are no regular files or not readable.
 
     Returns:
@@ -151,15 +151,15 @@ def set_aside_unreadable_segments(folder: Path) -> list[str]:
     return problems
 
 
-def make_unread_path(path: Path) -> Path:
+def make_free_unread_path(path: Path) -> Path:
     """Return a free path beside a segment for its unreadable bytes."""
     existing = {each.name for each in path.parent.iterdir()}
     names = (f"{path.stem}{f'.{n}' if n > 1 else ''}{UNREAD_SUFFIX}" for n in count(1))
     return path.with_name(next(name for name in names if name not in existing))
 
 
-def has_indexed_batches(path: Path, schema: pa.Schema) -> bool:
-    """Return whether the segment's index has or had batches; only the newest may lack its record.
+def may_have_indexed_batches(path: Path, schema: pa.Schema) -> bool:
+    """Return whether the index is not empty, or the segment has two batches or more.
 
     Raises:
         OSError: one of the two files cannot be read.
@@ -167,7 +167,7 @@ def has_indexed_batches(path: Path, schema: pa.Schema) -> bool:
     if path.with_suffix(INDEX_SUFFIX).stat().st_size > 0:
         return True
     _, begin = read_schema_and_first_offset(path)
-    return len(list(islice(read_messages_from(path, begin, schema), 2))) > 1
+    return len(list(islice(read_messages_until_damage(path, begin, schema), 2))) > 1
 
 
 def recover_segment(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
@@ -189,7 +189,7 @@ def recover_segment(path: Path, schema: pa.Schema) -> tuple[Segment | None, Inte
     except FileNotFoundError:
         index = _rebuild_index(path, end, schema)
     else:
-        batches = select_batches(index)
+        batches = select_valid_batch_records(index)
         was_closed = is_index_closed(index) and len(batches) == len(index) - 1
         if was_closed and len(batches) and find_end_offset(batches) == size:
             segment = Segment(path)
@@ -200,7 +200,7 @@ def recover_segment(path: Path, schema: pa.Schema) -> tuple[Segment | None, Inte
     with path.open("rb") as file:
         for record in index:
             if not is_record_valid(record) and end not in read:
-                read[end] = next(read_messages_from(path, end, schema), None)
+                read[end] = next(read_messages_until_damage(path, end, schema), None)
             found = _verify_record(file.fileno(), record, end, read.get(end))
             if found is None and is_record_valid(record):
                 doubtful.add(*seq_range_of(record))
@@ -213,7 +213,7 @@ def recover_segment(path: Path, schema: pa.Schema) -> tuple[Segment | None, Inte
                     end = max(end, int(found["offset"]) + int(found["length"]))
         if end < size:
             file.seek(end)
-            _write_all_or_none(make_unread_path(path), file.read())
+            _write_all_or_none(make_free_unread_path(path), file.read())
     segment = Segment(path)
     if not good:
         segment.delete_files()
@@ -239,7 +239,7 @@ def _write_all_or_none(path: Path, content: bytes) -> None:
 
 def _write_index(path: Path, records: Records) -> None:
     """Replace a segment's index, marked as closed."""
-    content = records.tobytes() + make_closing_record()
+    content = records.tobytes() + encode_closing_record()
     write_atomically(path.with_suffix(INDEX_SUFFIX), content)
 
 
@@ -248,17 +248,17 @@ def _verify_record(
 ) -> Any | None:
     """Return the record if the batch's bytes match it, repaired if only the record is damaged."""
     if is_record_valid(record):
-        is_right = not record["count"] or read_payload(descriptor, record) is not None
+        is_right = not record["count"] or read_verified_payload(descriptor, record) is not None
         return record if is_right else None
     if message is None or zlib.crc32(message.payload) != record["crc32"]:
         return None
-    return np.frombuffer(make_record(message, end), RECORD_DTYPE)[0]
+    return np.frombuffer(encode_index_record(message, end), RECORD_DTYPE)[0]
 
 
 def _rebuild_index(path: Path, begin: int, schema: pa.Schema) -> Records:
     records = bytearray()
     # Without a whole header no bytes after it can be trusted as a batch.
-    for message in read_messages_from(path, begin, schema) if begin else ():
-        records += make_record(message, begin)
+    for message in read_messages_until_damage(path, begin, schema) if begin else ():
+        records += encode_index_record(message, begin)
         begin += len(message.payload)
     return np.frombuffer(bytes(records), RECORD_DTYPE)

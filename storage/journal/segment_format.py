@@ -45,7 +45,7 @@ _OFFSET_END = 1 << 62
 Records = npt.NDArray[np.void]
 
 
-def make_record(message: EncodedBatch, offset: int) -> bytes:
+def encode_index_record(message: EncodedBatch, offset: int) -> bytes:
     """Return the index record of a batch as bytes."""
     return _pack_with_checksum(
         message.seq_first,
@@ -58,7 +58,7 @@ def make_record(message: EncodedBatch, offset: int) -> bytes:
     )
 
 
-def make_closing_record() -> bytes:
+def encode_closing_record() -> bytes:
     """Return the record that ends an index, as bytes."""
     return _pack_with_checksum(0, 0, 0, 0, 0, 0, 0)
 
@@ -89,7 +89,7 @@ def is_index_closed(index: Records) -> bool:
     return bool(len(index)) and is_record_valid(index[-1]) and not index[-1]["count"]
 
 
-def select_batches(index: Records) -> Records:
+def select_valid_batch_records(index: Records) -> Records:
     """Return the valid records with frames."""
     return index[(index["count"] > 0) & mask_valid_records(index)]
 
@@ -99,13 +99,13 @@ def find_end_offset(records: Records) -> int:
     return int((records["offset"] + records["length"]).max(initial=0))
 
 
-def read_index(path: Path) -> Records:
+def read_index(segment_path: Path) -> Records:
     """Read all records of a segment's index, valid or not; a cut one at its end is skipped.
 
     Raises:
         OSError: there is none, or it cannot be read.
     """
-    content = path.with_suffix(INDEX_SUFFIX).read_bytes()
+    content = segment_path.with_suffix(INDEX_SUFFIX).read_bytes()
     return np.frombuffer(content, RECORD_DTYPE, len(content) // RECORD_DTYPE.itemsize)
 
 
@@ -122,7 +122,9 @@ def read_schema_and_first_offset(path: Path) -> tuple[pa.Schema | None, int]:
             return None, 0
 
 
-def read_messages_from(path: Path, begin_offset: int, schema: pa.Schema) -> Iterator[EncodedBatch]:
+def read_messages_until_damage(
+    path: Path, begin_offset: int, schema: pa.Schema
+) -> Iterator[EncodedBatch]:
     """Yield batches from an offset on, up to the first bytes that are not a complete batch.
 
     Raises:
@@ -143,7 +145,7 @@ def read_messages_from(path: Path, begin_offset: int, schema: pa.Schema) -> Iter
             begin_offset += len(payload)
 
 
-def read_payload(descriptor: int, record: Any) -> bytes | None:
+def read_verified_payload(descriptor: int, record: Any) -> bytes | None:
     """Read a batch's bytes from an open segment; None if their CRC-32 is wrong.
 
     Args:

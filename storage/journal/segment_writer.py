@@ -13,9 +13,9 @@ from devices.errors import StorageError
 from storage.journal.segment import Segment
 from storage.journal.segment_format import (
     INDEX_SUFFIX,
+    encode_closing_record,
+    encode_index_record,
     find_end_offset,
-    make_closing_record,
-    make_record,
 )
 from storage.wire import EncodedBatch
 
@@ -29,9 +29,9 @@ class SegmentWriter:
     Args:
         path: the file, which must not exist.
         header: its schema message.
-        is_write_deferred: appended batches wait in memory for `write` or `sync`, in any thread.
-            Even to query a file's end may wait until the disk has taken what another thread is
-            syncing.
+        is_write_deferred: appended batches wait in memory for `write_waiting` or `sync`, in any
+            thread. Even to query a file's end may wait until the disk has taken what another
+            thread is syncing.
 
     Raises:
         OSError: it cannot be created; no file is left behind.
@@ -65,7 +65,7 @@ class SegmentWriter:
         Raises:
             OSError: the disk is full or refuses it.
         """
-        record = make_record(message, self._end)
+        record = encode_index_record(message, self._end)
         if self._writes_later and self._end - self._written < _MAX_WAITING_BYTES:
             self._waiting.append((message.payload, record))
         else:
@@ -116,7 +116,7 @@ class SegmentWriter:
                 self._drop_invalidated()
                 return
             with suppress(OSError):  # without it the batches are checked at the next open
-                write_all_or_none(self._index, make_closing_record())
+                write_all_or_none(self._index, encode_closing_record())
                 os.fsync(self._index.fileno())
         finally:
             self.close_without_sync()
@@ -124,13 +124,13 @@ class SegmentWriter:
     def _drop_invalidated(self) -> None:
         """Remove invalidated batches: they were written again elsewhere."""
         with suppress(OSError, StorageError):
-            records = self.segment.read_records()
+            records = self.segment.read_stored_batch_records()
             if not len(records):
                 self.segment.delete_files()
                 return
             self._data.truncate(find_end_offset(records))
             os.fsync(self._data.fileno())
-            self.segment.rewrite_index()
+            self.segment.rewrite_and_close_index()
 
     def close_without_sync(self) -> None:
         """Close the files without a sync."""

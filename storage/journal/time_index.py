@@ -48,7 +48,7 @@ class TimeIndex:
         """Clear the cache: numbers are no longer stored."""
         self._t_ns_by_end.clear()
 
-    def find_time_conflict(self, frames: FrameBatch, stored: Intervals) -> str:
+    def describe_time_conflict(self, frames: FrameBatch, stored: Intervals) -> str:
         """Return a message if time would run back between `frames` and stored ones; else empty.
 
         Args:
@@ -79,7 +79,7 @@ class TimeIndex:
         return self._t_ns_by_end[end]
 
 
-def find_first_seq_since(segments: Iterable[Segment], t_ns: int) -> int | None:
+def find_first_batch_seq_since(segments: Iterable[Segment], t_ns: int) -> int | None:
     """Return the first number of the oldest batch with a frame at `t_ns` or later, if any.
 
     Raises:
@@ -90,48 +90,50 @@ def find_first_seq_since(segments: Iterable[Segment], t_ns: int) -> int | None:
         if segment.t_ns_first >= t_ns:
             young.append(segment.seq_range[0])
         elif segment.t_ns_last >= t_ns:
-            records = segment.read_records()
+            records = segment.read_stored_batch_records()
             young += records["seq_first"][records["t_ns_last"] >= t_ns].tolist()
     return min(young, default=None)
 
 
-def find_t_ns_near(segments: Sequence[Segment], seq: int, *, is_upper: bool) -> int | None:
+def find_batch_t_ns_near(
+    segments: Sequence[Segment], seq: int, *, at_or_before: bool
+) -> int | None:
     """Return the node's UTC of the end (upper) or beginning of the batch with `seq`.
 
     If the batch's record is damaged, the nearest valid one before or after it counts; None if there
     is none.
     """
     holding = [segment for segment in segments if segment.stored.restricted_to(seq, seq)]
-    found = _find_nearest_batches(holding, seq, is_upper=is_upper) or _find_nearest_batches(
-        segments, seq, is_upper=is_upper
+    found = _find_nearest_batches(holding, seq, at_or_before=at_or_before) or _find_nearest_batches(
+        segments, seq, at_or_before=at_or_before
     )
-    return (max(found) if is_upper else min(found))[1] if found else None
+    return (max(found) if at_or_before else min(found))[1] if found else None
 
 
 def _find_nearest_batches(
-    segments: Iterable[Segment], seq: int, *, is_upper: bool
+    segments: Iterable[Segment], seq: int, *, at_or_before: bool
 ) -> list[tuple[int, int]]:
     """Return number and time of each segment's last batch up to `seq`, or first from it on."""
     found: list[tuple[int, int]] = []
     for segment in segments:
-        records = segment.read_records()
-        if is_upper:
+        records = segment.read_stored_batch_records()
+        if at_or_before:
             records = records[records["seq_first"] <= seq][-1:]
         else:
             records = records[records["seq_first"] + records["count"] > seq][:1]
-        name = "t_ns_last" if is_upper else "t_ns_first"
+        name = "t_ns_last" if at_or_before else "t_ns_first"
         found += [(int(record["seq_first"]), int(record[name])) for record in records]
     return found
 
 
-def find_last_seq_until(
+def find_last_seq_once_passed(
     segments: Iterable[Segment],
     t_ns: int,
     *,
     min_seq: int,
     read_frames: Callable[[int, int], Iterable[FrameBatch]],
 ) -> int | None:
-    """Return the last number at `t_ns` or before, as `Journal.find_last_seq_until`.
+    """Return the last number at `t_ns` or before, as `Journal.find_last_seq_once_passed`.
 
     Args:
         segments: segments of the journal.
@@ -147,7 +149,7 @@ def find_last_seq_until(
     records = np.concatenate(
         [np.zeros(0, RECORD_DTYPE)]
         + [
-            segment.read_records()
+            segment.read_stored_batch_records()
             for segment in segments
             if segment.seq_range[1] == before or segment.t_ns_first <= t_ns < segment.t_ns_last
         ]

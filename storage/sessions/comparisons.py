@@ -117,8 +117,8 @@ def read_comparison_report(folder: Path) -> dict[str, Any]:
     return content
 
 
-def write_series(path: Path, table: pa.Table) -> None:
-    """Write `series.parquet`; an existing one is replaced.
+def write_comparison_series(path: Path, table: pa.Table) -> None:
+    """Write the compared frames, `series.parquet`; an existing one is replaced.
 
     Args:
         path: the file.
@@ -130,8 +130,8 @@ def write_series(path: Path, table: pa.Table) -> None:
     write_hashed_table(path, table, max_group_rows=_GROUP_ROWS)
 
 
-def read_series(folder: Path) -> pa.Table | None:
-    """Read the compared frames; None: there were too many for a series.
+def read_comparison_series(folder: Path) -> pa.Table | None:
+    """Read the compared frames; None without a file: there were too many for a series.
 
     Raises:
         DamagedFileError: it was changed, or is no series.
@@ -152,8 +152,8 @@ def read_series(folder: Path) -> pa.Table | None:
     return table
 
 
-def read_series_footer(folder: Path) -> pq.FileMetaData:
-    """Read the footer of a series that `read_series` has verified just now.
+def read_comparison_series_footer(folder: Path) -> pq.FileMetaData:
+    """Read the footer of a series that `read_comparison_series` has verified just now.
 
     Raises:
         DamagedFileError: it cannot be read as Parquet any more.
@@ -166,7 +166,7 @@ def read_series_footer(folder: Path) -> pq.FileMetaData:
         return pq.read_metadata(content)
 
 
-def read_series_range(
+def read_comparison_series_range(
     folder: Path, footer: pq.FileMetaData, begin_ns: int | None, end_ns: int | None
 ) -> pa.Table:
     """Read a time range of a series: only its row groups, with their page checksums.

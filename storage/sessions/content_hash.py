@@ -31,13 +31,13 @@ class ContentDigest:
         self.order = FrameOrderChecker()
         self._hashes: dict[str, Any] = {}
 
-    def add_table(self, table: pa.Table) -> None:
-        """Add the next rows; every table must have the same columns in the same order."""
+    def add_table_and_check_order(self, table: pa.Table) -> None:
+        """Hash the next rows and check their order; every table must have the same columns."""
         for name in table.column_names:
             column = column_bytes_for_hash(name, table.column(name))
             self._hashes.setdefault(name, hashlib.sha256()).update(column)
         names = [n for n in ("seq", "t_mono_ns", "t_ns", "part") if n in self._hashes]
-        self.order.check_frames({n: table.column(n).to_numpy() for n in names})
+        self.order.add_and_check_frames({n: table.column(n).to_numpy() for n in names})
 
     @property
     def column_hashes(self) -> dict[str, str]:

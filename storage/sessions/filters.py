@@ -58,7 +58,7 @@ class SessionFilter:
         )
 
 
-def parse_t_ns(text: str, *, where: str) -> int:
+def parse_iso_or_t_ns(text: str, *, where: str) -> int:
     """Parse an instant in ns since 1970, UTC: such a number, or an ISO 8601 date or time.
 
     Args:

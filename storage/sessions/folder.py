@@ -169,8 +169,8 @@ class Session(_Record):
     calibration_id: str | None = None
     absolute_scale: Literal["measured", "assumed"] | None = None
 
-    def with_clock_rows(self, rows: Iterable[ClockOffset]) -> Session:
-        """Return the session with newer clock measurements of one of its streams."""
+    def with_newer_clock_rows(self, rows: Iterable[ClockOffset]) -> Session:
+        """Return the session with rows that are newer than its own of the same stream."""
         sorted_rows = sorted(self.clock, key=lambda row: row.t_mono_ns)
         newest = {row.stream_id: row.t_mono_ns for row in sorted_rows}
         further = [row for row in rows if row.t_mono_ns > newest.get(row.stream_id, -1)]
@@ -306,7 +306,7 @@ class SessionsFolder:
         )
 
     def move_to(self, session_id: str, destination: SessionsFolder) -> None:
-        """Move a session's folder to `to`, atomically.
+        """Move a session's folder to `destination`, atomically.
 
         Raises:
             UnknownError: there is no such session.

@@ -23,8 +23,8 @@ from storage.parquet_hash import (
     check_file_hash,
     check_footer_hash,
     footer_stated_and_actual_hash,
-    read_footer,
-    read_footer_from,
+    read_footer_or_empty,
+    read_footer_or_empty_from,
     read_stated_and_actual_hash,
 )
 from storage.schema import ARRAY_INFO_KEY, read_array_info
@@ -44,7 +44,7 @@ class SealedFileFooter:
         info: the array.
         notes: other facts for readers.
         content: description of the file's content.
-        content_sha256: hash of the description.
+        content_sha256: hash of array, notes and description.
         column_names: names of the flat columns.
         frame_count: rows.
         size_bytes: length of the footer.
@@ -66,7 +66,8 @@ class SealedFileFooter:
         Args:
             path: the file.
             skip_verification: skip the hashes: the file was verified already, or shall not be.
-            only_slices: as for `verify_unless_done`.
+            only_slices: skip the file's hash: the footer's own is enough for slices, since pages
+                are verified against their checksums when they are read.
             file: the open file, if it is not on this machine.
 
         Raises:
@@ -76,7 +77,7 @@ class SealedFileFooter:
         try:
             if file is None:
                 check_regular_file(path)
-            footer = read_footer(path) if file is None else read_footer_from(file)
+            footer = read_footer_or_empty(path) if file is None else read_footer_or_empty_from(file)
             length = len(footer).to_bytes(4, "little")
             # The parsed bytes are the same that are verified against the hash.
             self.metadata = pq.read_metadata(
@@ -96,8 +97,8 @@ class SealedFileFooter:
         if not skip_verification:
             check_footer_hash(hashes, where=where)
         self._check_format()
-        if not skip_verification and file is None:
-            self.verify_unless_done(path, only_slices=only_slices)
+        if not (skip_verification or only_slices) and file is None:
+            self.verify_file_hash_once(path)
         self.info = read_array_info(schema, where=where)
         self.notes = _parse_notes(self.schema_metadata.get(NOTES_KEY), where=where)
         self.content_sha256, self.content = self._read_content()
@@ -115,18 +116,13 @@ class SealedFileFooter:
         self.time_axis: TimeAxis | None = None
         self._min_max_cache: dict[str, list[tuple[int, int] | None]] = {}
 
-    def verify_unless_done(self, path: Path, *, only_slices: bool) -> None:
+    def verify_file_hash_once(self, path: Path) -> None:
         """Verify the file against its hash, unless that was done.
-
-        Args:
-            path: the file.
-            only_slices: the footer's own hash is enough, since pages are verified against their
-                checksums when they are read.
 
         Raises:
             FileFormatError: it is damaged.
         """
-        if self.is_file_verified or only_slices:
+        if self.is_file_verified:
             return
         try:
             hashes = read_stated_and_actual_hash(path)
@@ -201,7 +197,7 @@ def _parse_notes(text: bytes | None, *, where: str) -> dict[str, Any]:
     return notes
 
 
-def read_file_stamps(path: Path) -> FileStamps:
+def read_file_stamps_or_empty(path: Path) -> FileStamps:
     """Return device, inode, size and times, which change with a file; empty if there is none."""
     try:
         found = path.stat()

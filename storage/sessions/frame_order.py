@@ -75,8 +75,8 @@ class FrameOrderChecker:
                 found.append(f"part {part.part}: and {more} more of the kind")
         return found
 
-    def check_frames(self, columns: Mapping[str, Array]) -> None:
-        """Check the next frames.
+    def add_and_check_frames(self, columns: Mapping[str, Array]) -> None:
+        """Add the next frames, and collect messages about their order; nothing is raised.
 
         Args:
             columns: `seq`, `t_mono_ns`, `t_ns` and, if the file has it, `part`; n rows each.
@@ -146,7 +146,9 @@ def iterate_checking_order(
     order = FrameOrderChecker()
     for frames, extra in pieces:
         columns = {"seq": frames.seq, "t_mono_ns": frames.t_mono_ns, "t_ns": frames.t_ns}
-        order.check_frames(columns | {name: extra[name] for name in ("part",) if name in extra})
+        order.add_and_check_frames(
+            columns | {name: extra[name] for name in ("part",) if name in extra}
+        )
         if problems := order.problems:
             raise FileFormatError(
                 f"its frames are out of order: {problems[0]}",

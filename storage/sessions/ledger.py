@@ -37,9 +37,12 @@ def compute_ledger(
                 stream_id=part.stream_id,
                 seq_first=part.seq_first,
                 seq_last=last,
-                recorded=length - gaps.count,
-                lost={reason: numbers.count for reason, numbers in sorted(lost.by_reason.items())},
-                pending=(gaps - lost.numbers).count,
+                recorded=length - gaps.number_count,
+                lost={
+                    reason: numbers.number_count
+                    for reason, numbers in sorted(lost.by_reason.items())
+                },
+                pending=(gaps - lost.numbers).number_count,
                 max_lost_tail_frames=stream.max_lost_tail_frames,
             )
         )
@@ -62,7 +65,7 @@ def find_lost_numbers(
         _, lost = _find_gaps_and_losses(part, streams.get(part.stream_id, StreamState()))
         losses = found.setdefault(part.stream_id, Losses())
         for reason, numbers in lost.by_reason.items():
-            losses.add(numbers, reason)
+            losses.add_if_new(numbers, reason)
     return {
         stream_id: {reason: list(pairs) for reason, pairs in losses.to_pairs().items()}
         for stream_id, losses in found.items()
@@ -84,7 +87,7 @@ def _find_gaps_and_losses(part: Part, stream: StreamState) -> tuple[Intervals, L
     if last >= part.seq_first:
         gaps = stream.stored.missing_in(part.seq_first, last)
     lost = Losses(stream.lost.restricted_to(gaps))
-    lost.add(gaps - stream.obtainable - stream.lost.numbers, NODE_RESTARTED)
+    lost.add_if_new(gaps - stream.obtainable - stream.lost.numbers, NODE_RESTARTED)
     return gaps, lost
 
 
@@ -114,10 +117,8 @@ class StreamState:
 StreamStateT = TypeVar("StreamStateT", bound=StreamState)
 
 
-def adjust_states_to_session(
-    session: Session, streams: Mapping[str, StreamStateT]
-) -> dict[str, StreamStateT]:
-    """Return the streams' states as the session's ledger counts them.
+def settle_losses(session: Session, streams: Mapping[str, StreamStateT]) -> dict[str, StreamStateT]:
+    """Return the streams' states with their losses settled, as the ledger counts them.
 
     A damaged number is lost unless it is obtainable, and an obtainable one is lost once the session
     was given up. Slots count only from start to stop, and a tail counts only if a part reaches the
@@ -132,10 +133,10 @@ def adjust_states_to_session(
         stream = streams[part.stream_id]
         lost, may_come = Losses(stream.lost.to_pairs()), stream.obtainable
         if session.given_up:
-            lost.add(stream.damaged, CORRUPT)
-            lost.add(may_come, GIVEN_UP)
+            lost.add_if_new(stream.damaged, CORRUPT)
+            lost.add_if_new(may_come, GIVEN_UP)
             may_come = Intervals()
-        lost.add(stream.damaged - may_come, CORRUPT)
+        lost.add_if_new(stream.damaged - may_come, CORRUPT)
         reaches_end = (
             part.seq_last is None or stream.next_seq is None or part.seq_last >= stream.next_seq - 1
         )

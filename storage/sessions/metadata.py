@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from devices.errors import DamagedFileError, StorageError
-from storage.checksummed_json import parse_checksummed_json, read_checksummed_json
+from storage.checksummed_json import read_checksummed_json, verify_and_strip_json_checksum
 from storage.durable_files import read_small_file
 from storage.sessions.folder import Ledger, Part, Session
 
@@ -50,7 +50,7 @@ def parse_session_metadata(
         problems.append(f"{SESSION_NAME} {'cannot be read' if is_there else 'is missing'}")
         return None
     try:
-        body = parse_checksummed_json(session_json, where=SESSION_NAME)
+        body = verify_and_strip_json_checksum(session_json, where=SESSION_NAME)
         try:
             return make_session_metadata(Session.model_validate_json(body))
         except ValidationError:

@@ -12,7 +12,7 @@ from storage.sessions.pyramid import (
     Bins,
     concatenate_bins,
     find_group_starts,
-    make_frame_bins,
+    make_single_frame_bins,
     merge_bins,
 )
 
@@ -26,7 +26,7 @@ _NONE = np.empty(0, np.int64)
 
 
 class PreviewBins:
-    """Bins of consecutive frames, at most `most`; each covers more frames as the session grows.
+    """Bins of consecutive frames, at most `max_bins`; each covers more frames as the session grows.
 
     Attributes:
         frames_in_bin: frames per bin; 1: the bins are single frames.
@@ -42,25 +42,21 @@ class PreviewBins:
         self._last_frame: tuple[int, int] | None = None
         """Part and number of the last frame."""
 
-    def add_frames(self, frames: Mapping[str, Array], *, already_added: int = 0) -> int:
-        """Add the next frames.
+    def add_frames(self, frames: Mapping[str, Array], *, already_added: int = 0) -> None:
+        """Add the next frames, apart from leading ones that were added before.
 
         Args:
             frames: `storage.sessions.pyramid.required_frame_columns`, and `part`.
-            already_added: number of leading frames that were added before.
-
-        Returns:
-            How many of these frames were.
+            already_added: number of leading frames that were added before, at most all.
         """
-        if already_added and len(frames["seq"]):
-            already_added = min(already_added, len(frames["seq"]))
+        if already_added:
             self._last_frame = (
                 int(frames["part"][already_added - 1]),
                 int(frames["seq"][already_added - 1]),
             )
             frames = {name: values[already_added:] for name, values in frames.items()}
         if not len(frames["seq"]):
-            return already_added
+            return
         part = int(frames["part"][0])
         before = (
             self._last_frame[1]
@@ -68,15 +64,14 @@ class PreviewBins:
             else None
         )
         self._last_frame = int(frames["part"][-1]), int(frames["seq"][-1])
-        self._pending.append(make_frame_bins(frames, before))
+        self._pending.append(make_single_frame_bins(frames, before))
         self.frame_count += len(frames["seq"])
         if sum(_count_bins(piece) for piece in self._pending) >= max(
             _MIN_MERGED_FRAMES, self.frames_in_bin
         ):
             self._merge_full_bins()
-        return already_added
 
-    def truncate(self, max_frames: int) -> int:
+    def truncate_to_full_bins(self, max_frames: int) -> int:
         """Drop all but the first frames: those of full bins, at most `max_frames`.
 
         Returns:
@@ -116,7 +111,7 @@ class PreviewBins:
 def select_and_downsample_bins(
     bins: Bins, begin_ns: int | None, end_ns: int | None, max_bins: int
 ) -> tuple[Bins, int]:
-    """Return the bins of a time range, merged to at most `most`, and how many make one."""
+    """Return a time range's bins, merged to about `max_bins`, and how many make one."""
     rows = np.ones(_count_bins(bins), dtype=np.bool_)
     if begin_ns is not None:
         rows &= bins["t_last_ns"] >= begin_ns

@@ -98,8 +98,8 @@ def required_frame_columns(*, has_estimates: bool) -> tuple[str, ...]:
     )
 
 
-def make_frame_bins(frames: Mapping[str, Array], previous_seq: int | None = None) -> Bins:
-    """Make a bin for each frame.
+def make_single_frame_bins(frames: Mapping[str, Array], previous_seq: int | None = None) -> Bins:
+    """Make a bin of each single frame.
 
     Args:
         frames: `required_frame_columns`, (n,) or (n, tiles); `part` if there are several.
@@ -160,19 +160,19 @@ def _interval_ends(name: str, values: Array, sigmas: Array) -> Bins:
     return {f"{name.format('low')}_min": middle - half, f"{name.format('high')}_max": middle + half}
 
 
-def merge_bins(bins: Bins, count: int) -> Bins:
-    """Merge `count` bins at a time, or fewer at the end of a part."""
+def merge_bins(bins: Bins, group_size: int) -> Bins:
+    """Merge `group_size` bins at a time, or fewer at the end of a part."""
     if not len(bins["part"]):
         return bins
-    return _merge_groups(bins, find_group_starts(bins["part"], count))
+    return _merge_groups(bins, find_group_starts(bins["part"], group_size))
 
 
-def find_group_starts(part: Array, count: int) -> npt.NDArray[np.intp]:
-    """Return the first index of each group of `count`; no group extends over two parts."""
+def find_group_starts(part: Array, group_size: int) -> npt.NDArray[np.intp]:
+    """Return the first index of each group of `group_size`; no group extends over two parts."""
     n = len(part)
     begins = np.flatnonzero(np.r_[True, part[1:] != part[:-1]])
     since = np.arange(n) - np.repeat(begins, np.diff(np.r_[begins, n]))
-    return np.flatnonzero(since % count == 0)
+    return np.flatnonzero(since % group_size == 0)
 
 
 def _merge_groups(bins: Bins, starts: npt.NDArray[np.intp]) -> Bins:
@@ -227,7 +227,7 @@ class PyramidBuilder:
         before = self._last_frame[1] if follows and self._last_frame is not None else None
         last = int(frames["part"][-1]) if "part" in frames else 0
         self._last_frame = last, int(frames["seq"][-1])
-        self._open_frames.append(make_frame_bins(frames, before))
+        self._open_frames.append(make_single_frame_bins(frames, before))
         if sum(len(piece["part"]) for piece in self._open_frames) >= FRAMES_PER_FINEST_BIN:
             self._merge_full_bins()
 

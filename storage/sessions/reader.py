@@ -27,7 +27,7 @@ from storage.schema import (
     read_flat_column,
     read_quantity,
 )
-from storage.sessions.footer import SealedFileFooter, read_file_stamps
+from storage.sessions.footer import SealedFileFooter, read_file_stamps_or_empty
 from storage.sessions.sidecars import load_clock_table, read_stream_ids
 from storage.sessions.time_axis import (
     NODE_AXIS,
@@ -113,42 +113,43 @@ class SealedFileReader:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def has_columns(self, *names: str) -> bool:
+    def has_columns(self, *quantity_names: str) -> bool:
         """Return whether the file has these quantities (of `storage.schema.COLUMNS_BY_NAME`)."""
         tiles = len(self.info.tiles)
         return all(
-            self.column_names.issuperset(COLUMNS_BY_NAME[name].flat_names(tiles)) for name in names
+            self.column_names.issuperset(COLUMNS_BY_NAME[name].flat_names(tiles))
+            for name in quantity_names
         )
 
     def read_batches(
-        self, *extra_columns: str, row_groups: Sequence[int] | None = None
+        self, *extra_quantities: str, row_groups: Sequence[int] | None = None
     ) -> Iterator[tuple[FrameBatch, dict[str, Array]]]:
         """Yield frames in the order they were written, with extra columns.
 
         Args:
-            extra_columns: names of the extra columns.
+            extra_quantities: names of the extra columns.
             row_groups: row groups to read; None: all.
 
         Raises:
             FileFormatError: a column is missing, of another type, or damaged.
         """
-        names = (*(column.name for column in MEASURED_COLUMNS), *extra_columns)
-        for values in self.read_columns(*names, row_groups=row_groups):
+        names = (*(column.name for column in MEASURED_COLUMNS), *extra_quantities)
+        for values in self.read_quantities(*names, row_groups=row_groups):
             yield (
                 FrameBatch(**{column.name: values.pop(column.name) for column in MEASURED_COLUMNS}),
                 values,
             )
 
-    def read_columns(
+    def read_quantities(
         self,
-        *column_names: str,
+        *quantity_names: str,
         row_groups: Sequence[int] | None = None,
         max_values: int | None = None,
     ) -> Iterator[dict[str, Array]]:
         """Yield some quantities (of `COLUMNS_BY_NAME`), some thousand rows at a time.
 
         Args:
-            column_names: names of the quantities.
+            quantity_names: names of the quantities.
             row_groups: row groups to read; None: all.
             max_values: most numbers of a piece; None: the default.
 
@@ -156,13 +157,15 @@ class SealedFileReader:
             FileFormatError: as for `read_batches`.
         """
         tiles = len(self.info.tiles)
-        names = [flat for name in column_names for flat in COLUMNS_BY_NAME[name].flat_names(tiles)]
+        names = [
+            flat for name in quantity_names for flat in COLUMNS_BY_NAME[name].flat_names(tiles)
+        ]
         for group in range(len(self.footer.rows_by_group)) if row_groups is None else row_groups:
             for table in self._read_pieces(group, names, max_values):
                 with self._translate_damage(group):
                     values = {
                         name: read_quantity(COLUMNS_BY_NAME[name], table, tiles)
-                        for name in column_names
+                        for name in quantity_names
                     }
                 yield values
 
@@ -199,16 +202,16 @@ class SealedFileReader:
         unknown_groups = [group for group, min_max in enumerate(latest) if min_max is None]
         ends = [
             int(piece["t_ns"].max())
-            for piece in self.read_columns("t_ns", row_groups=unknown_groups)
+            for piece in self.read_quantities("t_ns", row_groups=unknown_groups)
         ]
         end = max([*ends, *(min_max[1] for min_max in latest if min_max is not None)])
         self.footer.span_ns = begin, end
         return begin, end
 
-    def read_flat_columns(
+    def read_overlapping_row_groups(
         self, names: Sequence[str], begin_t_ns: int | None, end_t_ns: int | None
     ) -> Iterator[dict[str, Array]]:
-        """Yield flat columns of the row groups that may have frames of a time range.
+        """Yield flat columns of all rows of the row groups that may have frames of a time range.
 
         Without statistics in the footer, all row groups are read.
 
@@ -225,7 +228,7 @@ class SealedFileReader:
         """
         logical = map_flat_columns(len(self.info.tiles))
         is_empty = True
-        for group in self.find_row_groups(begin_t_ns, end_t_ns):
+        for group in self.find_overlapping_row_groups(begin_t_ns, end_t_ns):
             for table in self._read_pieces(group, names):
                 with self._translate_damage(group):
                     values = {name: read_flat_column(logical[name], name, table) for name in names}
@@ -236,10 +239,12 @@ class SealedFileReader:
             with self._translate_damage(0):
                 yield {name: read_flat_column(logical[name], name, table) for name in names}
 
-    def find_row_groups(self, begin_t_ns: int | None, end_t_ns: int | None) -> list[int]:
+    def find_overlapping_row_groups(
+        self, begin_t_ns: int | None, end_t_ns: int | None
+    ) -> list[int]:
         """Return the row groups that may have frames of a time range.
 
-        Bounds as for `read_flat_columns`.
+        Bounds as for `read_overlapping_row_groups`.
         """
         if begin_t_ns is None and end_t_ns is None:
             return list(range(len(self.footer.rows_by_group)))
@@ -290,7 +295,7 @@ class SealedFileReader:
                 unknown_groups.append(group)
             else:
                 found.setdefault(part[0], []).extend(zip(t_mono_ns, t_ns, strict=True))
-        for piece in self.read_columns(*names, row_groups=unknown_groups):
+        for piece in self.read_quantities(*names, row_groups=unknown_groups):
             for number in np.unique(piece["part"]).tolist():
                 here = piece["part"] == number
                 ends = [[int(v.min()), int(v.max())] for v in (piece[n][here] for n in names[1:])]
@@ -339,16 +344,16 @@ def _open_with_footer(
 ) -> tuple[SealedFileFooter, pq.ParquetFile]:
     """Open a file and its footer; retry if the file is replaced in between."""
     while True:
-        stamps = read_file_stamps(path)
+        stamps = read_file_stamps_or_empty(path)
         own = footer or SealedFileFooter(
             path, skip_verification=is_checked, only_slices=only_slices
         )
-        if footer is not None and not is_checked:
-            footer.verify_unless_done(path, only_slices=only_slices)
+        if footer is not None and not (is_checked or only_slices):
+            footer.verify_file_hash_once(path)
         try:
             file = pq.ParquetFile(path, metadata=own.metadata, page_checksum_verification=True)
         except Exception as error:  # gone meanwhile, or damaged
             raise FileFormatError(f"cannot be read as Parquet: {error}", where=str(path)) from error
-        if footer is not None or stamps == read_file_stamps(path):
+        if footer is not None or stamps == read_file_stamps_or_empty(path):
             return own, file
         file.close()

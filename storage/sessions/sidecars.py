@@ -48,7 +48,7 @@ def read_markers(path: Path) -> tuple[Marker, ...]:
         return TypeAdapter(tuple[Marker, ...]).validate_python(table.to_pylist())
     except Exception as error:  # other content may cause any error
         raise DamagedFileError(
-            f"cannot be read as a table of events: {' '.join(str(error).split())[:300]}",
+            f"cannot be read as a table of markers: {' '.join(str(error).split())[:300]}",
             where=str(path),
             expected="columns id, label, t_ns without empty values",
         ) from error

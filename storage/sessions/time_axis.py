@@ -206,7 +206,7 @@ def _measure_clock_change(
     numbers = np.array([before.number, span.number])
     t_ns = np.array([before.t_ns[1], span.t_ns[0]], dtype=np.int64)
     t_mono_ns = np.array([before.t_mono_ns[1], span.t_mono_ns[0]], dtype=np.int64)
-    found = clock.compute_server_time(t_mono_ns, t_ns, numbers)
+    found = clock.compute_server_time_columns(t_mono_ns, t_ns, numbers)
     server_ns, bound_ns = found["t_server_ns"].tolist(), found["t_server_uncertainty_ns"].tolist()
     if UNKNOWN_T_NS in server_ns:
         return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from threading import Lock
 
-from storage.sessions.footer import FileStamps, SealedFileFooter, read_file_stamps
+from storage.sessions.footer import FileStamps, SealedFileFooter, read_file_stamps_or_empty
 from storage.sessions.reader import SealedFileReader
 
 _MAX_ENTRIES = 1000
@@ -36,7 +36,7 @@ class VerifiedFileCache:
         Raises:
             FileFormatError: as for `SealedFileReader`.
         """
-        stamps = read_file_stamps(path)
+        stamps = read_file_stamps_or_empty(path)
         with self._lock:
             footer = self._footers.pop(stamps, None)
             if footer is not None:
@@ -45,7 +45,7 @@ class VerifiedFileCache:
         reader = SealedFileReader(
             path, skip_verification=is_checked, only_slices=only_slices, footer=footer
         )
-        if stamps and stamps == read_file_stamps(path):  # not replaced meanwhile
+        if stamps and stamps == read_file_stamps_or_empty(path):  # not replaced meanwhile
             with self._lock:
                 self._store(stamps, reader.footer)
         elif footer is not None:  # it may be another file's by now

@@ -6,7 +6,7 @@ byte-stream-split: DuckDB before 2.0 and pyarrow before 16 do not read that. A r
 minute, in sessions of more than an hour up to five: each row group costs a reader of the footer
 some time. The file appears completely or not at all: it is written under a temporary name, synced,
 and renamed. Its footer has hashes of its content, of its bytes and of itself
-(`storage.sessions.compute_content_hash`, `storage.file_hash`).
+(`storage.sessions.content_hash`, `storage.parquet_hash`).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from storage.durable_files import make_temporary_path, sync_folder, translate_st
 from storage.parquet_hash import (
     FORMAT,
     FORMAT_KEY,
-    embed_file_hashes,
+    fill_hash_placeholders_and_sync,
 )
 from storage.schema import (
     ARRAY_INFO_KEY,
@@ -83,7 +83,13 @@ class SealedFileWriter:
         self._head = b"", b""
 
     def add_notes(self, notes: Mapping[str, object]) -> None:
-        """Add notes; only before the first minute's end."""
+        """Add notes; only before the first minute of frames is written.
+
+        Raises:
+            RuntimeError: the file has its notes already.
+        """
+        if self._writer is not None:
+            raise RuntimeError("notes after the file's head")
         self._notes |= notes
 
     def append_frames(self, frames: FrameBatch, extra_columns: Mapping[str, Array]) -> None:
@@ -91,7 +97,7 @@ class SealedFileWriter:
 
         Args:
             frames: n frames.
-            extra_columns: columns of `storage.schema.KNOWN` by name, n rows each.
+            extra_columns: columns of `storage.schema.COLUMNS_BY_NAME` by name, n rows each.
         """
         columns = {column.name: getattr(frames, column.name) for column in MEASURED_COLUMNS} | dict(
             extra_columns
@@ -128,7 +134,7 @@ class SealedFileWriter:
             self._writer.add_key_value_metadata(self._digest.compute_footer_entries(*self._head))
             self._writer.close()
             self._writer = None
-            embed_file_hashes(self._temporary)
+            fill_hash_placeholders_and_sync(self._temporary)
             self._temporary.replace(self.path)
         with translate_storage_errors(
             self.path, "The file is complete; a power cut may lose its name"
@@ -169,7 +175,7 @@ class SealedFileWriter:
             metadata={FORMAT_KEY: FORMAT, ARRAY_INFO_KEY: info_text, NOTES_KEY: notes_text},
         )
         table = pa.Table.from_arrays(list(arrays), schema=schema)
-        self._digest.add_table(table)
+        self._digest.add_table_and_check_order(table)
         self._group.append(table)
         self._pieces += 1
         if len(self._group) >= min(self._pieces // ROW_GROUP_GROWTH_RATIO, MAX_ROW_GROUP_PIECES):

@@ -89,11 +89,11 @@ class StreamReport:
             "node": self.node,
             "stream_id": self.stream_id,
             "segments": self.segment_count,
-            "frames": self.stored.count,
+            "frames": self.stored.number_count,
             "held": list(self.stored),
-            "lost": {reason: numbers.count for reason, numbers in lost if numbers},
-            "missing": self.absent_not_lost.count,
-            "unsynced": self.unsynced.count,
+            "lost": {reason: numbers.number_count for reason, numbers in lost if numbers},
+            "missing": self.absent_not_lost.number_count,
+            "unsynced": self.unsynced.number_count,
             "next_seq": self.notes.next_seq if self.notes is not None else None,
             "max_lost_tail_frames": self.notes.max_lost_tail_frames
             if self.notes is not None
@@ -142,9 +142,9 @@ def verify_journal(folder: Path) -> StreamReport:
         report.unsynced = report.unsynced | segment.unsynced
     report.unsynced = report.unsynced - report.stored
     if report.notes is not None:
-        report.lost.add(Intervals(report.notes.damaged) - report.stored, CORRUPT)
+        report.lost.add_if_new(Intervals(report.notes.damaged) - report.stored, CORRUPT)
     for segment in segments:
-        report.lost.add(segment.damaged - report.stored, CORRUPT)
+        report.lost.add_if_new(segment.damaged - report.stored, CORRUPT)
     _check_order_and_end(report, segments, is_servers=(folder.parents[2] / "nodes").is_dir())
     return report
 
@@ -184,7 +184,7 @@ def _check_order_and_end(
 
 def _check_clock(report: StreamReport, folder: Path) -> None:
     try:
-        lines = ClockLog(folder).read_content()
+        lines = ClockLog(folder).read_rows_and_damage()
     except StorageError as error:
         report.problems.append(f"{CLOCK_LOG}: {error.what}")
         return

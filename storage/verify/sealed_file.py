@@ -16,7 +16,7 @@ from devices.errors import FileFormatError
 from storage.intervals import Intervals, Losses, LossPairs, union
 from storage.parquet_hash import (
     footer_stated_and_actual_hash,
-    read_footer,
+    read_footer_or_empty,
     read_stated_and_actual_hash,
 )
 from storage.sessions.content_hash import ContentDigest
@@ -74,7 +74,7 @@ def verify_sealed_file(path: Path) -> SealedFileReport:
             "its bytes have changed since it was sealed, by the hash in its footer"
         )
     elif hashes is not None:
-        own = footer_stated_and_actual_hash(read_footer(path))
+        own = footer_stated_and_actual_hash(read_footer_or_empty(path))
         if own is None or own[0] != own[1]:
             report.problems.append("its footer's own hash is of another footer")
     try:
@@ -128,10 +128,10 @@ def find_ledger_mismatches(
             else Intervals()
         )
         accounted = sum(stated.lost.values()) + stated.pending
-        if gaps.count != accounted:
+        if gaps.number_count != accounted:
             problems.append(
-                f"{name}: {gaps.count} frames are missing ({_format_numbers(gaps)}), and the "
-                f"ledger accounts for {accounted}"
+                f"{name}: {gaps.number_count} frames are missing ({_format_numbers(gaps)}), and "
+                f"the ledger accounts for {accounted}"
             )
         if stated.stream_id in lost_by_stream:
             unnamed = gaps - lost_by_stream[stated.stream_id].numbers
@@ -191,7 +191,7 @@ def _verify_content(
     digest = ContentDigest()
     try:
         for table in reader.read_tables():
-            digest.add_table(table)
+            digest.add_table_and_check_order(table)
     except (KeyError, ValueError, TypeError) as error:
         if isinstance(error, FileFormatError):
             raise
@@ -268,7 +268,7 @@ def _check_ledger(report: SealedFileReport) -> None:
                     seq_first=part.seq_first,
                     seq_last=part.seq_last,
                     recorded=part.frames,
-                    lost={"unknown": part.gaps.count} if part.gaps else {},
+                    lost={"unknown": part.gaps.number_count} if part.gaps else {},
                     pending=0,
                 )
                 for part in report.parts

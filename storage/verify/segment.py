@@ -17,7 +17,7 @@ import pyarrow as pa
 
 from devices.errors import DamagedFileError, FileFormatError
 from devices.frames import ArrayInfo
-from storage.frame_rules import find_broken_rule
+from storage.frame_rules import describe_first_broken_rule
 from storage.intervals import Intervals
 from storage.journal.segment_format import (
     INDEX_SUFFIX,
@@ -29,10 +29,10 @@ from storage.journal.segment_format import (
     make_message_batch,
     mask_valid_records,
     read_index,
-    read_messages_from,
-    read_payload,
+    read_messages_until_damage,
     read_schema_and_first_offset,
-    select_batches,
+    read_verified_payload,
+    select_valid_batch_records,
     seq_range_of,
 )
 from storage.message_batch import MessageBatchDecoder
@@ -75,10 +75,10 @@ class SegmentReport:
         return {
             "node": self.info.node if self.info is not None else None,
             "stream_id": self.info.stream_id if self.info is not None else None,
-            "frames": self.stored.count,
+            "frames": self.stored.number_count,
             "held": list(self.stored),
             "damaged": list(self.damaged),
-            "unsynced": self.unsynced.count,
+            "unsynced": self.unsynced.number_count,
             "closed": self.is_closed,
             "problems": self.problems,
         }
@@ -129,9 +129,9 @@ def _verify(path: Path, report: SegmentReport) -> None:
             )
         return
     _BatchVerifier(report, schema, header_bytes).verify(index)
-    end = max(header_bytes, find_end_offset(select_batches(index)))
+    end = max(header_bytes, find_end_offset(select_valid_batch_records(index)))
     behind, at = 0, end
-    for message in read_messages_from(path, end, schema):
+    for message in read_messages_until_damage(path, end, schema):
         at += len(message.payload)
         if at > size:
             break
@@ -202,7 +202,7 @@ class _BatchVerifier:
         t_ns_first, t_ns_last = frames.t_ns[ends - records["count"]], frames.t_ns[ends - 1]
         if (t_ns_first != records["t_ns_first"]).any() or (t_ns_last != records["t_ns_last"]).any():
             return False
-        if find_broken_rule(frames, self._info):
+        if describe_first_broken_rule(frames, self._info):
             return False
         self._report.stored.add_ranges(records["seq_first"], records["count"])
         self._report_pending()
@@ -218,7 +218,7 @@ class _BatchVerifier:
         if not record["count"]:
             return False
         first, last = seq_range_of(record)
-        payload = read_payload(descriptor, record)
+        payload = read_verified_payload(descriptor, record)
         if payload is None:
             self._pending_problems.append(
                 f"frames {first} to {last} do not agree with their checksum"
@@ -255,14 +255,14 @@ def _find_batch_problem(payload: bytes, record: np.void, schema: pa.Schema, info
         return f"the batch holds {len(batch)} frames from {int(batch.seq[0])} on"
     if (int(batch.t_ns[0]), int(batch.t_ns[-1])) != (record["t_ns_first"], record["t_ns_last"]):
         return "the index has other instants than the batch"
-    return find_broken_rule(batch, info)
+    return describe_first_broken_rule(batch, info)
 
 
 def _has_any_batch(path: Path, index: Records) -> bool:
     """Return whether any batch in the segment matches the index."""
     with path.open("rb") as file:
-        batches = select_batches(index)
-        return any(read_payload(file.fileno(), record) is not None for record in batches)
+        batches = select_valid_batch_records(index)
+        return any(read_verified_payload(file.fileno(), record) is not None for record in batches)
 
 
 def _read_schema(path: Path, report: SegmentReport) -> tuple[pa.Schema | None, int]:

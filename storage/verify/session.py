@@ -16,7 +16,7 @@ from storage.clock.file import CLOCK_NAME, read_clock_file
 from storage.intervals import NO_END, Intervals
 from storage.parquet_hash import compute_sha256
 from storage.sessions.folder import FRAMES_NAME, Ledger, Marker, Session
-from storage.sessions.ledger import adjust_states_to_session, compute_ledger
+from storage.sessions.ledger import compute_ledger, settle_losses
 from storage.sessions.metadata import (
     SESSION_NAME,
     StoredMetadata,
@@ -332,7 +332,7 @@ def _count_ledger(
         reports.setdefault(part.stream_id, StreamReport(session.node, part.stream_id))
     # For a server's folder a node may still send frames; a node's own folder has all of them.
     may_come = Intervals([(0, NO_END)] if (data / "nodes").is_dir() else ())
-    states = adjust_states_to_session(
+    states = settle_losses(
         session, {b: found.to_stream_state(may_come) for b, found in reports.items()}
     )
     ledger = compute_ledger(session.parts, states, is_finished=session.stopped_t_ns is not None)

@@ -40,20 +40,20 @@ def node_folder(folder: Path) -> Path:
     )
     for stream_id in BOOTS:
         info = make_array(node="leg", stream_id=stream_id)
-        stream = journal.begin_stream(info)
+        stream = journal.switch_to_new_stream(info)
         in_flight = InFlightWriter(stream.folder, info)
         for first in range(0, 200, 10):
             frames = make_frames(np.arange(first, first + 10))
             for row in rows_of(frames):
                 in_flight.write_frame(row)
             for message in encode_as_messages(frames, info):
-                journal.queue_batch(stream, message)
+                journal.queue_batch_and_limit_memory(stream, message)
         in_flight.close()
         until(partial(_is_stored, stream))
     until((live / "journal" / "leg" / "retention.json").exists)
     until(lambda: not (live / "journal" / "leg" / BOOTS[0] / "in_flight").exists())
     shutil.copytree(live, folder)  # as SIGKILL leaves it
-    journal.close()
+    journal.end_streams_and_close()
     return folder
 
 
@@ -99,9 +99,9 @@ def _goes_on(root: Path, undamaged: Sequence[str]) -> tuple[str, list[str]]:
     journal.start_writer()
     try:
         info = make_array(node="leg", stream_id="c" * 32)
-        stream = journal.begin_stream(info)
+        stream = journal.switch_to_new_stream(info)
         for message in encode_as_messages(make_frames(np.arange(10)), info):
-            journal.queue_batch(stream, message)
+            journal.queue_batch_and_limit_memory(stream, message)
         until(lambda: stream.stored.last == 9)
         known = {each.stream_id: each for each in journal.streams}
         for stream_id in undamaged:
@@ -122,7 +122,7 @@ def _goes_on(root: Path, undamaged: Sequence[str]) -> tuple[str, list[str]]:
                 return f"of stream {each.stream_id} only {read} are read", journal.problems
         return "", list(journal.problems)
     finally:
-        journal.close()
+        journal.end_streams_and_close()
 
 
 def _is_stored(stream: NodeStream) -> bool:

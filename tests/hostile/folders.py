@@ -83,7 +83,7 @@ def make_node(root: Path) -> None:
     folder = _journal(root, make_array(stream_id=BOOT))
     wanted = RetentionRequests(folder.parent / "retention.json")
     write_secrets(folder.parent / SECRETS_NAME, {SERVER_ID: SECRET})
-    wanted.update_server_request(
+    wanted.update_request_in_memory(
         SERVER_ID, RetentionRequest(streams={BOOT: ((0, None),)}, known=(BOOT,))
     )
     wanted.save()
@@ -171,7 +171,7 @@ def _clock(path: Path) -> bytes:
     with SealedFileReader(path) as reader:
         table = load_clock_table(reader)
         columns = [
-            table.compute_server_time(frames.t_mono_ns, frames.t_ns, extra["part"])
+            table.compute_server_time_columns(frames.t_mono_ns, frames.t_ns, extra["part"])
             for frames, extra in reader.read_batches("part")
         ]
     values = [values.tobytes() for each in columns for values in each.values()]

@@ -177,7 +177,7 @@ class Running:
         """A journal as another process would find it now: opened from a copy of its files."""
         copy = self.data.with_name(f"copy-{uuid.uuid4().hex}")
         shutil.copytree(self.data / "journal" / name / stream_id, copy)
-        return Journal.open(copy)
+        return Journal.open_and_recover(copy)
 
     def held(self, stream_id: str, name: str = "bench") -> FrameBatch:
         """All that its journal holds, in order."""
@@ -207,7 +207,7 @@ class Running:
         self.open_journals = []
         for node in self.server.nodes:
             for journal in node.journals.values():
-                if journal.has_open_segment:
+                if journal.has_unclosed_segment:
                     self.open_journals.append(journal.folder)
                     journal.close()
         self._left_over = await _left_over()

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from devices.errors import DamagedFileError
 from storage.checksummed_json import (
-    append_checksum,
-    parse_checksummed_json,
+    append_json_checksum,
     read_checksummed_json,
+    verify_and_strip_json_checksum,
     write_checksummed_json,
 )
 from storage.durable_files import set_aside_damaged
@@ -32,41 +32,41 @@ objects = st.dictionaries(
 def test_it_is_the_same_object_with_one_key_more(
     content: dict[str, object], indent: int | None
 ) -> None:
-    text = append_checksum(json.dumps(content, indent=indent).encode())
+    text = append_json_checksum(json.dumps(content, indent=indent).encode())
     found = json.loads(text)
     assert len(found.pop("check")) == 64
     assert found == content
-    assert json.loads(parse_checksummed_json(text, where="")) == content
+    assert json.loads(verify_and_strip_json_checksum(text, where="")) == content
 
 
 @given(objects, st.data())
 def test_every_flipped_bit_is_seen(content: dict[str, object], data: st.DataObject) -> None:
-    text = bytearray(append_checksum(json.dumps(content, indent=1).encode()))
+    text = bytearray(append_json_checksum(json.dumps(content, indent=1).encode()))
     at = data.draw(st.integers(0, len(text) - 1))
     text[at] ^= 1 << data.draw(st.integers(0, 7))
     with pytest.raises(DamagedFileError):
-        parse_checksummed_json(bytes(text), where="")
+        verify_and_strip_json_checksum(bytes(text), where="")
 
 
 @given(objects, st.data())
 def test_a_byte_less_or_more_is_seen(content: dict[str, object], data: st.DataObject) -> None:
-    whole = append_checksum(json.dumps(content, indent=1).encode())
+    whole = append_json_checksum(json.dumps(content, indent=1).encode())
     at = data.draw(st.integers(0, len(whole) - 1))
     more = data.draw(st.binary(min_size=1, max_size=2))
     for text in (whole[:at] + whole[at + 1 :], whole[:at] + more + whole[at:]):
         with pytest.raises(DamagedFileError):
-            parse_checksummed_json(text, where="")
+            verify_and_strip_json_checksum(text, where="")
 
 
 @given(objects, st.data())
 def test_what_was_cut_or_has_zeros_at_its_end_is_damaged(
     content: dict[str, object], data: st.DataObject
 ) -> None:
-    whole = append_checksum(json.dumps(content, indent=1).encode())
+    whole = append_json_checksum(json.dumps(content, indent=1).encode())
     cut = whole[: data.draw(st.integers(0, len(whole) - 1))]
     for text in (cut, cut + bytes(len(whole) - len(cut))):
         with pytest.raises(DamagedFileError, match=r"a\.json"):
-            parse_checksummed_json(text, where="a.json")
+            verify_and_strip_json_checksum(text, where="a.json")
 
 
 def test_a_file_is_written_with_its_hash_and_read_without(tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ def test_a_file_is_written_with_its_hash_and_read_without(tmp_path: Path) -> Non
 )
 def test_what_states_no_hash_is_damaged(text: bytes) -> None:
     with pytest.raises(DamagedFileError, match=r"a\.json"):
-        parse_checksummed_json(text, where="a.json")
+        verify_and_strip_json_checksum(text, where="a.json")
 
 
 def test_a_missing_file_is_missing_and_not_damaged(tmp_path: Path) -> None:

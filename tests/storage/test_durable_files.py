@@ -20,13 +20,13 @@ from storage.durable_files import (
     lock_folder,
     make_synced_folder,
     make_temporary_path,
-    remove_stale_temporaries,
+    remove_dead_process_temporaries,
     set_aside_damaged,
     sync_folder,
     translate_storage_errors,
     write_atomically,
 )
-from storage.permissions import restrict_to_owner
+from storage.permissions import set_umask_and_restrict_folder
 from tests.storage.faulty_disk import IO_ERROR, disk_with_room_for, refusing
 
 
@@ -214,7 +214,7 @@ def test_a_file_system_without_permissions_is_used(
     monkeypatch.setattr(os, "chmod", refusing(OSError, number, os.strerror(number)))
     umask = os.umask(0o022)
     try:
-        restrict_to_owner(tmp_path / "data")
+        set_umask_and_restrict_folder(tmp_path / "data")
         assert os.umask(0o022) == 0o077
     finally:
         os.umask(umask)
@@ -228,7 +228,7 @@ def test_a_folder_that_cannot_be_closed_to_others_is_an_error_that_names_it(
     try:
         (tmp_path / "data").mkdir(mode=0o755)
         with pytest.raises(StorageError, match="closed to other users") as caught:
-            restrict_to_owner(tmp_path / "data")
+            set_umask_and_restrict_folder(tmp_path / "data")
     finally:
         os.umask(umask)
     assert caught.value.where == str(tmp_path / "data")
@@ -301,9 +301,9 @@ def test_what_a_dead_process_left_is_removed_and_nothing_else(tmp_path: Path) ->
     for path in (stale, mine, *(tmp_path / name for name in others)):
         path.write_bytes(b"x")
     (tmp_path / f".folder.{process.pid}.tmp").mkdir()
-    assert remove_stale_temporaries(tmp_path) == [stale]
+    assert remove_dead_process_temporaries(tmp_path) == [stale]
     assert {p.name for p in tmp_path.iterdir() if p.is_file()} == {mine.name, *others}
-    assert remove_stale_temporaries(tmp_path) == []
+    assert remove_dead_process_temporaries(tmp_path) == []
 
 
 @pytest.mark.process
@@ -313,11 +313,11 @@ def test_what_a_living_process_is_writing_stays(tmp_path: Path) -> None:
     ) as process:
         writing = first_line(process)
         writing.write_bytes(b"x")
-        assert remove_stale_temporaries(tmp_path) == []
+        assert remove_dead_process_temporaries(tmp_path) == []
         process.kill()
         os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
         # It is dead, although nobody has asked for its end.
-        assert remove_stale_temporaries(tmp_path) == [writing]
+        assert remove_dead_process_temporaries(tmp_path) == [writing]
 
 
 def test_a_number_that_was_given_to_another_process_is_no_sign_of_life(tmp_path: Path) -> None:
@@ -325,10 +325,10 @@ def test_a_number_that_was_given_to_another_process_is_no_sign_of_life(tmp_path:
     parts = mine.name.split(".")
     stale = mine.with_name(".".join([*parts[:3], str(int(parts[3]) - 1), *parts[4:]]))
     stale.write_bytes(b"")
-    assert remove_stale_temporaries(tmp_path) == [stale]
+    assert remove_dead_process_temporaries(tmp_path) == [stale]
 
 
 def test_a_folder_that_is_not_there_is_an_error_that_names_it(tmp_path: Path) -> None:
     with pytest.raises(StorageError) as caught:
-        remove_stale_temporaries(tmp_path / "none")
+        remove_dead_process_temporaries(tmp_path / "none")
     assert caught.value.where == str(tmp_path / "none")

@@ -34,7 +34,7 @@ def test_it_holds_what_was_added_in_whatever_order(added: list[tuple[int, int]])
         found.add(first, last)
         assert_tidy(found)
         assert members(found) == members(added[: at + 1])
-    assert found.count == len(members(added))
+    assert found.number_count == len(members(added))
     assert found.last == max(members(added), default=None)
     assert bool(found) == bool(added)
     assert found == Intervals(reversed(added))
@@ -83,7 +83,7 @@ def test_a_stream_that_came_in_any_order_is_one_interval(order: list[int]) -> No
 def test_numbers_may_be_as_large_as_a_stream_can_count() -> None:
     held = Intervals([(0, 0), (2**62, 2**64)])
     assert list(held.missing_in(0, 2**64)) == [(1, 2**62 - 1)]
-    assert held.count == 2**64 - 2**62 + 2
+    assert held.number_count == 2**64 - 2**62 + 2
 
 
 def test_an_empty_interval_is_refused_and_changes_nothing() -> None:

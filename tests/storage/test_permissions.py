@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from storage.durable_files import make_synced_folder, write_atomically
-from storage.permissions import restrict_to_owner
+from storage.permissions import set_umask_and_restrict_folder
 
 
 @pytest.fixture(autouse=True)
@@ -32,7 +32,7 @@ def written(folder: Path) -> tuple[int, int]:
 
 
 def test_a_folder_that_is_made_is_its_users(tmp_path: Path) -> None:
-    restrict_to_owner(tmp_path / "a" / "data")
+    set_umask_and_restrict_folder(tmp_path / "a" / "data")
     assert mode_of(tmp_path / "a" / "data") == 0o700
     assert written(tmp_path / "a" / "data") == (0o700, 0o600)
 
@@ -54,7 +54,7 @@ def test_a_folder_of_ours_that_all_could_read_is_closed(
     for name in found:
         (tmp_path / name).touch()
     tmp_path.chmod(0o755)
-    restrict_to_owner(tmp_path)
+    set_umask_and_restrict_folder(tmp_path)
     assert mode_of(tmp_path) == 0o700
 
 
@@ -66,7 +66,7 @@ def test_somebodys_home_stays_as_it_is_but_what_we_write_there_is_closed(
     (tmp_path / name).mkdir()
     tmp_path.chmod(0o755)
     for _ in range(2):
-        restrict_to_owner(tmp_path)
+        set_umask_and_restrict_folder(tmp_path)
         assert mode_of(tmp_path) == 0o755
         assert written(tmp_path) == (0o700, 0o600)
         for ours in (".lock", "server_id"):  # what a start leaves is there at the second one
@@ -76,7 +76,7 @@ def test_somebodys_home_stays_as_it_is_but_what_we_write_there_is_closed(
 @pytest.mark.parametrize("mode", [0o750, 0o770, 0o2750])
 def test_a_group_that_the_owner_let_in_may_read(tmp_path: Path, mode: int) -> None:
     tmp_path.chmod(mode)
-    restrict_to_owner(tmp_path)
+    set_umask_and_restrict_folder(tmp_path)
     assert mode_of(tmp_path) == mode
     folder, file = written(tmp_path)
     assert (folder & 0o777, file) == (0o750, 0o640)

@@ -80,7 +80,7 @@ def node_command(
     from service.node.tcp_connect import make_ingest_url
     from service.rig.options import RigOptions
     from service.user_folders import resolve_user_folder
-    from storage.permissions import restrict_to_owner
+    from storage.permissions import set_umask_and_restrict_folder
 
     if end_with_parent:
         from devices import realtime
@@ -108,7 +108,7 @@ def node_command(
     rig = RigOptions(the_scene, _choose_name(name), options.make_foot(the_scene))
     calibration, problem = find_scene_calibration(rig)
     with suppress(StorageError):  # an unwritable card is reported later
-        restrict_to_owner(folder)
+        set_umask_and_restrict_folder(folder)
     outcome = asyncio.run(
         _run_node(
             NodeOptions(

@@ -39,14 +39,14 @@ def recover_command(
     """
     from service.sessions.recovery import recover_folder
     from storage.durable_files import lock_folder
-    from storage.permissions import restrict_to_owner
+    from storage.permissions import set_umask_and_restrict_folder
 
     if not any((folder / name).is_dir() for name in ("journal", "sessions")):
         raise UsageError(
             f"no data folder {str(folder)!r}",
             expected="a folder with `journal` and `sessions`, of a server or a node",
         )
-    restrict_to_owner(folder)
+    set_umask_and_restrict_folder(folder)
     with lock_folder(folder), show_progress("opening journals") as report_step:
         recovery = recover_folder(
             folder, make_sessions=streams, abandon_missing=give_up, report_step=report_step

@@ -119,10 +119,10 @@ async def _run_server(settings: Settings) -> None:
     from service.api.logins import Logins
     from service.api.runner import serve_app
     from service.server.server import Server
-    from storage.permissions import restrict_to_owner
+    from storage.permissions import set_umask_and_restrict_folder
 
     stop = create_stop_event()
-    restrict_to_owner(settings.data)
+    set_umask_and_restrict_folder(settings.data)
     with open_listening_socket(settings.host, settings.port) as listening:
         server = Server(settings.data, exact=settings.no_quantize)
         token = load_or_create_token(settings.token, settings.data)

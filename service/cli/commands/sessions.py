@@ -89,15 +89,15 @@ def sessions_command(
     from rich.markup import escape
     from rich.table import Table
 
-    from storage.sessions.filters import SessionFilter, parse_completeness, parse_t_ns
+    from storage.sessions.filters import SessionFilter, parse_completeness, parse_iso_or_t_ns
 
     filters = SessionFilter(
         nodes=tuple(node or ()),
         tags=tuple(tag or ()),
         take=take,
         q=search,
-        from_t_ns=None if since is None else parse_t_ns(since, where="--from"),
-        to_t_ns=None if until is None else parse_t_ns(until, where="--to"),
+        from_t_ns=None if since is None else parse_iso_or_t_ns(since, where="--from"),
+        to_t_ns=None if until is None else parse_iso_or_t_ns(until, where="--to"),
         complete=None if complete is None else parse_completeness(complete, where="--complete"),
     )
     if server is not None and data is not None:

@@ -154,7 +154,7 @@ def _print_report(report: Report, *, is_part: bool = False) -> None:
         echo(_format_export(report))
     elif isinstance(report, SegmentReport):
         closed = "closed" if report.is_closed else "not closed"
-        echo(f"segment {report.path.name}: {report.stored.count} frames, {closed}")
+        echo(f"segment {report.path.name}: {report.stored.number_count} frames, {closed}")
         remarks = report.remarks
     else:
         echo(_format_stream(report))
@@ -199,10 +199,10 @@ def _format_ledger(ledger: Ledger | None) -> str:
 
 
 def _format_stream(report: StreamReport) -> str:
-    lost = sum(numbers.count for numbers in report.lost.by_reason.values())
+    lost = sum(numbers.number_count for numbers in report.lost.by_reason.values())
     return (
-        f"journal {report.node}/{report.stream_id}: {report.stored.count} frames in "
+        f"journal {report.node}/{report.stream_id}: {report.stored.number_count} frames in "
         f"{report.segment_count} segments"
         + (f", {lost} lost" if lost else "")
-        + (f", {report.absent_not_lost.count} not here" if report.absent_not_lost else "")
+        + (f", {report.absent_not_lost.number_count} not here" if report.absent_not_lost else "")
     )

@@ -20,7 +20,7 @@ from service.offline.archive.locations import (
 )
 from service.offline.archive.temporary_folders import SYSTEM_TEMP_FOLDER, create_workspace
 from storage.durable_files import translate_storage_errors
-from storage.parquet_hash import read_footer_from
+from storage.parquet_hash import read_footer_or_empty_from
 from storage.sessions.folder import FRAMES_NAME
 from storage.sessions.metadata import (
     SESSION_NAME,
@@ -45,7 +45,7 @@ def hash_session(location: SessionLocation) -> str:
     """
     if location.is_single_file:
         with open_for_reading(location.uri) as file:
-            metadata = read_footer_from(file)
+            metadata = read_footer_or_empty_from(file)
     else:
         metadata = read_bytes(f"{location.uri}/{SESSION_NAME}")
     return hashlib.sha256(metadata).hexdigest()

@@ -30,11 +30,11 @@ from service.offline.archive.temporary_folders import (
     create_workspace,
     remove_stale_workspaces,
 )
-from storage.checksummed_json import append_checksum, parse_checksummed_json
+from storage.checksummed_json import append_json_checksum, verify_and_strip_json_checksum
 from storage.durable_files import (
     make_synced_folder,
     make_temporary_path,
-    remove_stale_temporaries,
+    remove_dead_process_temporaries,
     sync_folder,
     translate_storage_errors,
 )
@@ -121,7 +121,7 @@ class ResultStore:
         Raises:
             StorageError: it cannot be written.
         """
-        text = append_checksum(json.dumps(vars(note), indent=1).encode())
+        text = append_json_checksum(json.dumps(vars(note), indent=1).encode())
         where = f"{self.out}/{session_id}/{_note_name(note.command)}"
         if self.is_remote:
             upload(where, text)
@@ -159,7 +159,9 @@ class ResultStore:
     def _read_note(self, name: str, command: str) -> ResultNote | None:
         where = f"{self.out}/{name}/{_note_name(command)}"
         try:
-            return ResultNote(**json.loads(parse_checksummed_json(read_bytes(where), where=where)))
+            return ResultNote(
+                **json.loads(verify_and_strip_json_checksum(read_bytes(where), where=where))
+            )
         except (FileFormatError, TypeError, ValueError):
             return None
 
@@ -173,7 +175,7 @@ class ResultStore:
             return
         with translate_storage_errors(Path(target)):
             Path(target).mkdir(parents=True, exist_ok=True)
-            remove_stale_temporaries(Path(target))
+            remove_dead_process_temporaries(Path(target))
             for path in files:
                 with path.open("rb") as file:
                     os.fsync(file.fileno())

@@ -22,7 +22,7 @@ from service.offline.archive.local_copies import (
 )
 from service.offline.estimate.request import CHUNK_FRAMES, EstimateRequest
 from service.offline.export import ExportOptions, export_session
-from storage.checksummed_json import append_checksum
+from storage.checksummed_json import append_json_checksum
 from storage.clock.file import CLOCK_NAME
 from storage.formats.slice import Slice
 from storage.formats.writers.registry import get_format
@@ -283,4 +283,4 @@ def _copy_session_files(source: Path, work: Path) -> None:
         if (content := read_bytes_or_none(source / name)) is not None:
             (work / name).write_bytes(content)
     text = json.dumps({**metadata.content, **about}, indent=1).encode()
-    (work / SESSION_NAME).write_bytes(append_checksum(text))
+    (work / SESSION_NAME).write_bytes(append_json_checksum(text))

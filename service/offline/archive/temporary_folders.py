@@ -14,7 +14,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from storage.durable_files import is_stale_temporary, make_temporary_path, translate_storage_errors
+from storage.durable_files import (
+    is_dead_process_temporary,
+    make_temporary_path,
+    translate_storage_errors,
+)
 
 _MACHINE = re.sub(r"[^\w-]", "-", socket.gethostname())
 SYSTEM_TEMP_FOLDER = Path(tempfile.gettempdir()) / f"foottile-{os.getuid()}"
@@ -41,5 +45,5 @@ def create_workspace(parent: Path) -> Iterator[Path]:
 def remove_stale_workspaces(parent: Path) -> None:
     """Delete folders left by killed processes of this machine."""
     for folder in parent.glob(f".{_MACHINE}.*.tmp"):
-        if is_stale_temporary(folder.name):
+        if is_dead_process_temporary(folder.name):
             shutil.rmtree(folder, ignore_errors=True)

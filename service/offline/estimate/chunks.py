@@ -25,7 +25,7 @@ from service.offline.estimate.preparation import PreparedEstimate, prepare_estim
 from service.offline.estimate.request import CHUNK_FRAMES, EstimateRequest
 from service.offline.estimate.session import EstimateResult, write_estimates
 from service.sessions.pipeline import EstimateStream
-from storage.checksummed_json import append_checksum, parse_checksummed_json
+from storage.checksummed_json import append_json_checksum, verify_and_strip_json_checksum
 from storage.durable_files import open_for_atomic_write, read_small_file, write_atomically
 from storage.parquet_hash import compute_sha256
 from storage.schema import ESTIMATE_COLUMNS
@@ -127,7 +127,7 @@ def estimate_next_chunk(
             if end != "json"
         }
     )
-    text = append_checksum(json.dumps(vars(made)).encode())
+    text = append_json_checksum(json.dumps(vars(made)).encode())
     write_atomically(chunks_folder / f"{number:04}.json", text)
     return True
 
@@ -204,7 +204,7 @@ def _list_finished_chunks(folder: Path) -> list[_ChunkIndex]:
         path = folder / f"{len(found):04}.json"
         try:
             index: dict[str, Any] = json.loads(
-                parse_checksummed_json(read_small_file(path), where=str(path))
+                verify_and_strip_json_checksum(read_small_file(path), where=str(path))
             )
         except FileNotFoundError:
             return found

@@ -48,7 +48,7 @@ def read_stored_estimates(path: Path) -> StoredEstimates | None:
             lag_ms = session.notes.get("lag_ms")
             if not isinstance(lag_ms, int | float) or not session.has_columns(*_COLUMNS):
                 return None
-            pieces = list(session.read_columns(*_COLUMNS))
+            pieces = list(session.read_quantities(*_COLUMNS))
     except FileFormatError:
         return None
     if not pieces:

@@ -103,7 +103,7 @@ def compute_estimation_range(
     if from_ns is not None and from_ns <= first_ns:
         from_ns = None
     until_ns = None if end_ns is None else end_ns + plan.lag_ns + _READ_MARGIN_NS
-    groups = tuple(session.find_row_groups(from_ns, until_ns))
+    groups = tuple(session.find_overlapping_row_groups(from_ns, until_ns))
     return EstimationRange(from_ns, begin_ns, end_ns, until_ns, groups, session.time_axis)
 
 

@@ -145,7 +145,7 @@ def evaluate_trial(
         ),
     )
     with SealedFileReader(session_path) as reader:
-        t_ns = np.concatenate([piece["t_mono_ns"] for piece in reader.read_columns("t_mono_ns")])
+        t_ns = np.concatenate([piece["t_mono_ns"] for piece in reader.read_quantities("t_mono_ns")])
     injected = json.loads(make_injected_path(reference_path).read_text())
     return TrialResult(
         name=name,

@@ -141,14 +141,14 @@ class RecomputedFrames:
         self, node: ServerNode, stream: ServerStream, calibration: Calibration | None, seq: int
     ) -> int:
         """Return the number of the frame with which models start."""
-        t_ns = self._journal.find_t_ns_near(seq, is_upper=False)
+        t_ns = self._journal.find_batch_t_ns_near(seq, at_or_before=False)
         tare = node.estimator.tare_history.tare_in_force_or_lost(stream.info)
         if calibration is None or tare is None or t_ns is None:
             return seq
         plan = make_plan(
             stream.info, calibration, tare, models=stream.info.models, lag_ms=LIVE_LAG_MS
         )
-        since = self._journal.find_first_seq_since(
+        since = self._journal.find_first_batch_seq_since(
             t_ns - round(1e9 * compute_settling_time_s(plan))
         )
         return seq if since is None else min(seq, since)
@@ -209,8 +209,8 @@ def _list_changes(
     if journal is None:
         return recorded
     until = last if not recorded or recorded[0].seq is None else max(begin, recorded[0].seq - 1)
-    t_ns = journal.find_t_ns_near(begin, is_upper=False)
-    until_ns = journal.find_t_ns_near(until, is_upper=True)
+    t_ns = journal.find_batch_t_ns_near(begin, at_or_before=False)
+    until_ns = journal.find_batch_t_ns_near(until, at_or_before=True)
     if t_ns is None or until_ns is None:
         return recorded
     tares = node.estimator.tare_history.tares_in_force_between(stream.info, t_ns, until_ns)

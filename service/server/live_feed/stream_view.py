@@ -99,7 +99,9 @@ class ServerStreamView:
             return (*order, None)[order.index(self._stream_id) + 1]
         # Hello no longer lists it: the next one is the first that began later, by the node's clock.
         journal = None if self._stream is None else self._stream.journal
-        last_t_ns = None if journal is None else journal.find_t_ns_near(NO_END, is_upper=True)
+        last_t_ns = (
+            None if journal is None else journal.find_batch_t_ns_near(NO_END, at_or_before=True)
+        )
         if last_t_ns is not None:
             for each in node.hello.earlier:
                 if each.t_ns_first > last_t_ns:

@@ -35,7 +35,7 @@ def is_bioware(head: str) -> bool:
 def parse_bioware_force_and_cop(
     text: str, where: str, _is_needed: ColumnFilter, values_max: int
 ) -> ForceTable:
-    """Parse the vertical force and centre of pressure of each plate, whichever columns are needed.
+    """Parse the vertical force and centre of pressure of every plate, needed or not.
 
     Raises:
         FileFormatError: names or force plates are missing, or numbers do not fit the names.

@@ -38,7 +38,7 @@ def read_sealed_session_table(path: Path, optional_names: Collection[str]) -> Fo
             for name in (INSTANT_COLUMN, "part", *STANDARD_UNITS, *sorted(optional_names))
             if name in single
         ]
-        pieces = list(reader.read_columns(*dict.fromkeys(wanted)))
+        pieces = list(reader.read_quantities(*dict.fromkeys(wanted)))
         axis = reader.time_axis
     if not pieces:
         raise FileFormatError("the session has no frames", where=where)

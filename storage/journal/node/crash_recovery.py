@@ -11,7 +11,7 @@ from storage.intervals import DISK_SLOW
 from storage.journal.journal import Journal
 from storage.journal.node.in_flight import (
     IN_FLIGHT_FILE,
-    read_in_flight_frames,
+    read_in_flight_of_this_boot,
     read_kernel_boot_id,
 )
 from storage.journal.node.stream import NodeStream
@@ -19,10 +19,10 @@ from storage.journal.stream_notes import StreamNotes
 from storage.wire import encode_as_messages
 
 
-def recover_stream(folder: Path, problems: list[str]) -> NodeStream | None:
-    """Open an earlier process's stream with its frames in flight; None if there is none.
+def recover_ended_stream(folder: Path, problems: list[str]) -> NodeStream | None:
+    """Open an earlier process's stream as ended, its frames in flight queued; or None.
 
-    Damaged files are set aside, with a message in `problem_responses`.
+    Damaged files are set aside, with a message in `problems`.
 
     After a reboot the frames in flight are lost. The notes get an upper limit of their number:
     those since the last sync, by the slowest sync of this disk.
@@ -32,7 +32,7 @@ def recover_stream(folder: Path, problems: list[str]) -> NodeStream | None:
         StorageError: it cannot be read.
     """
     try:
-        left = read_in_flight_frames(folder)
+        left = read_in_flight_of_this_boot(folder)
     except DamagedFileError as error:
         left = None
         problems.append(set_aside_and_describe(folder / IN_FLIGHT_FILE, error))
@@ -46,8 +46,8 @@ def recover_stream(folder: Path, problems: list[str]) -> NodeStream | None:
     if stream.has_ended:
         return stream
     if left is None:
-        stream.mark_ended()
-        stream.bound_lost_tail()
+        stream.mark_ended_in_memory()
+        stream.set_max_lost_tail_in_memory()
         return stream
     frames = left[1]
     if frames is not None:
@@ -58,8 +58,8 @@ def recover_stream(folder: Path, problems: list[str]) -> NodeStream | None:
             for batch in encode_as_messages(
                 frames.slice_rows(a - first, b + 1 - first), stream.info
             ):
-                stream.queue_batch(batch, gap_reason=DISK_SLOW)
-    stream.mark_ended(max_lost_tail_frames=0)
+                stream.queue_batch_and_record_gap(batch, gap_reason=DISK_SLOW)
+    stream.mark_ended_in_memory(max_lost_tail_frames=0)
     return stream
 
 
@@ -73,7 +73,7 @@ def _open_stream(folder: Path, problems: list[str]) -> NodeStream | None:
     notes = StreamNotes.load_or_set_aside(folder, problems)
     journal: Journal | None = None
     with suppress(FileFormatError):
-        journal = Journal.open(folder)
+        journal = Journal.open_and_recover(folder)
         problems += journal.problems
     if notes is None and journal is not None:  # the segments have the array's description, too
         notes = StreamNotes(array_info=journal.info)

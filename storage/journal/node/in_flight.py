@@ -62,9 +62,9 @@ class InFlightWriter:
                 raise
             finally:
                 os.close(descriptor)
-        stream_id = (read_kernel_boot_id() or "").encode()
-        check = zlib.crc32(description + stream_id)
-        head = _HEAD.pack(_MAGIC, tiles, ROW_COUNT, len(description), stream_id, check)
+        kernel_boot_id = (read_kernel_boot_id() or "").encode()
+        check = zlib.crc32(description + kernel_boot_id)
+        head = _HEAD.pack(_MAGIC, tiles, ROW_COUNT, len(description), kernel_boot_id, check)
         self._map[: self._begin] = head + description
 
     def write_frame(self, frame: AcquiredFrame) -> None:
@@ -97,8 +97,8 @@ class InFlightWriter:
         self._map.close()
 
 
-def read_in_flight_frames(folder: Path) -> tuple[ArrayInfo, FrameBatch | None] | None:
-    """Read the frames that a killed process left, in order; None if no file can be trusted.
+def read_in_flight_of_this_boot(folder: Path) -> tuple[ArrayInfo, FrameBatch | None] | None:
+    """Read the newest gapless frames that a process killed in this boot left; or None.
 
     After a reboot it cannot: the file was never synced. Counted back from the newest frame, the
     result ends at the first missing one.
@@ -147,27 +147,27 @@ def read_in_flight_frames(folder: Path) -> tuple[ArrayInfo, FrameBatch | None] |
     return info, frames
 
 
-def read_in_flight_frames_from(folder: Path, seq: int) -> FrameBatch | None:
-    """Read the frames that a killed process left from number `seq` on; None if there are none.
+def read_in_flight_frames_from(folder: Path, seq_first: int) -> FrameBatch | None:
+    """Read the frames that a killed process left from `seq_first` on; None if there are none.
 
     Raises:
         DamagedFileError: its content has changed.
         StorageError: it cannot be read now.
     """
-    left = read_in_flight_frames(folder)
+    left = read_in_flight_of_this_boot(folder)
     frames = None if left is None else left[1]
-    if frames is None or int(frames.seq[-1]) < seq:
+    if frames is None or int(frames.seq[-1]) < seq_first:
         return None
-    return frames.slice_rows(max(0, seq - int(frames.seq[0])), len(frames))
+    return frames.slice_rows(max(0, seq_first - int(frames.seq[0])), len(frames))
 
 
-def delete_in_flight_file(folder: Path) -> None:
-    """Delete the file once its frames are in the journal."""
+def try_delete_in_flight_file(folder: Path) -> None:
+    """Delete the file of frames in flight, if it is there and can be deleted."""
     with suppress(OSError):
         (folder / IN_FLIGHT_FILE).unlink(missing_ok=True)
 
 
-def create_in_flight_writer(folder: Path | None, info: ArrayInfo) -> InFlightWriter | None:
+def try_create_in_flight_writer(folder: Path | None, info: ArrayInfo) -> InFlightWriter | None:
     """Create a writer of frames in flight; None without a folder, or if the disk has no room."""
     if folder is None:
         return None
@@ -192,18 +192,18 @@ def _read_description(content: bytes, *, where: str) -> ArrayInfo | None:
     damage = DamagedFileError("its head is not what was written", where=where)
     if len(content) < _HEAD.size:
         raise damage
-    magic, tiles, rows, length, stream_id, check = _HEAD.unpack_from(content)
+    magic, tiles, rows, length, kernel_boot_id, check = _HEAD.unpack_from(content)
     description = content[_HEAD.size : _HEAD.size + length]
-    stream_id = stream_id.rstrip(b"\0")
+    kernel_boot_id = kernel_boot_id.rstrip(b"\0")
     expected = _HEAD.size + length + rows * (struct.calcsize(_row_format(tiles)) + 4)
     if (
         magic != _MAGIC
         or rows != ROW_COUNT
         or len(content) != expected
-        or zlib.crc32(description + stream_id) != check
+        or zlib.crc32(description + kernel_boot_id) != check
     ):
         raise damage
-    if stream_id.decode(errors="replace") != (read_kernel_boot_id() or ""):
+    if kernel_boot_id.decode(errors="replace") != (read_kernel_boot_id() or ""):
         return None
     try:
         info = ArrayInfo.model_validate_json(description)

@@ -21,7 +21,7 @@ from devices.errors import FileFormatError, StorageError
 from devices.frames import ArrayInfo
 from storage.durable_files import lock_folder, make_synced_folder, translate_storage_errors
 from storage.intervals import DISK_FULL, DISK_SLOW, READ_ONLY, Intervals
-from storage.journal.node.crash_recovery import recover_stream
+from storage.journal.node.crash_recovery import recover_ended_stream
 from storage.journal.node.in_flight import read_kernel_boot_id
 from storage.journal.node.retention import DEFAULT_BUDGET_BYTES, RetentionPolicy
 from storage.journal.node.retention_requests import RetentionRequest, RetentionRequests
@@ -104,8 +104,8 @@ class NodeJournal:
         """Start the writer thread."""
         self._thread.start()
 
-    def close(self) -> None:
-        """Write the waiting batches if the disk accepts them, and stop the writer thread."""
+    def end_streams_and_close(self) -> None:
+        """End all streams, write what waits for up to 10 s, and stop the writer thread."""
         self._stopping.set()
         self._wake.set()
         if self._thread.is_alive():
@@ -113,19 +113,19 @@ class NodeJournal:
         self._locks.close()
 
     @property
-    def warnings(self) -> tuple[str, ...]:
-        """Warnings about storage, as messages."""
+    def disk_warnings(self) -> tuple[str, ...]:
+        """Warning that the disk refuses frames, as a message; empty while it accepts them."""
         problem = self._disk_problem
         if problem is None:
             return ()
-        waiting_s = sum(stream.waiting_s for stream in self.streams)
+        waiting_s = sum(stream.waiting_frames_duration_s for stream in self.streams)
         return (f"{problem[1]}; {waiting_s:.0f} s of frames wait in memory",)
 
-    def begin_stream(self, info: ArrayInfo) -> NodeStream:
+    def switch_to_new_stream(self, info: ArrayInfo) -> NodeStream:
         """Start a new stream and mark earlier ones as ended."""
         with self._streams_lock:
             for stream in self.streams:
-                stream.mark_ended()
+                stream.mark_ended_in_memory()
             number = max((stream.notes.number for stream in self.streams), default=0) + 1
             notes = StreamNotes(
                 array_info=info, number=number, kernel_boot_id=read_kernel_boot_id()
@@ -135,9 +135,11 @@ class NodeJournal:
         self._wake.set()
         return stream
 
-    def queue_batch(self, stream: NodeStream, batch: EncodedBatch, missed_slots: int = 0) -> None:
-        """Queue the newest frames for the writer; drop the oldest beyond a limit."""
-        stream.queue_batch(batch, missed_slots)
+    def queue_batch_and_limit_memory(
+        self, stream: NodeStream, batch: EncodedBatch, total_missed_slots: int | None = None
+    ) -> None:
+        """Queue the newest frames for the writer; drop the oldest beyond 32 MiB."""
+        stream.queue_batch_and_record_gap(batch, total_missed_slots)
         # The writer is not woken: it writes all batches at its next sync.
         while sum(each.waiting_bytes for each in self.streams) > MAX_WAITING_BYTES:
             if not self._drop_oldest():  # the writer has written them meanwhile
@@ -145,20 +147,20 @@ class NodeJournal:
 
     def update_retention_request(self, server_id: str, request: RetentionRequest) -> None:
         """Update a server's retention request."""
-        if self.retention_requests.update_server_request(server_id, request):
+        if self.retention_requests.update_request_in_memory(server_id, request):
             self._are_requests_changed = True
             self._wake.set()
 
-    def report_damage(self, stream: NodeStream, numbers: Intervals) -> None:
-        """Report frames that are damaged on disk; the writer invalidates them."""
+    def queue_invalidation(self, stream: NodeStream, numbers: Intervals) -> None:
+        """Queue damaged frames, which the writer's thread then invalidates."""
         self._damaged.append((stream, numbers))
         self._wake.set()
 
-    def undelivered_numbers(self, stream: NodeStream) -> Intervals:
-        """Return the available numbers of a stream that sessions need and no server has yet."""
-        return stream.undelivered_numbers(self.retention_requests)
+    def available_undelivered_numbers(self, stream: NodeStream) -> Intervals:
+        """Return a stream's available numbers that a server needs and has not acknowledged."""
+        return stream.available_undelivered_numbers(self.retention_requests)
 
-    def wait_until_on_disk(self, timeout_s: float = _CLOSE_TIMEOUT_S) -> bool:
+    def wait_for_ended_streams_on_disk(self, timeout_s: float = _CLOSE_TIMEOUT_S) -> bool:
         """Wait until every ended stream is complete on disk; False after a timeout."""
         end_s = time.monotonic() + timeout_s
         while not all(stream.is_complete_on_disk for stream in self.streams if stream.has_ended):
@@ -168,8 +170,8 @@ class NodeJournal:
             time.sleep(0.01)
         return True
 
-    def write_recovered_frames(self) -> None:
-        """Write all frames to disk in the caller's thread, for recovery.
+    def finish_recovered_streams(self) -> None:
+        """Write frames in flight and the ends of all streams in the caller's thread.
 
         Raises:
             StorageError: the disk refuses the frames in flight.
@@ -177,7 +179,7 @@ class NodeJournal:
         self._write_and_clean_up(is_forced=True)
         if not all(stream.is_complete_on_disk for stream in self.streams):
             raise StorageError(
-                "the frames in flight cannot be written: " + "; ".join(self.warnings),
+                "the frames in flight cannot be written: " + "; ".join(self.disk_warnings),
                 where=str(self.folder),
                 remedy="Free space on the disk, and run it again",
             )
@@ -204,7 +206,7 @@ class NodeJournal:
             if self._stopping.is_set() and stop_s == math.inf:
                 stop_s = time.monotonic() + _CLOSE_TIMEOUT_S
                 for stream in self.streams:
-                    stream.mark_ended()
+                    stream.mark_ended_in_memory()
             try:
                 self._write_and_clean_up(is_forced=stop_s < math.inf)
             except Exception:
@@ -220,7 +222,7 @@ class NodeJournal:
         if now_s - self._synced_s >= SYNC_INTERVAL_S or is_forced:
             self._synced_s = now_s
             for stream in self.streams:
-                stream.sync()
+                stream.sync_or_requeue()
                 stream.try_finish_on_disk(self.retention_requests, self.problems)
         if now_s - self._tidied_s >= _CLEANUP_INTERVAL_S or (
             self._are_requests_changed and not self._disk_problem
@@ -244,31 +246,31 @@ class NodeJournal:
         self._disk_problem = None
 
     def _write_stream(self, stream: NodeStream) -> None:
-        stream.create_journal()
+        stream.ensure_journal_and_notes()
         while stream.waiting_bytes and stream.journal is not None:
             try:
                 self._retention.enforce_budget(
-                    self.streams, is_forced=self._disk_problem is not None
+                    self.streams, ignore_check_interval=self._disk_problem is not None
                 )
                 stream.write_oldest_waiting()
             except StorageError as error:
                 if (
                     error.errno not in _DISK_FULL_ERRORS
-                    or not self._retention.delete_oldest_segment(self.streams)
+                    or not self._retention.evict_oldest_unneeded_segment(self.streams)
                 ):
                     raise
 
     def _clean_up(self) -> None:
         while self._damaged:
             stream, numbers = self._damaged.popleft()
-            stream.invalidate(numbers, self.retention_requests)
+            stream.invalidate_and_record_loss(numbers, self.retention_requests)
         if self._are_requests_changed:
             self._are_requests_changed = False
             try:
                 self.retention_requests.save()
             except StorageError:
                 self._are_requests_changed = True
-        dropped = self._retention.delete_expired(self.streams)
+        dropped = self._retention.evict_expired_and_save_losses(self.streams)
         with self._streams_lock:
             self.streams = [stream for stream in self.streams if stream not in dropped]
 
@@ -281,7 +283,7 @@ class NodeJournal:
                 folders = [path for path in self.folder.iterdir() if path.is_dir()]
             for folder in folders:
                 try:
-                    stream = recover_stream(folder, self.problems)
+                    stream = recover_ended_stream(folder, self.problems)
                 except (FileFormatError, StorageError) as error:
                     self.problems.append(f"a stream is skipped: {error}")
                     continue
@@ -292,7 +294,7 @@ class NodeJournal:
         for stream in streams:
             number = max(number + 1, stream.notes.number)
             if stream.notes.number != number:
-                stream.update_notes(number=number)
+                stream.update_notes_in_memory(number=number)
         return streams
 
     def _lock_folder(self, folder: Path, *, is_shared: bool) -> None:
@@ -328,7 +330,9 @@ def _sort_streams(found: Iterable[NodeStream]) -> list[NodeStream]:
 
 def _first_t_ns_of(stream: NodeStream) -> float:
     journal = stream.journal
-    begin_t_ns = journal.find_t_ns_near(0, is_upper=False) if journal is not None else None
+    begin_t_ns = (
+        journal.find_batch_t_ns_near(0, at_or_before=False) if journal is not None else None
+    )
     return math.inf if begin_t_ns is None else begin_t_ns
 
 
@@ -343,4 +347,4 @@ def recover_node_journals(root: Path) -> None:
     """
     for folder in sorted(path for path in (root / "journal").glob("*") if path.is_dir()):
         journal = NodeJournal(root, folder.name, is_recovery=True)
-        journal.write_recovered_frames()
+        journal.finish_recovered_streams()

@@ -47,22 +47,22 @@ class RetentionPolicy:
         self._began_s = time.monotonic()
         self._weighed_s = -math.inf
 
-    def enforce_budget(self, streams: Sequence[NodeStream], *, is_forced: bool) -> None:
-        """Delete the oldest segments while the journals exceed their budget.
+    def enforce_budget(self, streams: Sequence[NodeStream], *, ignore_check_interval: bool) -> None:
+        """Delete the oldest unneeded segments beyond the budget; check once a second.
 
         Args:
             streams: all streams of the node, oldest first.
-            is_forced: check even if the last check was a moment ago.
+            ignore_check_interval: check even if the last check was a moment ago.
 
         Raises:
             StorageError: they exceed it, and sessions need every frame.
         """
         now_s = time.monotonic()
-        if now_s - self._weighed_s < _BUDGET_CHECK_INTERVAL_S and not is_forced:
+        if now_s - self._weighed_s < _BUDGET_CHECK_INTERVAL_S and not ignore_check_interval:
             return
         self._weighed_s = now_s
         while sum(s.journal.size_bytes for s in streams if s.journal) > self._budget_bytes:
-            if not self.delete_oldest_segment(streams):
+            if not self.evict_oldest_unneeded_segment(streams):
                 raise StorageError(
                     f"the journal's {self._budget_bytes} bytes are used up, and sessions need "
                     "every frame",
@@ -70,14 +70,14 @@ class RetentionPolicy:
                     errno=errno.ENOSPC,
                 )
 
-    def delete_oldest_segment(self, streams: Sequence[NodeStream]) -> bool:
+    def evict_oldest_unneeded_segment(self, streams: Sequence[NodeStream]) -> bool:
         """Delete the oldest segment that no session needs; return whether there was one."""
         return self._may_drop and any(
-            stream.delete_oldest_segment(self._wanted) for stream in streams
+            stream.evict_oldest_unneeded_segment(self._wanted) for stream in streams
         )
 
-    def delete_expired(self, streams: Sequence[NodeStream]) -> list[NodeStream]:
-        """Delete frames that are older than the ring; return the streams that are gone."""
+    def evict_expired_and_save_losses(self, streams: Sequence[NodeStream]) -> list[NodeStream]:
+        """Delete expired frames and save the losses; return streams that are deleted whole."""
         return [stream for stream in streams if self._may_drop and self._delete_expired_of(stream)]
 
     def _delete_expired_of(self, stream: NodeStream) -> bool:
@@ -88,18 +88,18 @@ class RetentionPolicy:
         past_ring = self._is_expired(stream)
         newest = stream.recent_batches(max(0, stream.next_seq - 1))
         if self._wanted.is_unknown:  # only a full budget deletes then
-            stream.save_new_losses()
+            stream.try_save_new_losses()
             return False
         with suppress(StorageError):
             if not stream.has_ended and newest:
-                stream.delete_old_segments(newest[-1].t_ns_last - RING_DURATION_NS, self._wanted)
+                stream.evict_old_segments(newest[-1].t_ns_last - RING_DURATION_NS, self._wanted)
             elif stream.has_ended and past_ring:
-                stream.delete_old_segments(_END_OF_TIME_NS, self._wanted)
+                stream.evict_old_segments(_END_OF_TIME_NS, self._wanted)
         is_empty = stream.is_complete_on_disk and not journal.stored
         if is_empty and past_ring and not self._wanted.required_numbers_of(stream.stream_id):
             journal.close_and_delete()
             return True
-        stream.save_new_losses()
+        stream.try_save_new_losses()
         return False
 
     def _is_expired(self, stream: NodeStream) -> bool:

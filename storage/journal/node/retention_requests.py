@@ -99,7 +99,7 @@ class RetentionRequests:
     def required_numbers_of(self, stream_id: str) -> Intervals:
         """Return the numbers of a stream that servers or the node's own session need."""
         servers = list(self._servers.values())
-        return self.local_numbers_of(stream_id) | union(
+        return self.own_session_numbers_of(stream_id) | union(
             server.required_numbers_of(stream_id) for server in servers
         )
 
@@ -108,9 +108,11 @@ class RetentionRequests:
 
         Numbers of the node's own session stay included even if a server has them as well.
         """
-        return self.local_numbers_of(stream_id) | self.undelivered_numbers_of(stream_id, acked_by)
+        return self.own_session_numbers_of(stream_id) | self.undelivered_numbers_of(
+            stream_id, acked_by
+        )
 
-    def local_numbers_of(self, stream_id: str) -> Intervals:
+    def own_session_numbers_of(self, stream_id: str) -> Intervals:
         """Return the numbers of a stream that the node's own session needs."""
         return Intervals(self._local.get(stream_id, ()))
 
@@ -123,8 +125,8 @@ class RetentionRequests:
             for server_id, server in list(self._servers.items())
         )
 
-    def update_server_request(self, server_id: str, request: RetentionRequest) -> bool:
-        """Set a server's request; return whether it differs from the one before."""
+    def update_request_in_memory(self, server_id: str, request: RetentionRequest) -> bool:
+        """Set a server's request in memory; return whether it differs from the one before."""
         if self._servers.get(server_id, RetentionRequest()) == request:
             return False
         self._servers = {**self._servers, server_id: request}
@@ -132,7 +134,7 @@ class RetentionRequests:
             del self._servers[server_id]
         return True
 
-    def set_local_numbers(self, numbers: Mapping[str, Intervals]) -> None:
+    def set_own_session_numbers(self, numbers: Mapping[str, Intervals]) -> None:
         """Set the numbers that the node's own session needs; that session stores them."""
         self._local = dict(numbers)
 

@@ -22,8 +22,8 @@ from storage.journal.journal import Journal
 from storage.journal.node.batch_queue import BatchQueue
 from storage.journal.node.in_flight import (
     IN_FLIGHT_FILE,
-    delete_in_flight_file,
     read_in_flight_frames_from,
+    try_delete_in_flight_file,
 )
 from storage.journal.node.retention_requests import RetentionRequests
 from storage.journal.stream_notes import MAX_UNSYNCED_S, StreamNotes, compute_max_lost_tail_frames
@@ -74,7 +74,7 @@ class NodeStream:
         if journal is not None:
             self._lost.remove(journal.stored)
             for reason, numbers in journal.lost.by_reason.items():
-                self._lost.add(numbers, reason)
+                self._lost.add_if_new(numbers, reason)
         last = (self.stored | self._lost.numbers).last
         recovered_seq = 0 if last is None else last + 1
         self.next_seq = recovered_seq if notes.next_seq is None else notes.next_seq
@@ -94,8 +94,8 @@ class NodeStream:
         return self._waiting.size_bytes
 
     @property
-    def waiting_s(self) -> float:
-        """Seconds of frames that wait in memory to be written."""
+    def waiting_frames_duration_s(self) -> float:
+        """Duration of the frames that wait in memory to be written, s."""
         with self._lock:
             return self._waiting.frame_count / self.info.nominal_rate_hz
 
@@ -123,7 +123,7 @@ class NodeStream:
         with self._lock:
             return self._union_of_acked()
 
-    def undelivered_numbers(self, requests: RetentionRequests) -> Intervals:
+    def available_undelivered_numbers(self, requests: RetentionRequests) -> Intervals:
         """Return the available numbers that servers need and have not acknowledged."""
         held = self.available
         with self._lock:
@@ -136,19 +136,23 @@ class NodeStream:
 
     # --- frames in and out ------------------------------------------------------------------------
 
-    def queue_batch(
-        self, batch: EncodedBatch, missed_slots: int | None = None, *, gap_reason: str = NODE_BUSY
+    def queue_batch_and_record_gap(
+        self,
+        batch: EncodedBatch,
+        total_missed_slots: int | None = None,
+        *,
+        gap_reason: str = NODE_BUSY,
     ) -> None:
-        """Append a batch to the memory queue, in the order of acquisition.
+        """Append a batch to the memory queue, and record skipped numbers before it as lost.
 
         Args:
             batch: the frames.
-            missed_slots: count since the stream began; None: unchanged.
+            total_missed_slots: count since the stream began; None: unchanged.
             gap_reason: reason of loss for skipped numbers before this batch.
         """
         with self._lock:
             if batch.seq_first > self.next_seq:
-                self._lost.add(Intervals([(self.next_seq, batch.seq_first - 1)]), gap_reason)
+                self._lost.add_if_new(Intervals([(self.next_seq, batch.seq_first - 1)]), gap_reason)
             if self._waiting_since_s is None:
                 self._waiting_since_s = time.monotonic()
             self._waiting.append(batch)
@@ -156,14 +160,14 @@ class NodeStream:
             while self._recent.size_bytes > MAX_RECENT_BYTES and len(self._recent.batches) > 1:
                 self._recent.popleft()
             self.next_seq = max(self.next_seq, batch.seq_last + 1)
-            if missed_slots is not None:
-                self.missed_slots = missed_slots
+            if total_missed_slots is not None:
+                self.missed_slots = total_missed_slots
 
-    def mark_ended(self, **changes: object) -> None:
-        """Mark the stream as ended, and update its notes."""
+    def mark_ended_in_memory(self, **changes: object) -> None:
+        """Mark the stream as ended and change its notes, both in memory."""
         with self._lock:
             self.has_ended = True
-        self.update_notes(**changes)
+        self.update_notes_in_memory(**changes)
 
     def record_acknowledgement(self, server_id: str, seq_first: int, seq_last: int) -> None:
         """Record that these frames are on a server's disk."""
@@ -185,17 +189,19 @@ class NodeStream:
             if len(self._waiting.batches) <= min_batches_left:
                 return False
             oldest = self._waiting.popleft()
-        self.record_loss(oldest.numbers, reason, requests)
+        self.record_loss_unless_delivered(oldest.numbers, reason, requests)
         return True
 
-    def record_loss(self, numbers: Intervals, reason: str, requests: RetentionRequests) -> None:
-        """Record the loss of frames.
+    def record_loss_unless_delivered(
+        self, numbers: Intervals, reason: str, requests: RetentionRequests
+    ) -> None:
+        """Record the loss of frames in memory, except frames that a server has.
 
         Frames that a server has are not lost, except frames that the node's own session needs.
         """
-        needed_here = requests.local_numbers_of(self.stream_id)
+        needed_here = requests.own_session_numbers_of(self.stream_id)
         with self._lock:
-            self._lost.add(numbers - (self._union_of_acked() - needed_here), reason)
+            self._lost.add_if_new(numbers - (self._union_of_acked() - needed_here), reason)
 
     def recent_batches(self, from_seq: int) -> list[EncodedBatch]:
         """Return the newest batches in memory with frames from `from_seq` on, oldest first."""
@@ -205,7 +211,7 @@ class NodeStream:
             )
         return found[::-1]
 
-    def read_batches(self, seq_first: int, seq_last: int) -> Iterator[EncodedBatch]:
+    def read_overlapping_batches(self, seq_first: int, seq_last: int) -> Iterator[EncodedBatch]:
         """Yield batches with any of these frames, from disk and memory, in order.
 
         Raises:
@@ -227,38 +233,40 @@ class NodeStream:
                 yield memory[at]
                 at += 1
             if journal is not None:
-                yield from journal.read_messages(first, last)
+                yield from journal.read_overlapping_messages(first, last)
         yield from memory[at:]
 
     # --- for the thread that writes ---------------------------------------------------------------
 
-    def update_notes(self, **changes: object) -> None:
-        """Change the notes in memory; `save_notes` writes them."""
+    def update_notes_in_memory(self, **changes: object) -> None:
+        """Change the notes in memory; `update_and_save_notes` writes them."""
         with self._lock:
             now = {"lost": self._lost.to_pairs(), "missed_slots": self.missed_slots, **changes}
             self.notes = self.notes.model_copy(update=now)
 
-    def bound_lost_tail(self) -> None:
-        """Set `max_lost_tail_frames`, an upper limit of the frames that were lost in flight."""
+    def set_max_lost_tail_in_memory(self) -> None:
+        """Set the notes' `max_lost_tail_frames` in memory: a limit of frames lost in flight."""
         rate_hz, slowest_s = self.info.nominal_rate_hz, self.notes.sync_max_s
-        self.update_notes(max_lost_tail_frames=compute_max_lost_tail_frames(rate_hz, slowest_s))
+        self.update_notes_in_memory(
+            max_lost_tail_frames=compute_max_lost_tail_frames(rate_hz, slowest_s)
+        )
 
-    def save_notes(self, **changes: object) -> None:
+    def update_and_save_notes(self, **changes: object) -> None:
         """Change the notes and write them to disk.
 
         Raises:
             StorageError: the disk is full or not writable; the changes stay in memory.
         """
-        self.update_notes(**changes)
+        self.update_notes_in_memory(**changes)
         notes = self.notes
         notes.save(self.folder)
         self._saved_losses = notes.lost
 
-    def save_new_losses(self) -> None:
+    def try_save_new_losses(self) -> None:
         """Write the notes if losses have changed; after an error the next call retries."""
         if self.lost.to_pairs() != self._saved_losses:
             with suppress(StorageError):
-                self.save_notes()
+                self.update_and_save_notes()
 
     def write_oldest_waiting(self) -> None:
         """Write the oldest waiting batch to the journal, if there is one.
@@ -271,26 +279,26 @@ class NodeStream:
             batch = next(iter(self._waiting.batches), None)
         if journal is None or batch is None:
             return
-        journal.append_message(batch)
+        journal.append_new_encoded_frames(batch)
         with self._lock:
             if self._waiting.batches and self._waiting.batches[0] is batch:  # not dropped meanwhile
                 self._waiting.popleft()
             self._lost.remove(batch.numbers)
             self._unsynced.append(batch)
 
-    def create_journal(self) -> None:
-        """Create the journal, if there is none.
+    def ensure_journal_and_notes(self) -> None:
+        """Create the journal and save the notes, if it is missing and needed.
 
         Raises:
             StorageError: the disk refuses it.
         """
         if self.journal is None and not self.is_complete_on_disk:
             journal = Journal(self.folder, self.info)
-            self.save_notes()
+            self.update_and_save_notes()
             with self._lock:
                 self.journal = journal
 
-    def sync(self) -> None:
+    def sync_or_requeue(self) -> None:
         """Sync written batches; batches that the disk refuses go back to the memory queue."""
         journal = self.journal
         if journal is None or not self._unsynced:
@@ -307,14 +315,16 @@ class NodeStream:
                 self._waiting.prepend(self._unsynced)
                 self._unsynced = []
                 self._waiting_since_s = since_s
-            journal.invalidate(refused)  # after the queue has them again, so no frame is missing
+            journal.invalidate_whole_batches(
+                refused
+            )  # after the queue has them again, so no frame is missing
             return
         with self._lock:
             self._unsynced = []
         took_s = 0.0 if since_s is None else time.monotonic() - since_s
         if took_s > max(MAX_UNSYNCED_S, self.notes.sync_max_s):
             with suppress(StorageError):
-                self.save_notes(sync_max_s=took_s)
+                self.update_and_save_notes(sync_max_s=took_s)
 
     def try_finish_on_disk(self, requests: RetentionRequests, problems: list[str]) -> None:
         """Record the stream's end once all of it is on disk; the next call retries after an error.
@@ -332,43 +342,45 @@ class NodeStream:
                 self.journal.close()
             # A stream that ended before its first frame is kept if a server requests it.
             if self.next_seq or requests.required_numbers_of(self.stream_id):
-                self.save_notes(next_seq=self.next_seq)
+                self.update_and_save_notes(next_seq=self.next_seq)
             elif self.folder.is_dir():
                 shutil.rmtree(self.folder, ignore_errors=True)
         except StorageError:
             return
         # Only now: until the end is noted, the frames in flight may be needed again.
-        delete_in_flight_file(self.folder)
+        try_delete_in_flight_file(self.folder)
         with self._lock:
             self._recent = BatchQueue()
             self.is_complete_on_disk = True
 
-    def invalidate(self, damaged_numbers: Intervals, requests: RetentionRequests) -> None:
+    def invalidate_and_record_loss(
+        self, damaged_numbers: Intervals, requests: RetentionRequests
+    ) -> None:
         """Remove frames that turned out to be damaged on disk, and record their loss."""
         if self.journal is not None:
-            self.journal.invalidate(damaged_numbers)
-            self.record_loss(damaged_numbers, CORRUPT, requests)
+            self.journal.invalidate_whole_batches(damaged_numbers)
+            self.record_loss_unless_delivered(damaged_numbers, CORRUPT, requests)
 
-    def delete_old_segments(self, before_t_ns: int, requests: RetentionRequests) -> None:
-        """Delete segments that end before an instant and have no needed frames.
+    def evict_old_segments(self, before_t_ns: int, requests: RetentionRequests) -> None:
+        """Delete segments that end before an instant, without needed frames; record losses.
 
         Raises:
             StorageError: a file cannot be deleted.
         """
         if self.journal is not None:
             gone = self.journal.delete_old_segments(before_t_ns, self.numbers_to_retain(requests))
-            self.record_loss(gone, EVICTED, requests)
+            self.record_loss_unless_delivered(gone, EVICTED, requests)
 
-    def delete_oldest_segment(self, requests: RetentionRequests) -> bool:
-        """Delete the oldest segment without needed frames; return whether there was one.
+    def evict_oldest_unneeded_segment(self, requests: RetentionRequests) -> bool:
+        """Delete the oldest segment without needed frames, record losses; False if none.
 
         Raises:
             StorageError: it cannot be deleted.
         """
         gone = Intervals()
         if self.journal is not None:
-            gone = self.journal.delete_oldest_segment(self.numbers_to_retain(requests))
-            self.record_loss(gone, EVICTED, requests)
+            gone = self.journal.delete_oldest_unneeded_segment(self.numbers_to_retain(requests))
+            self.record_loss_unless_delivered(gone, EVICTED, requests)
         return bool(gone)
 
     def _queue_in_flight(self, problems: list[str]) -> bool:
@@ -381,12 +393,12 @@ class NodeStream:
             new = read_in_flight_frames_from(self.folder, self.next_seq)
         except DamagedFileError as error:
             problems.append(set_aside_and_describe(self.folder / IN_FLIGHT_FILE, error))
-            self.bound_lost_tail()
+            self.set_max_lost_tail_in_memory()
             return False
         if new is None:
             return False
         for batch in encode_as_messages(new, self.info):
-            self.queue_batch(batch)
+            self.queue_batch_and_record_gap(batch)
         return True
 
     def _union_of_acked(self) -> Intervals:

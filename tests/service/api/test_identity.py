@@ -10,7 +10,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 
 from service.node_identity import compute_fingerprint
-from storage.secret_file import SECRETS_NAME, read_secrets
+from storage.secret_file import SECRETS_NAME, read_secrets_or_empty
 from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import Earlier, FakeNode, NodeOf
 from tests.service.node.publishing import Publishing
@@ -40,7 +40,7 @@ def test_the_secret_is_on_the_disk_when_a_node_is_welcomed_and_nobody_is_shown_i
 ) -> None:
     node.greet()
     path = running.data / "nodes" / "bench" / SECRETS_NAME
-    assert read_secrets(path) == {"bench": node.secret}
+    assert read_secrets_or_empty(path) == {"bench": node.secret}
     node.deliver(10)
     node.leave()
     challenge = node.open_and_identify()

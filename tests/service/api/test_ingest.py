@@ -121,7 +121,7 @@ def test_a_killed_server_has_every_frame_that_it_acknowledged(
     node = node_of(running)
     node.connect()
     with Play(node):
-        while node.acked.count < 400:
+        while node.acked.number_count < 400:
             node.receive("ack")
         os.kill(process.pid, signal.SIGKILL)
         with suppress(ConnectionClosed):
@@ -130,7 +130,7 @@ def test_a_killed_server_has_every_frame_that_it_acknowledged(
     assert process.ended(5.0) == -signal.SIGKILL
     copy = tmp_path / "copy"
     shutil.copytree(data / "journal" / "bench" / node.stream_id, copy)
-    journal = Journal.open(copy)
+    journal = Journal.open_and_recover(copy)
     assert not (node.acked - journal.stored)
     held = journal.stored.last
     assert held is not None

@@ -42,7 +42,7 @@ def asked(session: Recording, **query: Any) -> Any:
 
 def frames(session: Recording, *names: str) -> dict[str, Any]:
     with session.reader() as file:
-        pieces = list(file.read_columns(*names))
+        pieces = list(file.read_quantities(*names))
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
 
 

@@ -44,7 +44,7 @@ def from_its_frames(session: Recording) -> list[dict[str, Any]]:
     """By the definition, from the columns of the sealed file all at once."""
     names = ("seq", "t_ns", "part", *STANCE_INPUT_COLUMNS)
     with session.reader() as file:
-        pieces = list(file.read_columns(*names))
+        pieces = list(file.read_quantities(*names))
     assert len(pieces) == 1
     columns = {
         name: values.astype(float) if values.dtype == "f4" else values

@@ -74,7 +74,7 @@ class Publishing:
 
     def take(self, n: int) -> None:
         for batch in batches(self.node, n):
-            self.stream.queue_batch(batch, 0)
+            self.stream.queue_batch_and_record_gap(batch, 0)
         self.publisher.notify_new_frames()
 
     async def until(self, condition: Callable[[], object], timeout_s: float = PATIENCE_S) -> None:
@@ -84,7 +84,7 @@ class Publishing:
             await asyncio.sleep(0.005)
 
     async def emptied(self) -> None:
-        await self.until(lambda: self.stream.acked.count == self.stream.next_seq)
+        await self.until(lambda: self.stream.acked.number_count == self.stream.next_seq)
 
     def _hello(self) -> Hello:
         hello: Hello = self.node.hello(

@@ -38,7 +38,7 @@ def test_everything_that_lacks_is_given_once_in_pieces(
         stream_id: Intervals(pair for b, numbers in lacks if b == stream_id for pair in numbers)
         for stream_id in "ab"
     }
-    assert backlog.frame_count == sum(numbers.count for numbers in expected.values())
+    assert backlog.frame_count == sum(numbers.number_count for numbers in expected.values())
     given_ = {"a": Intervals(), "b": Intervals()}
     total = 0
     for stream_id, first, last in sent(backlog, frames_max):
@@ -46,7 +46,7 @@ def test_everything_that_lacks_is_given_once_in_pieces(
         given_[stream_id].add(first, last)
         total += last - first + 1
     assert given_ == expected
-    assert total == sum(numbers.count for numbers in expected.values())
+    assert total == sum(numbers.number_count for numbers in expected.values())
     assert backlog.frame_count == 0
 
 

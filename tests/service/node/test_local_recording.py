@@ -57,9 +57,11 @@ def test_a_session_goes_on_in_every_stream_of_the_same_tiles(
     tmp_path: Path, journal: NodeJournal, recording: Recording
 ) -> None:
     first = recording()
-    first.add_stream(journal.begin_stream(stream(1)))
-    first.add_stream(journal.begin_stream(stream(2)))
-    recording().add_stream(journal.begin_stream(stream(3)))  # the process was killed in between
+    first.add_stream(journal.switch_to_new_stream(stream(1)))
+    first.add_stream(journal.switch_to_new_stream(stream(2)))
+    recording().add_stream(
+        journal.switch_to_new_stream(stream(3))
+    )  # the process was killed in between
     assert streams_of(sessions(tmp_path)["mud"]) == [1, 2, 3]
 
 
@@ -67,8 +69,8 @@ def test_other_tiles_begin_a_session_that_says_which_one_it_takes_up(
     tmp_path: Path, journal: NodeJournal, recording: Recording
 ) -> None:
     first = recording()
-    first.add_stream(journal.begin_stream(stream(1)))
-    first.add_stream(journal.begin_stream(stream(2, tiles=3)))
+    first.add_stream(journal.switch_to_new_stream(stream(1)))
+    first.add_stream(journal.switch_to_new_stream(stream(2, tiles=3)))
     ended, further = sessions(tmp_path)["mud"], sessions(tmp_path)["mud (2)"]
     assert (streams_of(ended), ended.state) == ([1], "pending")
     assert "other tiles" in (ended.problem or "")
@@ -76,7 +78,7 @@ def test_other_tiles_begin_a_session_that_says_which_one_it_takes_up(
     assert (streams_of(further), further.continues, further.state) == ([2], ended.id, "recording")
     # After a crash it is that one which goes on, and the first is sealed.
     second = recording()
-    second.add_stream(journal.begin_stream(stream(3, tiles=3)))
+    second.add_stream(journal.switch_to_new_stream(stream(3, tiles=3)))
     assert streams_of(sessions(tmp_path)["mud (2)"]) == [2, 3]
     second.seal_earlier_sessions()
     assert sessions(tmp_path)["mud"].state == "sealed"
@@ -87,7 +89,7 @@ def test_a_session_whose_calibration_cannot_be_read_is_sealed_and_says_so(
     tmp_path: Path, journal: NodeJournal, recording: Recording
 ) -> None:
     first = recording()
-    first.add_stream(journal.begin_stream(stream(1)))
+    first.add_stream(journal.switch_to_new_stream(stream(1)))
     (begun,) = sessions(tmp_path).values()
     spoilt = begun.model_copy(update={"calibration": {"this": "is none"}})
     SessionsFolder(tmp_path / "sessions").save(spoilt)
@@ -100,11 +102,11 @@ def test_while_a_session_cannot_be_read_every_stream_is_kept(
 ) -> None:
     first = recording()
     stream_id = stream(1).stream_id
-    first.add_stream(journal.begin_stream(stream(1)))
+    first.add_stream(journal.switch_to_new_stream(stream(1)))
     (begun,) = sessions(tmp_path).values()
     folder = SessionsFolder(tmp_path / "sessions")
     (folder.get_path(begun.id) / "session.json").write_bytes(b"{")
     with pytest.raises(FileFormatError):
         folder.load(begun.id)
     recording(None)
-    assert journal.retention_requests.local_numbers_of(stream_id).count > 10**9
+    assert journal.retention_requests.own_session_numbers_of(stream_id).number_count > 10**9

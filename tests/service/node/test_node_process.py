@@ -19,7 +19,7 @@ import pytest
 from devices.frames import NO_SERVO_COUNTS, FrameFlag, TileFlag
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
-from storage.journal.node.in_flight import read_in_flight_frames
+from storage.journal.node.in_flight import read_in_flight_of_this_boot
 from storage.journal.stream_notes import StreamNotes
 from tests.service.cli.outcome import static_only
 from tests.service.process import Start
@@ -156,7 +156,7 @@ def test_a_node_without_a_server_keeps_its_frames(
     (folder,) = (tmp_path / "node" / "journal" / "leg").glob("?" * 32)
     notes = StreamNotes.load(folder)
     assert notes is not None
-    with closing(Journal.open(folder)) as journal:
+    with closing(Journal.open_and_recover(folder)) as journal:
         assert journal.stored == Intervals([(0, (notes.next_seq or 0) - 1)])
 
 
@@ -217,7 +217,7 @@ def test_a_node_whose_own_files_are_damaged_starts_says_so_and_loses_no_more_tha
     until(lambda: not running.node("leg")["connected"])
     arrived = running.node("leg")["last_seq"]
     stream = own / before["stream_id"]
-    left = read_in_flight_frames(stream)
+    left = read_in_flight_of_this_boot(stream)
     assert left is not None
     assert left[1] is not None
     taken = int(left[1].seq[-1])

@@ -138,12 +138,12 @@ async def test_frames_on_their_way_between_memory_and_disk_are_sent_a_moment_lat
     running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A look at both may miss what goes from one to the other; it is held all the same."""
-    given, looks = NodeStream.read_batches, count()
+    given, looks = NodeStream.read_overlapping_batches, count()
 
     def not_at_first(stream: NodeStream, seq_first: int, seq_last: int) -> Iterator[EncodedBatch]:
         return iter(()) if next(looks) == 0 else given(stream, seq_first, seq_last)
 
-    monkeypatch.setattr(NodeStream, "read_batches", not_at_first)
+    monkeypatch.setattr(NodeStream, "read_overlapping_batches", not_at_first)
     publishing = Publishing(node, running.url)
     publishing.take(100)
     async with publishing:

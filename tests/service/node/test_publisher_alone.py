@@ -173,7 +173,7 @@ async def test_earlier_streams_are_named_before_their_frames(node: FakeNode) -> 
     async with played() as script:
         old = NodeStream(Path("nowhere"), StreamNotes(array_info=node.info), None)
         for batch in batches(node, 50):
-            old.queue_batch(batch, 0)
+            old.queue_batch_and_record_gap(batch, 0)
         old_id = node.stream_id
         node.reboot()
         publishing = Publishing(node, script.url, earlier=[old])
@@ -221,7 +221,9 @@ async def test_what_a_server_wants_is_told_with_the_streams_it_had_heard_of(node
 async def test_losses_are_said_whenever_they_change(node: FakeNode) -> None:
     async with played() as script, Publishing(node, script.url) as publishing:
         await publishing.until(lambda: script.said)
-        publishing.stream.record_loss(Intervals([(3, 9)]), "disk_full", NodeWanted(Path("nowhere")))
+        publishing.stream.record_loss_unless_delivered(
+            Intervals([(3, 9)]), "disk_full", NodeWanted(Path("nowhere"))
+        )
         await publishing.until(lambda: any(isinstance(m, LossReport) for m in script.said))
         await asyncio.sleep(0.1)
     [lost] = [message for message in script.said if isinstance(message, LossReport)]

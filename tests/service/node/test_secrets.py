@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from service.node.secrets import ServerSecrets
-from storage.secret_file import SECRETS_NAME, read_secrets
+from storage.secret_file import SECRETS_NAME, read_secrets_or_empty
 from tests.storage.faulty_disk import NO_SPACE, refusing
 
 ONE, OTHER = "1" * 32, "2" * 32
@@ -28,7 +28,7 @@ def test_each_server_has_a_secret_of_its_own_that_is_on_the_disk(
     tmp_path: Path, secrets: ServerSecrets, reports: list[str]
 ) -> None:
     shared = {server: secrets.get_or_create_secret(server) for server in (ONE, OTHER)}
-    assert read_secrets(tmp_path / SECRETS_NAME) == shared
+    assert read_secrets_or_empty(tmp_path / SECRETS_NAME) == shared
     assert shared[ONE] != shared[OTHER]
     again = ServerSecrets(tmp_path, reports.append)
     assert {server: again.get_or_create_secret(server) for server in shared} == shared
@@ -75,4 +75,4 @@ def test_ever_new_servers_do_not_fill_the_disk_and_the_newest_are_kept(
 ) -> None:
     monkeypatch.setattr("service.node.secrets._SERVERS_MAX", 3)
     shared = {server: secrets.get_or_create_secret(server) for server in "abcde"}
-    assert read_secrets(tmp_path / SECRETS_NAME) == {s: shared[s] for s in "cde"}
+    assert read_secrets_or_empty(tmp_path / SECRETS_NAME) == {s: shared[s] for s in "cde"}

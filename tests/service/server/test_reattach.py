@@ -90,7 +90,7 @@ def test_a_session_has_all_frames_of_each_stream_that_it_was_in(happened: list[s
         for stream_id, numbers in parts.items():
             own = [part for part in sealed.parts if part.stream_id == stream_id]
             lengths = [(part.seq_last or 0) - part.seq_first + 1 for part in own]
-            assert numbers.count == sum(lengths)
+            assert numbers.number_count == sum(lengths)
         told.close()
 
 

@@ -215,8 +215,8 @@ def test_what_was_deleted_because_nobody_needs_it_is_not_lost_even_after_a_resta
     told.synced()
     told.node.delete_unneeded_step({NEW: Intervals([(10, 12)])})
     held = told.node.present_stream.stored
-    assert held.missing_in(10, 12).count == 0
-    assert held.missing_in(0, 99).count > 50
+    assert held.missing_in(10, 12).number_count == 0
+    assert held.missing_in(0, 99).number_count > 50
     assert told.node.present_stream_lost_by_reason == {}
     # It is not asked for again either, but what a session needs is.
     told.connect(stored=((0, 99),), next_seq=100)

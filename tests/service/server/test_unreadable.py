@@ -65,7 +65,7 @@ def _tares(folder: Path) -> None:
 
 def _wanted(folder: Path) -> None:
     wanted = RetentionRequests(folder / "retention.json")
-    wanted.update_server_request("other", NEEDED)
+    wanted.update_request_in_memory("other", NEEDED)
     wanted.save()
 
 
@@ -96,7 +96,7 @@ def _stream(folder: Path) -> None:
         assert journal.problems == [] or "The file is unchanged" in journal.problems[0]
         assert bool(journal.problems) is not bool(journal.streams)
     finally:
-        journal.close()
+        journal.end_streams_and_close()
 
 
 @pytest.mark.parametrize("number", [errno.EMFILE, errno.ENOMEM, errno.EACCES, errno.ESTALE])
@@ -124,13 +124,13 @@ def test_a_node_goes_on_and_writes_what_servers_need_only_once_it_was_read(
         wanted = RetentionRequests(tmp_path / "retention.json")
         assert wanted.is_unknown
         assert "frames are kept" in wanted.problems[0]
-        assert wanted.update_server_request("laptop", NEEDED)
+        assert wanted.update_request_in_memory("laptop", NEEDED)
         with pytest.raises(StorageError):
             wanted.save()
     wanted.save()
     again = RetentionRequests(tmp_path / "retention.json")
-    assert not again.update_server_request("other", NEEDED)
-    assert not again.update_server_request("laptop", NEEDED)
+    assert not again.update_request_in_memory("other", NEEDED)
+    assert not again.update_request_in_memory("laptop", NEEDED)
 
 
 def test_tares_that_are_damaged_and_cannot_be_set_aside_are_not_written_over(

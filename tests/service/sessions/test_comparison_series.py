@@ -16,7 +16,7 @@ import service.sessions.comparison_series
 import storage.sessions.comparisons
 from service.sessions.comparison_series import ComparisonSeries, ComparisonSeriesCache
 from storage.formats.slice import Slice
-from storage.sessions.comparisons import SERIES_NAME, SERIES_SCHEMA, write_series
+from storage.sessions.comparisons import SERIES_NAME, SERIES_SCHEMA, write_comparison_series
 from storage.sessions.pyramid import Bins
 
 BEGIN_NS = 1_700_000_000_000_000_000
@@ -36,7 +36,7 @@ def series(t_ms: Any, ours_n: Any, reference_n: Any) -> pa.Table:
 
 
 def kept(folder: Path, table: pa.Table) -> ComparisonSeries:
-    write_series(folder / SERIES_NAME, table)
+    write_comparison_series(folder / SERIES_NAME, table)
     found = ComparisonSeriesCache().get_or_read(folder)
     assert found is not None
     return found
@@ -96,13 +96,13 @@ def test_a_zoom_costs_the_same_wherever_it_is_and_however_long_the_series(
     forces_n = np.arange(n) % 1000
     whole = kept(tmp_path, series(2 * np.arange(n), forces_n, forces_n))
     read: list[int] = []
-    within = storage.sessions.comparisons.read_series_range
+    within = storage.sessions.comparisons.read_comparison_series_range
 
     def counted(folder: Path, footer: Any, *bounds_ns: int | None) -> pa.Table:
         read.append(len(storage.sessions.comparisons._find_row_groups(footer, *bounds_ns)))
         return within(folder, footer, *bounds_ns)
 
-    monkeypatch.setattr(service.sessions.comparison_series, "read_series_range", counted)
+    monkeypatch.setattr(service.sessions.comparison_series, "read_comparison_series_range", counted)
     for part in (ALL, Slice(0.0, 550.0), Slice(100.0, 400.0)):
         bins, size = whole.get_bins(BEGIN_NS, part, 500)
         assert 500 <= len(bins["frames"]) <= 2000 + 2
@@ -119,25 +119,25 @@ def test_it_is_read_whole_once_and_again_when_it_is_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read: list[Path] = []
-    whole = storage.sessions.comparisons.read_series
+    whole = storage.sessions.comparisons.read_comparison_series
 
     def counted(folder: Path) -> pa.Table | None:
         read.append(folder)
         return whole(folder)
 
-    monkeypatch.setattr(service.sessions.comparison_series, "read_series", counted)
+    monkeypatch.setattr(service.sessions.comparison_series, "read_comparison_series", counted)
     series_kept = ComparisonSeriesCache()
-    write_series(tmp_path / SERIES_NAME, series([0, 2], [1.0, 1.0], [2.0, 2.0]))
+    write_comparison_series(tmp_path / SERIES_NAME, series([0, 2], [1.0, 1.0], [2.0, 2.0]))
     first = series_kept.get_or_read(tmp_path)
     assert series_kept.get_or_read(tmp_path) is first
-    write_series(tmp_path / SERIES_NAME, series([0, 2], [1.0, 1.0], [5.0, 2.0]))
+    write_comparison_series(tmp_path / SERIES_NAME, series([0, 2], [1.0, 1.0], [5.0, 2.0]))
     second = series_kept.get_or_read(tmp_path)
     assert second is not None
     assert second.get_bins(BEGIN_NS, ALL, 10)[0]["reference_grf_n_max"].tolist() == [5.0, 2.0]
     assert len(read) == 2
     for folder in (tmp_path / str(i) for i in range(6)):
         folder.mkdir()
-        write_series(folder / SERIES_NAME, series([0], [1.0], [1.0]))
+        write_comparison_series(folder / SERIES_NAME, series([0], [1.0], [1.0]))
         assert series_kept.get_or_read(folder) is not None
     assert len(series_kept._entries) == 4
 

@@ -29,7 +29,7 @@ from storage.journal.journal import Journal
 from storage.journal.node.journal import NodeJournal
 from storage.journal.stream_notes import StreamNotes
 from storage.sessions.folder import Part, Session, SessionsFolder
-from storage.sessions.ledger import adjust_states_to_session, compute_ledger
+from storage.sessions.ledger import compute_ledger, settle_losses
 from storage.verify.session import verify_session
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.calibrations import make_calibration, make_tare
@@ -151,7 +151,7 @@ def test_a_node_alone_and_recovery_in_its_folder_seal_the_same_session(
             report=lambda _: None,
         )
         recording.seal_earlier_sessions()
-        journal.close()
+        journal.end_streams_and_close()
         recover_folder(recovered)
         done = loaded(alone)
         assert done.state == "sealed"
@@ -223,7 +223,7 @@ def test_a_server_and_recovery_in_its_folder_come_to_the_same_session(
         assert done.max_lost_tail_frames == given_up.max_lost_tail_frames
         streams_then = session_parts.make_session_streams(given_up, node)
         ledger = compute_ledger(
-            given_up.parts, adjust_states_to_session(given_up, streams_then), is_finished=True
+            given_up.parts, settle_losses(given_up, streams_then), is_finished=True
         )
         assert done.ledger == ledger
         if done.frames and made.problem is not None:

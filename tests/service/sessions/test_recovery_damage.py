@@ -41,7 +41,7 @@ def test_frames_that_are_damaged_are_lost_and_the_others_kept(tmp_path: Path) ->
     assert loaded(tmp_path).frames == 90
     notes = StreamNotes.load(folder)
     assert notes is not None
-    assert Losses(notes.lost).by_reason["corrupt"].count == 10
+    assert Losses(notes.lost).by_reason["corrupt"].number_count == 10
     assert find_verdict(verify_path(tmp_path / "sessions" / ID)) == "lossy"
 
 
@@ -88,7 +88,7 @@ def test_a_damaged_batch_at_the_stop_is_lost_and_the_others_tell_the_end(tmp_pat
 
 def test_a_stop_where_time_runs_back_fails_one_session_and_not_the_recovery(tmp_path: Path) -> None:
     folder = stream(servers(tmp_path), info_of(), (0, 99))
-    journal = Journal.open(folder)
+    journal = Journal.open_and_recover(folder)
     late = frames(100, 109)
     back_ns = PERIOD_NS * 60
     journal.append_new_frames(

@@ -10,7 +10,7 @@ import pytest
 from devices.errors import StateError
 from service.server.session_store import SessionStore, Trash
 from service.sessions.recovery import recover_folder
-from storage.checksummed_json import append_checksum, parse_checksummed_json
+from storage.checksummed_json import append_json_checksum, verify_and_strip_json_checksum
 from storage.clock.log import ClockLog, ClockOffset
 from storage.sessions.folder import Session, SessionsFolder
 from storage.verify.data_folder import find_verdict, verify_path
@@ -118,12 +118,12 @@ def test_one_that_nothing_proves_is_named_and_its_files_stay(data: Path) -> None
 
 def test_one_of_another_version_is_left_as_it_is(data: Path) -> None:
     path = data / "sessions" / ID / "session.json"
-    text = parse_checksummed_json(path.read_bytes(), where="")
+    text = verify_and_strip_json_checksum(path.read_bytes(), where="")
     text = text.replace(b'"walk"', b'"walk", "colour": "red"', 1)
-    path.write_bytes(append_checksum(text))
+    path.write_bytes(append_json_checksum(text))
     found = book(data)
     assert ID in found.unreadable
-    assert path.read_bytes() == append_checksum(text)
+    assert path.read_bytes() == append_json_checksum(text)
 
 
 def test_of_one_that_is_not_sealed_all_frames_are_kept(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ def test_the_truth_is_within_the_bound_at_every_instant(
     clock = wandering(drawn)
     rows = clock.measured(every(10, drawn[2]), seed, slow_ns=slow_ms * 1e6)
     t_mono_ns = anywhere(rows, seed)
-    offset, bound = ClockOffsets(rows).offset_at(t_mono_ns)
+    offset, bound = ClockOffsets(rows).offset_and_bound_at(t_mono_ns)
     assert (np.abs(offset - clock.at(t_mono_ns)) <= bound).all()
 
 
@@ -60,10 +60,12 @@ def test_before_and_after_the_measurements_the_bound_grows_and_holds(
     clock = Clock((drift_ppm,))
     rows = clock.measured(every(10, n), seed)
     t_mono_ns = anywhere(rows, seed, beyond_ns=round(hours * HOUR))
-    offset, bound = ClockOffsets(rows).offset_at(t_mono_ns)
+    offset, bound = ClockOffsets(rows).offset_and_bound_at(t_mono_ns)
     assert (np.abs(offset - clock.at(t_mono_ns)) <= bound).all()
     last = int(rows.t_mono_ns[-1])
-    _, later = ClockOffsets(rows).offset_at(last + np.array([0, 1, 60, 3600, 36000]) * SECOND)
+    _, later = ClockOffsets(rows).offset_and_bound_at(
+        last + np.array([0, 1, 60, 3600, 36000]) * SECOND
+    )
     assert (np.diff(later) > 0).all()
 
 
@@ -86,7 +88,7 @@ def test_the_truth_is_within_the_bound_beside_steps_and_across_them(
     for after_ns, _ in at:  # a probe during which the clock is set says nothing
         assume((np.abs(rows.t_mono_ns - BEGIN_NS - after_ns) > rows.uncertainty_ns).all())
     t_mono_ns = anywhere(rows, seed)
-    offset, bound = ClockOffsets(rows).offset_at(t_mono_ns)
+    offset, bound = ClockOffsets(rows).offset_and_bound_at(t_mono_ns)
     assert (np.abs(offset - clock.at(t_mono_ns)) <= bound).all()
 
 
@@ -110,8 +112,8 @@ def test_no_offset_between_two_instants_is_out_of_reach(
     clock = ClockOffsets(stepping.measured(every(10, 31), seed))
     between = BEGIN_NS + np.linspace(begin_s, begin_s + lasts_s, 301) * SECOND
     t_mono_ns = np.rint(between).astype(np.int64)
-    least, greatest, sure = clock.bound_ranges(t_mono_ns[:1], t_mono_ns[-1:])
-    offset, _ = clock.offset_at(t_mono_ns)
+    least, greatest, sure = clock.bound_offset_in_ranges(t_mono_ns[:1], t_mono_ns[-1:])
+    offset, _ = clock.offset_and_bound_at(t_mono_ns)
     assert not sure[0] or (least[0] <= offset.min() and offset.max() <= greatest[0])
     assert sure[0] or len(clock.stretches) > 1
 
@@ -120,7 +122,7 @@ def test_a_lopsided_network_does_not_become_a_small_bound_around_a_wrong_offset(
     # Every way there takes 0.3 ms, every way back 9.3 ms: a mean would be 4.5 ms off, and sure.
     t_mono_ns = every(10, 3600)
     rows = OffsetRows(t_mono_ns, np.full(3600, -4_500_000), np.full(3600, 4_800_000))
-    offset, bound = ClockOffsets(rows).offset_at(t_mono_ns)
+    offset, bound = ClockOffsets(rows).offset_and_bound_at(t_mono_ns)
     assert (np.abs(offset) <= bound).all()
     assert (bound >= 4_500_000).all()
 
@@ -169,7 +171,7 @@ def test_the_bound_is_hardly_wider_than_the_best_there_can_be(
     rows = wandering(drawn).measured(every(10, min(drawn[2], 12)), seed)
     begin, end = int(rows.t_mono_ns[0]), int(rows.t_mono_ns[-1])
     t_mono_ns = begin + round(where * (end - begin))
-    _, bound = ClockOffsets(rows).offset_at(np.array([t_mono_ns]))
+    _, bound = ClockOffsets(rows).offset_and_bound_at(np.array([t_mono_ns]))
     best = best_possible(rows, t_mono_ns)
     assert best - 200 <= bound[0]  # honest, to the solver's precision
     assert bound[0] < 3 * best + 200  # 1.1 in the median
@@ -178,7 +180,7 @@ def test_the_bound_is_hardly_wider_than_the_best_there_can_be(
 def test_many_measurements_are_better_than_the_median_of_them() -> None:
     clock = Clock((40.0,))
     rows = clock.measured(every(10, 360), 3)
-    _, bound = ClockOffsets(rows).offset_at(rows.t_mono_ns)
+    _, bound = ClockOffsets(rows).offset_and_bound_at(rows.t_mono_ns)
     assert np.median(bound) < 0.75 * np.median(rows.uncertainty_ns)
 
 
@@ -186,7 +188,7 @@ def test_in_ten_minutes_without_link_a_known_drift_is_worth_more_than_a_crystal(
     clock = Clock((40.0,))
     rows = clock.measured(np.concatenate((every(10, 60), every(10, 60) + 1200 * SECOND)), 3)
     middle = BEGIN_NS + 900 * SECOND
-    offset, bound = ClockOffsets(rows).offset_at(np.array([middle]))
+    offset, bound = ClockOffsets(rows).offset_and_bound_at(np.array([middle]))
     assert abs(offset[0] - clock.at(np.array([middle]))[0]) <= bound[0]
     assert bound[0] < 8_000_000 < 300 * SECOND * CRYSTAL_RATE_LIMIT
 
@@ -194,7 +196,7 @@ def test_in_ten_minutes_without_link_a_known_drift_is_worth_more_than_a_crystal(
 def test_ten_minutes_after_the_link_is_gone_the_drift_is_still_worth_most_of_the_bound() -> None:
     clock = ClockOffsets(Clock((40.0,)).measured(every(10, 60), 3))
     end = clock.rows.t_mono_ns[-1]
-    _, bound = clock.offset_at(end + np.array([0, 600 * SECOND]))
+    _, bound = clock.offset_and_bound_at(end + np.array([0, 600 * SECOND]))
     assert bound[1] - bound[0] < 16_000_000 < 600 * SECOND * CRYSTAL_RATE_LIMIT / 3
 
 
@@ -214,7 +216,7 @@ def test_the_assumptions_are_those_that_users_are_told() -> None:
 
 def test_two_rows_at_the_same_instant_are_intersected() -> None:
     mapped = ClockOffsets(rows_of((BEGIN_NS, 0, 1000), (BEGIN_NS, 1500, 1000)))
-    offset, bound = mapped.offset_at(np.array([BEGIN_NS]))
+    offset, bound = mapped.offset_and_bound_at(np.array([BEGIN_NS]))
     assert offset[0] == 750
     assert 250 <= bound[0] <= 255
 
@@ -222,7 +224,7 @@ def test_two_rows_at_the_same_instant_are_intersected() -> None:
 def test_two_rows_at_the_same_instant_that_contradict_each_other_are_a_step_there() -> None:
     mapped = ClockOffsets(rows_of((BEGIN_NS, 0, 10), (BEGIN_NS, HOUR, 10)))
     assert len(mapped.stretches) == 2
-    offset, _ = mapped.offset_at(BEGIN_NS + np.array([-1, 1]))
+    offset, _ = mapped.offset_and_bound_at(BEGIN_NS + np.array([-1, 1]))
     assert np.abs(offset - [0, HOUR]).max() <= 1
 
 
@@ -233,8 +235,8 @@ def test_the_order_in_which_rows_came_does_not_matter(random: Random) -> None:
     shuffled = OffsetRows(rows.t_mono_ns[order], rows.offset_ns[order], rows.uncertainty_ns[order])
     t_mono_ns = anywhere(rows, 1, beyond_ns=100 * SECOND)
     for a, b in zip(
-        ClockOffsets(rows).offset_at(t_mono_ns),
-        ClockOffsets(shuffled).offset_at(t_mono_ns),
+        ClockOffsets(rows).offset_and_bound_at(t_mono_ns),
+        ClockOffsets(shuffled).offset_and_bound_at(t_mono_ns),
         strict=True,
     ):
         assert (a == b).all()
@@ -243,7 +245,7 @@ def test_the_order_in_which_rows_came_does_not_matter(random: Random) -> None:
 def test_rows_without_uncertainty_are_met_to_the_nanosecond() -> None:
     t_mono_ns = every(10, 100)
     rows = OffsetRows(t_mono_ns, np.full(100, 12345), np.zeros(100, dtype=np.int64))
-    offset, bound = ClockOffsets(rows).offset_at(t_mono_ns)
+    offset, bound = ClockOffsets(rows).offset_and_bound_at(t_mono_ns)
     assert (np.abs(offset - 12345) <= bound).all()
     assert (bound <= 3).all()
     assert (bound >= 1).all()
@@ -254,7 +256,7 @@ def test_the_largest_numbers_there_may_be_do_not_overflow(end: int) -> None:
     late, wide = T_MONO_NS_END - 1, UNCERTAINTY_END_NS - 1
     mapped = ClockOffsets(rows_of((0, end, wide), (late, -end, wide), (5, 0, 0)))
     with np.errstate(all="raise"):
-        offset, bound = mapped.offset_at(np.array([0, 5, 2**59, late, -late]))
+        offset, bound = mapped.offset_and_bound_at(np.array([0, 5, 2**59, late, -late]))
     assert (bound >= 0).all()
     assert abs(int(offset[1])) <= int(bound[1])
 
@@ -269,15 +271,15 @@ def test_any_split_into_batches_gives_the_same_bits(batches: Callable[[int], lis
     rows = clock.measured(every(10, 60), 1)
     mapped = ClockOffsets(rows)
     t_mono_ns = np.sort(anywhere(rows, 1, beyond_ns=100 * SECOND))
-    whole = mapped.offset_at(t_mono_ns)
+    whole = mapped.offset_and_bound_at(t_mono_ns)
     ends = np.cumsum(batches(len(t_mono_ns)))
-    pieces = [mapped.offset_at(piece) for piece in np.split(t_mono_ns, ends[:-1])]
+    pieces = [mapped.offset_and_bound_at(piece) for piece in np.split(t_mono_ns, ends[:-1])]
     for i in range(2):
         assert (np.concatenate([piece[i] for piece in pieces]) == whole[i]).all()
 
 
 def test_no_instants_give_no_offsets() -> None:
-    offset, bound = ClockOffsets(rows_of((BEGIN_NS, 5, 1000))).offset_at(
+    offset, bound = ClockOffsets(rows_of((BEGIN_NS, 5, 1000))).offset_and_bound_at(
         np.array([], dtype=np.int64)
     )
     assert len(offset) == len(bound) == 0

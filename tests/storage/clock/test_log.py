@@ -40,12 +40,12 @@ def filled(log: ClockLog, n: int) -> list[ClockOffset]:
 def test_rows_come_back_in_the_order_they_came(log: ClockLog) -> None:
     rows = filled(log, 20)
     log.sync()
-    assert list(ClockLog(log.path.parent).read_rows()) == rows
+    assert list(ClockLog(log.path.parent).read_undamaged_rows()) == rows
 
 
 def test_a_log_without_rows_is_empty_and_makes_no_file(log: ClockLog) -> None:
     log.sync()
-    assert log.read_rows() == ()
+    assert log.read_undamaged_rows() == ()
     assert not log.path.parent.exists()
 
 
@@ -66,7 +66,7 @@ def test_any_row_comes_back_as_it_was(
     )
     log.append(given_row)
     log.append(given_row)
-    assert log.read_rows() == (given_row, given_row)
+    assert log.read_undamaged_rows() == (given_row, given_row)
 
 
 def test_a_torn_last_line_costs_that_row_only(log: ClockLog) -> None:
@@ -75,11 +75,11 @@ def test_a_torn_last_line_costs_that_row_only(log: ClockLog) -> None:
     begin = whole.rindex(b"\n", 0, -1) + 1
     for end in range(begin, len(whole)):
         log.path.write_bytes(whole[:end])
-        assert list(log.read_rows())[:2] == rows[:2]
-        assert len(log.read_rows()) in ({2, 3} if end == len(whole) - 1 else {2})
+        assert list(log.read_undamaged_rows())[:2] == rows[:2]
+        assert len(log.read_undamaged_rows()) in ({2, 3} if end == len(whole) - 1 else {2})
         log.append(row(9))
-        assert log.read_rows()[-1] == row(9)
-        assert set(log.read_rows()) <= {*rows, row(9)}
+        assert log.read_undamaged_rows()[-1] == row(9)
+        assert set(log.read_undamaged_rows()) <= {*rows, row(9)}
 
 
 @pytest.mark.parametrize("every_bit", [False, pytest.param(True, marks=pytest.mark.soak)])
@@ -93,7 +93,7 @@ def test_a_flipped_bit_anywhere_never_makes_another_row(log: ClockLog, every_bit
             damaged = bytearray(whole)
             damaged[at] ^= 1 << bit
             log.path.write_bytes(damaged)
-            read = log.read_rows()
+            read = log.read_undamaged_rows()
             assert set(read) <= set(rows)
             assert len(read) >= (1 if whole[at] == 10 else 2)
 
@@ -103,9 +103,11 @@ def test_what_a_power_cut_left_of_the_last_lines_is_cut_off_before_the_next(log:
     whole = log.path.read_bytes()
     begin = 1 + [at for at, byte in enumerate(whole) if byte == 10][1]
     log.path.write_bytes(whole[:begin] + bytes(70) + b"\n" + bytes(5000) + b"\n[]\n" + bytes(9))
-    assert log.read_content() == ClockLogContent(tuple(rows[:2]), damaged_lines=0, is_torn=True)
+    assert log.read_rows_and_damage() == ClockLogContent(
+        tuple(rows[:2]), damaged_lines=0, is_torn=True
+    )
     log.append(row(9))
-    assert log.read_content() == ClockLogContent((*rows[:2], row(9)))
+    assert log.read_rows_and_damage() == ClockLogContent((*rows[:2], row(9)))
     assert log.path.read_bytes()[:begin] == whole[:begin]
 
 
@@ -119,7 +121,7 @@ def test_rubbish_is_skipped(log: ClockLog, rubbish: bytes) -> None:
     with log.path.open("ab") as file:
         file.write(rubbish)
     log.append(row(7))
-    assert list(log.read_rows()) == [row(0), row(1), row(7)]
+    assert list(log.read_undamaged_rows()) == [row(0), row(1), row(7)]
 
 
 def test_a_full_disk_is_said_and_earlier_rows_stay(
@@ -144,7 +146,7 @@ def test_a_full_disk_is_said_and_earlier_rows_stay(
     assert "clock.jsonl" in caught.value.where
     assert log.path.read_bytes() == before
     log.append(row(9))
-    assert list(log.read_rows()) == [*rows, row(9)]
+    assert list(log.read_undamaged_rows()) == [*rows, row(9)]
 
 
 def test_a_disk_so_full_that_nothing_can_be_taken_back_keeps_the_rows(
@@ -167,7 +169,7 @@ def test_a_disk_so_full_that_nothing_can_be_taken_back_keeps_the_rows(
         with pytest.raises(StorageError):
             log.append(row(8))
     log.append(row(9))
-    assert [r for r in log.read_rows() if r != row(8)] == [*rows, row(9)]
+    assert [r for r in log.read_undamaged_rows() if r != row(8)] == [*rows, row(9)]
 
 
 def test_a_folder_that_cannot_be_written_is_an_error_of_storage(tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ class NodeClock:
     def server_ns(self, table: ClockTable, since_ns: int) -> tuple[int, int]:
         """Server's time and bound of a frame that was taken then."""
         t_mono_ns = np.array([self.t_mono_ns(since_ns)])
-        columns = table.compute_server_time(t_mono_ns, t_mono_ns + self.utc_offset_ns, None)
+        columns = table.compute_server_time_columns(t_mono_ns, t_mono_ns + self.utc_offset_ns, None)
         return int(columns["t_server_ns"][0]), int(columns["t_server_uncertainty_ns"][0])
 
 
@@ -138,7 +138,7 @@ def test_a_node_that_was_started_anew_an_hour_off_has_two_streams_and_no_step() 
     assert [len(stream.steps) for stream in table.summarize().streams] == [0, 0]
     t_mono_ns = np.array([first.t_mono_ns(SECOND), second.t_mono_ns(SECOND)])
     t_ns = t_mono_ns + np.array([first.utc_offset_ns, second.utc_offset_ns])
-    columns = table.compute_server_time(t_mono_ns, t_ns, np.array([0, 1], dtype=np.uint16))
+    columns = table.compute_server_time_columns(t_mono_ns, t_ns, np.array([0, 1], dtype=np.uint16))
     errors = columns["t_server_ns"] - (SERVER_NS + SECOND)
     assert (np.abs(errors) <= columns["t_server_uncertainty_ns"]).all()
     assert t_ns[0] - t_ns[1] == HOUR  # raw stays as it was
@@ -158,7 +158,7 @@ def test_a_stream_that_nobody_measured_gets_no_time(clock_set: bool | None, stat
     assert [stream.state for stream in table.summarize().streams] == ["measured", state]
     t_mono_ns = np.array([node.t_mono_ns(0)] * 3)
     part = np.array([0, 1, 7], dtype=np.uint16)
-    columns = table.compute_server_time(t_mono_ns, t_mono_ns, part)
+    columns = table.compute_server_time_columns(t_mono_ns, t_mono_ns, part)
     for values in columns.values():
         assert (values == UNKNOWN_T_NS).tolist() == [False, True, True]
 
@@ -174,12 +174,12 @@ def test_instants_that_are_none_get_no_servers_time() -> None:
     table = ClockTable(rows, [StreamClockFacts("b")], ["b"])
     end = T_NS_END
     ends = np.array([-(2**63), 2**63 - 1, end, -end, end - 1, 0])
-    columns = table.compute_server_time(np.zeros(6, dtype=np.int64), ends, None)
+    columns = table.compute_server_time_columns(np.zeros(6, dtype=np.int64), ends, None)
     assert (columns["t_server_ns"] == UNKNOWN_T_NS).tolist() == [True] * 4 + [False] * 2
     assert columns["t_server_ns"][-1] == 2**60 - 1
     end = T_MONO_NS_END
     ends = np.array([-(2**63), 2**63 - 1, end, -end, end - 1, 0])
-    columns = table.compute_server_time(ends, np.zeros(6, dtype=np.int64), None)
+    columns = table.compute_server_time_columns(ends, np.zeros(6, dtype=np.int64), None)
     assert (columns["t_server_ns"] == UNKNOWN_T_NS).tolist() == [True] * 4 + [False] * 2
 
 
@@ -188,7 +188,7 @@ def test_a_sum_that_is_no_instant_is_none() -> None:
     rows = OffsetRows(np.array([0, 10**14]), begin_ns + np.array([0, 2 * 10**9]), np.array([0, 0]))
     table = ClockTable({"b": rows}, [StreamClockFacts("b")], ["b"])
     t_ns = np.array([2**62 - 1, 0])
-    columns = table.compute_server_time(np.array([2**59, 2**59]), t_ns, None)
+    columns = table.compute_server_time_columns(np.array([2**59, 2**59]), t_ns, None)
     assert (columns["t_server_ns"] == UNKNOWN_T_NS).tolist() == [True, False]
     assert (columns["t_server_uncertainty_ns"] == UNKNOWN_T_NS).tolist() == [True, False]
 
@@ -198,7 +198,7 @@ def test_frames_without_parts_are_of_the_first() -> None:
         name: OffsetRows(np.array([0]), np.array([i]), np.array([0])) for i, name in enumerate("ab")
     }
     table = ClockTable(rows, [StreamClockFacts("a"), StreamClockFacts("b")], ["a", "b"])
-    columns = table.compute_server_time(np.array([0]), np.array([7]), None)
+    columns = table.compute_server_time_columns(np.array([0]), np.array([7]), None)
     assert columns["t_server_ns"].tolist() == [7]
 
 

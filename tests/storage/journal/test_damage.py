@@ -211,7 +211,7 @@ def test_a_segment_that_was_closed_is_not_read_through_but_its_frames_are_checke
     with pytest.raises(DamagedFramesError, match="frames 10 to 19") as caught:
         list(journal.read_frames(0, 29))
     assert (caught.value.seq_first, caught.value.seq_last) == (10, 19)
-    journal.invalidate(Intervals([(10, 19)]))
+    journal.invalidate_whole_batches(Intervals([(10, 19)]))
     assert_holds(journal, {*range(10), *range(20, 30)})
     # A copy that comes later is the one that counts, after a restart, too.
     journal.append_new_frames(part(10, 19))
@@ -240,7 +240,7 @@ def test_one_damaged_batch_among_thousands_of_frames_costs_its_own_frames_only(
         before += (int(seq) for batch in journal.read_frames(3, 9000) for seq in batch.seq)
     assert (caught.value.seq_first, caught.value.seq_last) == (5000, 5024)
     assert before == list(range(3, 5000))
-    journal.invalidate(Intervals([(5000, 5024)]))
+    journal.invalidate_whole_batches(Intervals([(5000, 5024)]))
     held = {*range(5000), *range(5025, 9000)}
     assert_holds(journal, held, 3, 8990, of=whole)
     assert max(len(batch) for batch in journal.read_frames(0, 9000)) > 1000
@@ -368,11 +368,13 @@ def test_a_damaged_record_of_the_index_gives_its_neighbours_instant_never_a_far_
     content[record * RECORD_DTYPE.itemsize + 9] ^= 1
     index.write_bytes(content)
     asked = 10 * record + 2
-    oldest, newest = (journal.find_t_ns_near(asked, is_upper=newest) for newest in (False, True))
+    oldest, newest = (
+        journal.find_batch_t_ns_near(asked, at_or_before=newest) for newest in (False, True)
+    )
     assert oldest == part(10 * record + 10, 10 * record + 10).t_ns[0]
     assert newest == (part(10 * record - 1, 10 * record - 1).t_ns[0] if record else None)
     index.write_bytes(b"")
-    assert journal.find_t_ns_near(asked, is_upper=False) is None
+    assert journal.find_batch_t_ns_near(asked, at_or_before=False) is None
 
 
 def test_an_index_that_was_emptied_is_said(tmp_path: Path) -> None:

@@ -49,12 +49,12 @@ def test_what_waits_is_written_before_anything_is_read(tmp_path: Path) -> None:
     journal.append_new_frames(part(0, 29))
     assert_holds(journal, set(range(30)))
     journal.append_new_frames(part(30, 39))
-    assert journal.find_t_ns_near(35, is_upper=False) == int(part(30, 30).t_ns[0])
+    assert journal.find_batch_t_ns_near(35, at_or_before=False) == int(part(30, 30).t_ns[0])
     journal.append_new_frames(part(40, 49))
-    assert journal.find_first_seq_since(int(part(45, 45).t_ns[0])) == 40
+    assert journal.find_first_batch_seq_since(int(part(45, 45).t_ns[0])) == 40
     journal.append_new_frames(part(50, 59))
-    assert journal.find_last_seq_until(int(part(54, 54).t_ns[0]), min_seq=0) == 54
-    assert [m.seq_first for m in journal.read_messages(0, 59)] == [0, 30, 40, 50]
+    assert journal.find_last_seq_once_passed(int(part(54, 54).t_ns[0]), min_seq=0) == 54
+    assert [m.seq_first for m in journal.read_overlapping_messages(0, 59)] == [0, 30, 40, 50]
 
 
 @given(
@@ -108,7 +108,7 @@ def test_what_was_refused_and_disowned_is_not_held_and_can_come_again(tmp_path: 
     (path,) = segments(tmp_path)
     with disk_with_room_for(path.stat().st_size + 100), pytest.raises(StorageError):
         journal.sync()
-    journal.invalidate(Intervals([(10, 39)]))
+    journal.invalidate_whole_batches(Intervals([(10, 39)]))
     assert_holds(journal, set(range(10)))
     journal.append_new_frames(part(10, 19))
     journal.close()
@@ -167,6 +167,6 @@ def test_a_segment_that_was_closed_by_another_thread_does_not_stop_who_reads(
 
     monkeypatch.setattr(SegmentWriter, "write_waiting", closed_just_before)
     assert (
-        journal.find_t_ns_near(5, is_upper=False) is None
+        journal.find_batch_t_ns_near(5, at_or_before=False) is None
     )  # not acknowledged, and asked for again
     OPENED.remove(journal)  # nothing is left to be closed

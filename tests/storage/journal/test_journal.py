@@ -261,7 +261,7 @@ def test_the_first_number_since_an_instant_is_at_most_a_batch_early_and_never_la
         journal.append_new_frames(LONG.slice_rows(n * 5, n * 5 + 5))
     young = sorted(n for n in members(journal.stored) if LONG.t_ns[n] >= t_ns)
     expected = young[0] // 5 * 5 if young else None
-    assert journal.find_first_seq_since(t_ns) == expected
+    assert journal.find_first_batch_seq_since(t_ns) == expected
 
 
 @settings(max_examples=60, deadline=None)
@@ -273,7 +273,7 @@ def test_the_last_number_until_an_instant_is_known_once_the_stream_has_passed_it
     for n in order:
         journal.append_new_frames(LONG.slice_rows(n * 5, n * 5 + 5))
     held = {n for n in members(journal.stored) if n >= at_least}
-    found = journal.find_last_seq_until(t_ns, min_seq=at_least)
+    found = journal.find_last_seq_once_passed(t_ns, min_seq=at_least)
     if not any(LONG.t_ns[n] > t_ns for n in held):
         assert found is None
     else:
@@ -289,7 +289,7 @@ def test_open_files_do_not_grow_with_segments(tmp_path: Path) -> None:
     journal.sync()
     assert len(open_here()) == 2
     while_read = [len(open_here()) for _ in journal.read_frames(0, 199)]
-    while_read += [len(open_here()) for _ in journal.read_messages(0, 199)]
+    while_read += [len(open_here()) for _ in journal.read_overlapping_messages(0, 199)]
     assert max(while_read) <= 2 + 8
     assert sum(len(batch) for batch in journal.read_frames(0, 199)) == 200
     assert len(open_here()) == 2
@@ -308,7 +308,7 @@ def test_names_of_segments_sort_as_their_frames(tmp_path: Path) -> None:
 
 def test_what_was_disowned_is_asked_for_again_and_held_once(tmp_path: Path) -> None:
     journal = filled(tmp_path, (0, 9), (10, 19))
-    journal.invalidate(Intervals([(10, 19)]))
+    journal.invalidate_whole_batches(Intervals([(10, 19)]))
     assert journal.stored == Intervals([(0, 9)])
     journal.append_new_frames(part(10, 19))
     assert_holds(journal, set(range(20)))
@@ -323,7 +323,7 @@ def test_what_the_file_under_its_name_never_had_is_disowned_as_well(tmp_path: Pa
     journal.append_new_frames(part(10, 19))
     (tmp_path / "data").rename(tmp_path / "away")
     (tmp_path / "copy").rename(tmp_path / "data")
-    journal.invalidate(Intervals([(10, 19)]))
+    journal.invalidate_whole_batches(Intervals([(10, 19)]))
     assert journal.stored == Intervals([(0, 9)])
     journal.append_new_frames(part(10, 19))
     assert_holds(journal, set(range(20)))
@@ -338,7 +338,7 @@ def test_a_doubtful_copy_is_forgotten_when_its_segment_is_closed(tmp_path: Path)
     """
     journal = filled(tmp_path, (0, 9), (10, 19))
     (path,) = segments(tmp_path)
-    journal.invalidate(Intervals([(10, 19)]))
+    journal.invalidate_whole_batches(Intervals([(10, 19)]))
     journal.append_new_frames(part(10, 19))
     journal.close()
     assert path.stat().st_size == HEADER + len(encode_frames(part(0, 9), SCHEMA))

@@ -17,7 +17,7 @@ from storage.parquet_hash import (
     FILE_HASH_KEY,
     FOOTER_HASH_KEY,
     HASH_PLACEHOLDER,
-    embed_file_hashes,
+    fill_hash_placeholders_and_sync,
 )
 from storage.schema import ARRAY_INFO_KEY
 from storage.sessions.content_hash import CONTENT_HASH_KEY, CONTENT_KEY, compute_content_hash
@@ -72,7 +72,7 @@ def rewritten(path: Path, table: pa.Table, **metadata: bytes | None) -> Path:
     with pq.ParquetWriter(path, table.schema, write_page_checksum=True) as file:
         file.write_table(table)
         file.add_key_value_metadata({key.decode(): text.decode() for key, text in hashes.items()})
-    embed_file_hashes(path)
+    fill_hash_placeholders_and_sync(path)
     return path
 
 

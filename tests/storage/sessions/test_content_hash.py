@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
 from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, NOT_READ, FrameBatch
-from storage.parquet_hash import embed_file_hashes, read_stated_and_actual_hash
+from storage.parquet_hash import fill_hash_placeholders_and_sync, read_stated_and_actual_hash
 from storage.sessions.reader import SealedFileReader
 from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import make_array
@@ -119,7 +119,7 @@ def test_row_groups_and_encodings_do_not_change_the_hashes_of_columns(tmp_path: 
 
     digest = ContentDigest()
     for group in range(pq.ParquetFile(other).num_row_groups):
-        digest.add_table(pq.ParquetFile(other).read_row_group(group))
+        digest.add_table_and_check_order(pq.ParquetFile(other).read_row_group(group))
     assert digest.describe_content() == said
 
 
@@ -202,7 +202,7 @@ def test_what_is_too_short_states_no_hash(tmp_path: Path, size: int) -> None:
     path.write_bytes(path.read_bytes()[-size:] if size else b"")
     assert read_stated_and_actual_hash(path) is None
     with pytest.raises(FileFormatError, match="no place"):
-        embed_file_hashes(path)
+        fill_hash_placeholders_and_sync(path)
 
 
 def test_a_note_that_looks_like_the_hash_is_none(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.errors import UsageError
-from storage.sessions.filters import SessionFilter, parse_completeness, parse_t_ns
+from storage.sessions.filters import SessionFilter, parse_completeness, parse_iso_or_t_ns
 from storage.sessions.folder import Completeness, Part, Session
 
 T_NS = 1_767_225_600_000_000_000
@@ -75,18 +75,18 @@ def test_an_instant_is_the_same_in_every_way_of_writing_it(
     at: datetime, offset_minutes: int
 ) -> None:
     utc = at.replace(tzinfo=UTC)
-    t_ns = parse_t_ns(utc.isoformat(), where="from")
+    t_ns = parse_iso_or_t_ns(utc.isoformat(), where="from")
     assert datetime.fromtimestamp(t_ns // 10**9, UTC) == utc.replace(microsecond=0)
     assert t_ns % 10**9 == utc.microsecond * 1000
     elsewhere = utc.astimezone(timezone(timedelta(minutes=offset_minutes)))
     for written in (at.isoformat(), elsewhere.isoformat(), str(at), f" {at.isoformat()}Z"):
-        assert parse_t_ns(written, where="from") == t_ns
+        assert parse_iso_or_t_ns(written, where="from") == t_ns
     if t_ns >= 10**8:
-        assert parse_t_ns(str(t_ns), where="from") == t_ns
+        assert parse_iso_or_t_ns(str(t_ns), where="from") == t_ns
 
 
 def test_a_date_is_its_midnight() -> None:
-    assert parse_t_ns("2026-01-01", where="from") == T_NS
+    assert parse_iso_or_t_ns("2026-01-01", where="from") == T_NS
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_a_date_is_its_midnight() -> None:
 )
 def test_what_is_no_instant_is_refused_with_what_would_be_one(said: str) -> None:
     with pytest.raises(UsageError, match="is no instant") as refused:
-        parse_t_ns(said, where="--from")
+        parse_iso_or_t_ns(said, where="--from")
     assert "--from" in str(refused.value)
     assert "2026-11-24T08:00" in str(refused.value)
 

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import DamagedFileError, FileFormatError, StorageError, UnknownError
-from storage.checksummed_json import append_checksum, parse_checksummed_json
+from storage.checksummed_json import append_json_checksum, verify_and_strip_json_checksum
 from storage.clock.log import ClockOffset
 from storage.sessions.folder import (
     Ledger,
@@ -235,7 +235,7 @@ def test_what_is_not_a_session_is_refused_with_its_path(
     content = path.read_bytes()
     assert old in content
     path.write_bytes(
-        append_checksum(parse_checksummed_json(content, where="").replace(old, new, 1))
+        append_json_checksum(verify_and_strip_json_checksum(content, where="").replace(old, new, 1))
     )
     with pytest.raises(FileFormatError, match="not a session") as caught:
         folder.load(ID)

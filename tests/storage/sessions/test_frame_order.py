@@ -28,7 +28,7 @@ def looked_at(content: dict[str, Any], cuts: list[int]) -> FrameOrderChecker:
     order = FrameOrderChecker()
     bounds = [0, *sorted(cuts), len(content["seq"])]
     for begin, end in itertools.pairwise(bounds):
-        order.check_frames({name: values[begin:end] for name, values in content.items()})
+        order.add_and_check_frames({name: values[begin:end] for name, values in content.items()})
     return order
 
 
@@ -42,10 +42,10 @@ def test_what_is_there_is_counted_however_it_comes(parts: list[set[int]], cuts: 
     order = looked_at(columns(seq, part), [min(cut, len(seq)) for cut in cuts])
     assert order.problems == []
     for found, numbers in zip(order.parts, parts, strict=True):
-        assert found.frames == found.numbers.count == len(numbers)
+        assert found.frames == found.numbers.number_count == len(numbers)
         assert found.numbers == Intervals((n, n) for n in numbers)
         assert (found.seq_first, found.seq_last) == (min(numbers), max(numbers))
-        assert found.gaps.count == max(numbers) - min(numbers) + 1 - len(numbers)
+        assert found.gaps.number_count == max(numbers) - min(numbers) + 1 - len(numbers)
         assert found.offset_ns == 7
 
 

@@ -39,7 +39,7 @@ def test_recorded_and_lost_and_pending_are_all_there_is(
     counted = compute_ledger((part,), {"a": stream}, is_finished=True)
     (one,) = counted.parts
     assert one.recorded + sum(one.lost.values()) + one.pending == length
-    assert one.recorded == Intervals(held).restricted_to(first, first + length - 1).count
+    assert one.recorded == Intervals(held).restricted_to(first, first + length - 1).number_count
     assert counted.complete == (one.recorded == length)
     assert counted.lossy == bool(one.lost)
 

@@ -9,7 +9,7 @@ import pytest
 
 from storage.schema import Array
 from storage.sessions.preview import PreviewBins, select_and_downsample_bins
-from storage.sessions.pyramid import make_frame_bins
+from storage.sessions.pyramid import make_single_frame_bins
 
 
 def frames(first: int, n: int, part: int = 0) -> dict[str, Array]:
@@ -43,7 +43,7 @@ def test_the_longer_it_is_the_coarser_and_nothing_hides(pieces: tuple[int, ...])
     assert so_far.frame_count == bins["frames"].sum() == at
     assert bins["t_first_ns"][0] == 0
     assert bins["t_last_ns"][-1] == (at - 1) * 2_000_000
-    whole = make_frame_bins(frames(0, at))
+    whole = make_single_frame_bins(frames(0, at))
     for tile in (0, 1):
         assert bins[f"pressure_raw_{tile}_min"].min() == whole[f"pressure_raw_{tile}_min"].min()
         assert bins[f"pressure_raw_{tile}_max"].max() == whole[f"pressure_raw_{tile}_max"].max()
@@ -79,6 +79,6 @@ def test_no_bin_reaches_over_into_another_part_and_what_is_lost_is_counted() -> 
 def test_some_time_of_it_is_merged_until_it_is_as_few_as_asked_for(
     begin_ns: int | None, end_ns: int | None, most: int, expected: tuple[int, int]
 ) -> None:
-    bins: Any = make_frame_bins(frames(0, 1000))
+    bins: Any = make_single_frame_bins(frames(0, 1000))
     found, count = select_and_downsample_bins(bins, begin_ns, end_ns, most)
     assert (len(found["part"]), count) == expected

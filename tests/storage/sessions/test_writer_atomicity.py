@@ -11,7 +11,7 @@ from devices.errors import FileFormatError
 from devices.frames import (
     FrameBatch,
 )
-from storage.durable_files import remove_stale_temporaries
+from storage.durable_files import remove_dead_process_temporaries
 from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import make_array
 from tests.storage.faulty_disk import disk_with_room_for
@@ -102,7 +102,7 @@ def test_while_it_is_written_its_name_says_whose_it_is(tmp_path: Path) -> None:
         writer.append_frames(frames(3000, period_ns=50_000_000), {})
         (name,) = names_in(tmp_path)
         assert name.startswith(f".s.parquet.{os.getpid()}.")
-        assert remove_stale_temporaries(tmp_path) == []
+        assert remove_dead_process_temporaries(tmp_path) == []
     assert names_in(tmp_path) == ["s.parquet"]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from devices.frames import ArrayInfo, FrameBatch
 from service.sessions.inputs import SessionInputs
 from service.sessions.sealing import seal_session
-from storage.checksummed_json import append_checksum
+from storage.checksummed_json import append_json_checksum
 from storage.clock.log import ClockOffset
 from storage.intervals import Losses
 from storage.journal.journal import Journal
@@ -105,7 +105,7 @@ def edited(folder: Path, change: Any) -> None:
     content = json.loads(path.read_bytes())
     content.pop("check", None)
     change(content)
-    path.write_bytes(append_checksum(json.dumps(content).encode()))
+    path.write_bytes(append_json_checksum(json.dumps(content).encode()))
 
 
 def raised(name: str, value: Any) -> Any:

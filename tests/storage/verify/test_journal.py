@@ -115,8 +115,8 @@ def test_a_segment_that_was_cut_at_any_byte_is_damaged_if_it_was_closed(
             assert report.problems, size
         else:  # nobody was promised what is gone, and the index still says how much it is
             assert report.problems == [], size
-            assert report.unsynced.count == gone or size < boundaries[0]
-            assert report.stored.count == 40 - gone
+            assert report.unsynced.number_count == gone or size < boundaries[0]
+            assert report.stored.number_count == 40 - gone
 
 
 def test_a_cut_at_a_batch_of_segment_and_index_is_seen_by_the_stream_s_end(tmp_path: Path) -> None:
@@ -129,7 +129,7 @@ def test_a_cut_at_a_batch_of_segment_and_index_is_seen_by_the_stream_s_end(tmp_p
     assert "cut behind frame 24" in "; ".join(report.problems)
     (tmp_path / "nodes").mkdir()  # a server may still get the rest
     report = verify_journal(folder)
-    assert (report.problems, report.absent_not_lost.count) == ([], 15)
+    assert (report.problems, report.absent_not_lost.number_count) == ([], 15)
 
 
 def test_batches_that_are_in_no_index_are_seen(tmp_path: Path) -> None:
@@ -176,7 +176,9 @@ def test_one_flipped_bit_anywhere_in_a_closed_segment_or_its_index_is_found(
     finally:
         path.write_bytes(whole)
     # A header has padding, and bytes that nobody reads.
-    harmless = path.suffix == ".arrows" and at < ends(folder)[0] and report.stored.count == 40
+    harmless = (
+        path.suffix == ".arrows" and at < ends(folder)[0] and report.stored.number_count == 40
+    )
     assert report.problems or harmless
 
 
@@ -247,7 +249,7 @@ def test_time_that_runs_back_from_one_segment_to_the_next_is_seen(tmp_path: Path
 def test_a_segment_proves_itself_alone(tmp_path: Path) -> None:
     path = segment_of(stream(tmp_path))
     report = verify_segment(path)
-    assert (report.stored.count, report.is_closed, report.problems) == (40, True, [])
+    assert (report.stored.number_count, report.is_closed, report.problems) == (40, True, [])
     with pytest.raises(FileFormatError, match=r"none\.arrows"):
         verify_segment(path.with_name("none.arrows"))
 
@@ -257,9 +259,9 @@ def test_what_was_cut_off_after_a_crash_is_mentioned(tmp_path: Path) -> None:
     path = segment_of(folder)
     path.write_bytes(path.read_bytes() + b"half a batch")
     assert verify_journal(folder).problems == []
-    Journal.open(folder).close()
+    Journal.open_and_recover(folder).close()
     report = verify_journal(folder)
-    assert (report.problems, report.stored.count) == ([], 40)
+    assert (report.problems, report.stored.number_count) == ([], 40)
     assert "no whole batch" in "; ".join(report.remarks)
 
 
@@ -268,7 +270,7 @@ def test_what_a_disk_refused_once_and_was_written_again_is_no_disorder(tmp_path:
     journal = Journal(folder, array())
     for first in range(0, 40, 10):
         journal.append_new_frames(frames(first, first + 9))
-    journal.invalidate(Intervals([(20, 39)]))
+    journal.invalidate_whole_batches(Intervals([(20, 39)]))
     for first in range(20, 60, 10):
         journal.append_new_frames(frames(first, first + 9))
     StreamNotes(array_info=array(), next_seq=60).save(folder)
@@ -310,7 +312,7 @@ def test_a_damaged_clock_row_is_said_and_a_torn_last_one_is_no_damage(tmp_path: 
     report = verify_journal(path.parent)
     assert (report.problems, "clock.jsonl" in report.remarks[-1]) == ([], True)
     ClockLog(path.parent).append(
-        ClockLog(path.parent).read_rows()[0]
+        ClockLog(path.parent).read_undamaged_rows()[0]
     )  # which cuts the torn one off
     assert verify_journal(path.parent).remarks == []
 

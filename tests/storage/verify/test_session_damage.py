@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from storage.checksummed_json import parse_checksummed_json
+from storage.checksummed_json import verify_and_strip_json_checksum
 from storage.verify.data_folder import find_verdict, verify_path
 from storage.verify.session import verify_session
 from tests.storage.verify.folders import (
@@ -127,7 +127,7 @@ def test_an_edited_note_is_seen_by_the_check_alone(tmp_path: Path) -> None:
     text = path.read_bytes()
     path.write_bytes(text.replace(b"first try", b"third try"))
     assert "was changed" in problems(folder)
-    path.write_bytes(parse_checksummed_json(text, where=""))
+    path.write_bytes(verify_and_strip_json_checksum(text, where=""))
     assert "no hash" in problems(folder)
 
 

@@ -25,7 +25,7 @@ from service.api.routes.common import (
 from service.private_paths import PublicText
 from service.server.broadcast.views import MarkerView, Page, SessionView
 from storage.formats.writers.parquet import PARQUET
-from storage.sessions.filters import SessionFilter, parse_completeness, parse_t_ns
+from storage.sessions.filters import SessionFilter, parse_completeness, parse_iso_or_t_ns
 from storage.sessions.folder import Ledger
 from storage.sessions.sidecars import MARKERS_NAME
 
@@ -225,7 +225,7 @@ async def list_sessions(
     to: Annotated[str | None, Query(max_length=40, description="Started before this time.")] = None,
     complete: Annotated[
         Literal["true", "false", "lossy"] | None,
-        Query(description="Filter by completeness: complete, pending, or lossy."),
+        Query(description="Filter by completeness: true, false, or lossy."),
     ] = None,
 ) -> SessionPage:
     """Return a page of the sessions that pass all filters."""
@@ -234,8 +234,8 @@ async def list_sessions(
         tags=tag,
         take=take,
         q=q,
-        from_t_ns=None if from_ is None else parse_t_ns(from_, where="from"),
-        to_t_ns=None if to is None else parse_t_ns(to, where="to"),
+        from_t_ns=None if from_ is None else parse_iso_or_t_ns(from_, where="from"),
+        to_t_ns=None if to is None else parse_iso_or_t_ns(to, where="to"),
         complete=None if complete is None else parse_completeness(complete, where="complete"),
     )
     ends = [] if cursor is None else [_parse_cursor(cursor)]

@@ -91,7 +91,7 @@ def test_another_load_lies_within_the_interval_that_five_weights_state(run: Run)
     assert run("estimate", "others.parquet", *asked_for).code == 0
     names = ("force_n", "force_sigma_n", "true_force_n")
     with SealedFileReader(Path("estimated.parquet")) as session:
-        pieces = list(session.read_columns(*names))
+        pieces = list(session.read_quantities(*names))
     force_n, sigma_n, true_n = (
         np.concatenate([piece[name] for piece in pieces])[:, 0] for name in names
     )

@@ -67,7 +67,7 @@ def test_sessions_marks_and_frames_are_views_of_what_is_in_the_folders(made: Pat
 
 def test_frames_have_the_numbers_of_the_sealed_file(made: Path) -> None:
     with SealedFileReader(made / "sessions" / IDS[1] / "frames.parquet") as session:
-        (columns,) = session.read_columns("t_ns", "pressure_raw", "grf_n")
+        (columns,) = session.read_quantities("t_ns", "pressure_raw", "grf_n")
     rows = run_query(
         find_sessions([str(made)]),
         "SELECT t_ns, pressure_raw_1, grf_n FROM frames "  # noqa: S608  # our own words

@@ -18,7 +18,7 @@ from service.estimation.pipeline.model_set import MODEL_NAMES
 from service.offline.estimate.chunks import estimate_next_chunk, join_chunks, needs_chunks
 from service.offline.estimate.request import EstimateRequest
 from service.offline.estimate.session import estimate_session
-from storage.checksummed_json import append_checksum
+from storage.checksummed_json import append_json_checksum
 from storage.formats.slice import Slice
 from storage.parquet_hash import compute_sha256
 from storage.sessions.writer import SealedFileWriter
@@ -163,7 +163,7 @@ def test_what_another_array_has_kept_is_refused(raw: Path, tmp_path: Path) -> No
     said = json.loads((tmp_path / "0000.json").read_text())
     said = {name: said[name] for name in ("number", "groups", "frames", "sha256")}
     said["sha256"]["npz"] = compute_sha256(tmp_path / "0000.npz")
-    (tmp_path / "0000.json").write_bytes(append_checksum(json.dumps(said).encode()))
+    (tmp_path / "0000.json").write_bytes(append_json_checksum(json.dumps(said).encode()))
     with pytest.raises(DamagedFileError, match="another session"):
         estimate_next_chunk(raw, tmp_path, asked, chunk_frames=1, on_remark=ignored)
 

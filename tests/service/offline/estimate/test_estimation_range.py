@@ -69,7 +69,7 @@ def estimated(source: Path, out: Path, part: Slice, **changes: Any) -> EstimateR
 
 def columns_of(path: Path) -> dict[str, np.ndarray]:
     with SealedFileReader(path) as reader:
-        pieces = list(reader.read_columns("t_ns", "seq", *NAMES))
+        pieces = list(reader.read_quantities("t_ns", "seq", *NAMES))
     return {name: np.concatenate([p[name] for p in pieces]) for name in ("t_ns", "seq", *NAMES)}
 
 
@@ -135,13 +135,13 @@ def test_only_row_groups_that_are_needed_are_read(
     raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[list[int]] = []
-    columns = SealedFileReader.read_columns
+    columns = SealedFileReader.read_quantities
 
     def noting(reader: SealedFileReader, *wanted: str, row_groups: Any = None) -> Any:
         asked.append(row_groups)
         return columns(reader, *wanted, row_groups=row_groups)
 
-    monkeypatch.setattr(SealedFileReader, "read_columns", noting)
+    monkeypatch.setattr(SealedFileReader, "read_quantities", noting)
     estimated(raw, tmp_path / "part.parquet", Slice(150.0, 160.0), tare_s=(0.5, 3.5))
     looking_for_a_tare, reading = [groups for groups in asked if groups != []]
     assert looking_for_a_tare is None  # of which only the beginning is read

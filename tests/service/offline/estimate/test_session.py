@@ -52,7 +52,7 @@ def request(*, exact: bool = False, tare_s: tuple[float, float] | None = None) -
 
 
 def estimates_of(reader: SealedFileReader) -> dict[str, np.ndarray]:
-    pieces = list(reader.read_columns(*NAMES))
+    pieces = list(reader.read_quantities(*NAMES))
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in NAMES}
 
 

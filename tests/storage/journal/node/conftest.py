@@ -37,7 +37,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
     yield begin
     for journal in running:
-        journal.close()
+        journal.end_streams_and_close()
     assert not any(thread.name == "journal" for thread in threading.enumerate())
 
 
@@ -50,4 +50,4 @@ def journal(start: Start) -> NodeJournal:
 @pytest.fixture
 def stream(journal: NodeJournal) -> NodeStream:
     """Its stream, of which nothing has been taken yet."""
-    return journal.begin_stream(make_array())
+    return journal.switch_to_new_stream(make_array())

@@ -17,7 +17,7 @@ Start = Callable[..., NodeJournal]
 def fill(journal: NodeJournal, stream: NodeStream, first: int, last: int) -> None:
     """Take frames `first` to `last`, ten in a batch."""
     for begin in range(first, last + 1, 10):
-        journal.queue_batch(stream, message(begin, min(begin + 9, last)))
+        journal.queue_batch_and_limit_memory(stream, message(begin, min(begin + 9, last)))
 
 
 def store(journal: NodeJournal, stream: NodeStream, first: int, last: int) -> None:
@@ -28,12 +28,12 @@ def store(journal: NodeJournal, stream: NodeStream, first: int, last: int) -> No
 
 def given(stream: NodeStream, first: int, last: int) -> list[int]:
     """First numbers of the batches that it gives for these frames."""
-    return [batch.seq_first for batch in stream.read_batches(first, last)]
+    return [batch.seq_first for batch in stream.read_overlapping_batches(first, last)]
 
 
 def killed(journal: NodeJournal, folder: Path) -> Path:
     """The node's folder as SIGKILL leaves it: what the kernel has."""
     copy = folder.with_name(folder.name + "-killed")
     shutil.copytree(folder, copy)
-    journal.close()
+    journal.end_streams_and_close()
     return copy

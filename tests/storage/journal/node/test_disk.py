@@ -53,16 +53,16 @@ def test_a_disk_that_takes_nothing_costs_what_memory_cannot_hold_and_goes_on_whe
             segment_writer, "write_all_or_none", refusing(OSError, number, os.strerror(number))
         )
         fill(journal, stream, 50, 69)
-        until(lambda: journal.warnings)
-        assert words in journal.warnings[0]
+        until(lambda: journal.disk_warnings)
+        assert words in journal.disk_warnings[0]
         fill(journal, stream, 70, 999)
         lost = stream.lost.by_reason[reason]
         assert next(iter(lost))[0] == 50
-        assert stream.available.count + lost.count == 1000
+        assert stream.available.number_count + lost.number_count == 1000
         assert given(stream, 990, 999) == [990]  # the live picture, and what still waits
-    until(lambda: journal.warnings == ())
+    until(lambda: journal.disk_warnings == ())
     until(lambda: stream.stored.last == 999)
-    assert stream.stored.count + stream.lost.by_reason[reason].count == 1000
+    assert stream.stored.number_count + stream.lost.by_reason[reason].number_count == 1000
 
 
 def test_a_slow_disk_holds_up_nobody_and_what_does_not_fit_is_named(
@@ -80,11 +80,11 @@ def test_a_slow_disk_holds_up_nobody_and_what_does_not_fit_is_named(
     fill(journal, stream, 0, 9)
     assert stuck.wait(5.0)
     fill(journal, stream, 10, 999)
-    assert stream.lost.by_reason["disk_slow"].count > 500
+    assert stream.lost.by_reason["disk_slow"].number_count > 500
     assert stream.recent_batches(990)
     go_on.set()
     until(lambda: stream.stored.last == 999)
-    assert stream.stored.count + stream.lost.numbers.count == 1000
+    assert stream.stored.number_count + stream.lost.numbers.number_count == 1000
 
 
 def test_what_the_disk_could_not_sync_is_written_once_more(
@@ -105,20 +105,20 @@ def test_what_the_disk_could_not_sync_is_written_once_more(
 def test_frames_that_the_disk_could_not_sync_are_given_all_the_while(
     journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    disown = Journal.invalidate
+    disown = Journal.invalidate_whole_batches
     seen: list[tuple[Intervals, list[int]]] = []
 
     def then_looked_at(journal_: Journal, numbers: Intervals) -> None:
         disown(journal_, numbers)
         seen.append((stream.available, given(stream, 0, 49)))
 
-    monkeypatch.setattr(Journal, "invalidate", then_looked_at)
+    monkeypatch.setattr(Journal, "invalidate_whole_batches", then_looked_at)
     before_each_sync_of_frames(monkeypatch, failing_once(lambda: None, *IO_ERROR))
     fill(journal, stream, 0, 49)
     until(lambda: seen and stream.available.last == 49 and stream.is_synced)
     held, batches = seen[0]
-    assert (held.first, held.count) == (0, 10 * len(batches))
-    assert batches == list(range(0, held.count, 10))
+    assert (held.first, held.number_count) == (0, 10 * len(batches))
+    assert batches == list(range(0, held.number_count, 10))
     assert batches
 
 
@@ -126,7 +126,7 @@ def test_frames_that_turn_out_damaged_are_named_and_given_no_more(
     journal: NodeJournal, stream: NodeStream
 ) -> None:
     store(journal, stream, 0, 49)
-    journal.report_damage(stream, Intervals([(20, 29)]))
+    journal.queue_invalidation(stream, Intervals([(20, 29)]))
     until(lambda: stream.lost.by_reason.get("corrupt") == Intervals([(20, 29)]))
     assert given(stream, 0, 49) == [0, 10, 30, 40]
 
@@ -157,10 +157,10 @@ def test_over_the_bound_of_memory_the_oldest_goes_first_of_whichever_stream(
 
     monkeypatch.setattr(segment_writer, "write_all_or_none", refusing(*NO_SPACE))
     journal = start()
-    before = journal.begin_stream(make_array())
+    before = journal.switch_to_new_stream(make_array())
     fill(journal, before, 0, 149)
-    until(lambda: journal.warnings)
-    present = journal.begin_stream(make_array(stream_id="1" * 32))
+    until(lambda: journal.disk_warnings)
+    present = journal.switch_to_new_stream(make_array(stream_id="1" * 32))
     fill(journal, present, 0, 99)
     assert present.available == Intervals([(0, 99)])
     assert "disk_full" in before.lost.to_pairs()

@@ -19,9 +19,9 @@ from storage.journal.node import in_flight
 from storage.journal.node.in_flight import (
     ROW_COUNT,
     InFlightWriter,
-    create_in_flight_writer,
-    delete_in_flight_file,
-    read_in_flight_frames,
+    read_in_flight_of_this_boot,
+    try_create_in_flight_writer,
+    try_delete_in_flight_file,
 )
 from tests.builders.arrays import make_array
 from tests.builders.frames import assert_same_bits
@@ -30,7 +30,7 @@ from tests.storage.stream import frames, take_in_flight
 
 
 def found(folder: Path) -> FrameBatch:
-    left = read_in_flight_frames(folder)
+    left = read_in_flight_of_this_boot(folder)
     assert left is not None
     assert left[1] is not None
     return left[1]
@@ -44,7 +44,7 @@ def test_the_newest_frames_are_there_whatever_came_before(tmp_path: Path, last: 
 
 def test_the_array_is_known_before_the_first_frame(tmp_path: Path) -> None:
     InFlightWriter(tmp_path, make_array(3)).close()
-    assert read_in_flight_frames(tmp_path) == (make_array(3), None)
+    assert read_in_flight_of_this_boot(tmp_path) == (make_array(3), None)
 
 
 def test_after_another_start_of_the_machine_nothing_is_trusted(
@@ -52,7 +52,7 @@ def test_after_another_start_of_the_machine_nothing_is_trusted(
 ) -> None:
     take_in_flight(tmp_path, frames(0, 99))
     monkeypatch.setattr(in_flight, "read_kernel_boot_id", lambda: "another start")
-    assert read_in_flight_frames(tmp_path) is None
+    assert read_in_flight_of_this_boot(tmp_path) is None
 
 
 @settings(max_examples=60)
@@ -70,7 +70,7 @@ def test_a_damaged_row_ends_what_is_trusted_and_never_gives_another_frame(
     content[at : at + 3] = data.draw(st.binary(min_size=3, max_size=3))
     path.write_bytes(content)
     try:
-        left = read_in_flight_frames(folder)
+        left = read_in_flight_of_this_boot(folder)
     except DamagedFileError:
         return
     if left is None or left[1] is None:
@@ -87,22 +87,22 @@ def test_a_full_disk_is_known_at_once_and_leaves_nothing_behind(
     """Without room that is reserved, the first write to a mapped page would end the process."""
 
     monkeypatch.setattr(os, "posix_fallocate", refusing(*NO_SPACE))
-    assert create_in_flight_writer(tmp_path, make_array()) is None
+    assert try_create_in_flight_writer(tmp_path, make_array()) is None
     assert list(tmp_path.iterdir()) == []
-    assert create_in_flight_writer(None, make_array()) is None
+    assert try_create_in_flight_writer(None, make_array()) is None
 
 
 def test_what_is_no_such_file_is_nothing(tmp_path: Path) -> None:
-    assert read_in_flight_frames(tmp_path) is None
+    assert read_in_flight_of_this_boot(tmp_path) is None
     for content in (b"", bytes(5000)):  # begun, and nothing written yet
         (tmp_path / "in_flight").write_bytes(content)
-        assert read_in_flight_frames(tmp_path) is None
+        assert read_in_flight_of_this_boot(tmp_path) is None
     for content in (b"FootTile", b"FootTile in flight 2".ljust(5000)):
         (tmp_path / "in_flight").write_bytes(content)
         with pytest.raises(DamagedFileError, match="in_flight"):
-            read_in_flight_frames(tmp_path)
-    delete_in_flight_file(tmp_path)
-    delete_in_flight_file(tmp_path)
+            read_in_flight_of_this_boot(tmp_path)
+    try_delete_in_flight_file(tmp_path)
+    try_delete_in_flight_file(tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -30,7 +30,7 @@ def test_a_stream_that_ended_in_order_is_known_to_its_end_after_a_restart(
     journal: NodeJournal, stream: NodeStream, start: Start
 ) -> None:
     fill(journal, stream, 0, 99)
-    journal.close()
+    journal.end_streams_and_close()
     again = start()
     (found,) = again.streams
     assert (found.next_seq, found.notes.max_lost_tail_frames, found.is_complete_on_disk) == (
@@ -39,7 +39,10 @@ def test_a_stream_that_ended_in_order_is_known_to_its_end_after_a_restart(
         True,
     )
     assert found.available == Intervals([(0, 99)])
-    assert again.begin_stream(make_array(stream_id="1" * 32)).notes.number == found.notes.number + 1
+    assert (
+        again.switch_to_new_stream(make_array(stream_id="1" * 32)).notes.number
+        == found.notes.number + 1
+    )
 
 
 def test_a_killed_node_has_lost_nothing(
@@ -54,13 +57,13 @@ def test_a_killed_node_has_lost_nothing(
     again.start_writer()
     (found,) = again.streams
     assert (found.next_seq, found.notes.max_lost_tail_frames) == (118, 0)
-    assert again.wait_until_on_disk()
+    assert again.wait_for_ended_streams_on_disk()
     assert found.stored == Intervals([(0, 117)])
     assert found.journal is not None
     rescued = next(found.journal.read_frames(110, 110))
     assert (rescued.tile_flags & TileFlag.OVER_RANGE).all()
     assert not (found.folder / "in_flight").exists()
-    again.close()
+    again.end_streams_and_close()
 
 
 def test_a_power_cut_costs_what_was_not_synced_and_says_how_much_that_may_be(
@@ -74,7 +77,7 @@ def test_a_power_cut_costs_what_was_not_synced_and_says_how_much_that_may_be(
     (found,) = again.streams
     assert found.next_seq == 100
     assert found.notes.max_lost_tail_frames == 0.5 * 500 + 17
-    again.close()
+    again.end_streams_and_close()
 
 
 def test_a_disk_that_was_slower_than_the_promise_widens_the_bound(
@@ -87,7 +90,7 @@ def test_a_disk_that_was_slower_than_the_promise_widens_the_bound(
     folder = killed(journal, tmp_path)
     again = NodeJournal(folder, "leg")
     assert again.streams[0].notes.max_lost_tail_frames > 0.6 * 500
-    again.close()
+    again.end_streams_and_close()
 
 
 def test_killed_before_its_notes_were_written_a_stream_is_found_by_what_was_in_flight(
@@ -98,7 +101,7 @@ def test_killed_before_its_notes_were_written_a_stream_is_found_by_what_was_in_f
     journal = start()
     (found,) = journal.streams
     assert (found.stream_id, found.next_seq) == ("2" * 32, 6)
-    assert journal.wait_until_on_disk()
+    assert journal.wait_for_ended_streams_on_disk()
     assert found.stored == Intervals([(0, 5)])
 
 
@@ -114,7 +117,7 @@ def test_recovery_writes_what_was_in_flight_and_drops_nothing(
     notes = StreamNotes.load(folder / "journal" / "leg" / ("0" * 32))
     assert notes is not None
     assert notes.next_seq == 118
-    with closing(Journal.open(folder / "journal" / "leg" / ("0" * 32))) as found:
+    with closing(Journal.open_and_recover(folder / "journal" / "leg" / ("0" * 32))) as found:
         assert found.stored == Intervals([(0, 117)])
     assert not list(folder.rglob("in_flight"))
 
@@ -125,8 +128,8 @@ def test_what_acquisition_had_taken_when_it_was_killed_is_taken_over(
     """Its last batches never came through the pipe; the node itself lives on."""
     fill(journal, stream, 0, 89)
     take_in_flight(stream.folder, frames(0, 99))
-    stream.mark_ended()
-    assert journal.wait_until_on_disk()
+    stream.mark_ended_in_memory()
+    assert journal.wait_for_ended_streams_on_disk()
     assert stream.stored == Intervals([(0, 99)])
     assert (stream.next_seq, stream.lost.to_pairs()) == (100, {})
 
@@ -139,8 +142,8 @@ def test_frames_in_flight_that_cannot_be_read_are_set_aside_and_bounded_while_th
     path = stream.folder / in_flight.IN_FLIGHT_FILE
     damaged = b"X" + path.read_bytes()[1:]
     path.write_bytes(damaged)
-    stream.mark_ended()
-    assert journal.wait_until_on_disk()
+    stream.mark_ended_in_memory()
+    assert journal.wait_for_ended_streams_on_disk()
     notes = StreamNotes.load(stream.folder)
     assert notes is not None
     assert (notes.next_seq, notes.max_lost_tail_frames) == (90, 0.5 * 500 + 17)
@@ -155,10 +158,10 @@ def test_frames_in_flight_that_cannot_be_read_now_are_waited_for(
     take_in_flight(stream.folder, frames(0, 99))
     with monkeypatch.context() as patched:
         refuse = refusing(StorageError, "cannot be read: Too many open files")
-        patched.setattr(in_flight, "read_in_flight_frames", refuse)
-        stream.mark_ended()
-        assert not journal.wait_until_on_disk(0.2)
-    assert journal.wait_until_on_disk()
+        patched.setattr(in_flight, "read_in_flight_of_this_boot", refuse)
+        stream.mark_ended_in_memory()
+        assert not journal.wait_for_ended_streams_on_disk(0.2)
+    assert journal.wait_for_ended_streams_on_disk()
     assert stream.stored == Intervals([(0, 99)])
 
 
@@ -166,8 +169,8 @@ def test_notes_of_a_later_version_stay_and_their_stream_is_left_out(
     start: Start, tmp_path: Path
 ) -> None:
     journal = start()
-    fill(journal, journal.begin_stream(make_array()), 0, 99)
-    journal.close()
+    fill(journal, journal.switch_to_new_stream(make_array()), 0, 99)
+    journal.end_streams_and_close()
     path = tmp_path / "journal" / "leg" / ("0" * 32) / "stream.json"
     said = json.loads(read_checksummed_json(path)) | {"clock_steps": 3}
     write_checksummed_json(path, json.dumps(said).encode())
@@ -176,7 +179,7 @@ def test_notes_of_a_later_version_stay_and_their_stream_is_left_out(
     assert again.streams == []
     assert "another version wrote it" in again.problems[0]
     assert "Update foottile" in again.problems[0]
-    again.close()
+    again.end_streams_and_close()
     assert [each.name for each in path.parent.glob("stream.json*")] == ["stream.json"]
     assert path.read_bytes() == before
 
@@ -188,10 +191,10 @@ def test_streams_are_in_order_even_if_the_notes_of_one_are_damaged(
     journal = start()
     names = ["f" * 32, "a" * 32, "c" * 32]
     for number, name in enumerate(names):
-        stream = journal.begin_stream(make_array(stream_id=name))
+        stream = journal.switch_to_new_stream(make_array(stream_id=name))
         fill(journal, stream, 1000 * number, 1000 * number + 99)  # later by their instants
-        until(lambda stream=stream: stream.stored.count == 100)  # type: ignore[misc]  # bound here
-    journal.close()
+        until(lambda stream=stream: stream.stored.number_count == 100)  # type: ignore[misc]  # bound here
+    journal.end_streams_and_close()
     (tmp_path / "journal" / "leg" / names[damaged] / "stream.json").write_bytes(b"{")
     again = start()
     assert [stream.stream_id for stream in again.streams] == names

@@ -27,19 +27,19 @@ def test_every_frame_is_on_disk_within_the_promise_and_can_be_given_at_any_time(
     until(lambda: stream.stored == Intervals([(0, 99)]))
     assert given(stream, 15, 44) == [10, 20, 30, 40]
     assert stream.available == Intervals([(0, 99)])
-    assert journal.warnings == ()
+    assert journal.disk_warnings == ()
 
 
 def test_two_processes_do_not_use_one_nodes_folder(start: Start, tmp_path: Path) -> None:
     start()
     with pytest.raises(StorageError, match="another foottile process"):
         NodeJournal(tmp_path, "leg")
-    NodeJournal(tmp_path, "arm").close()
+    NodeJournal(tmp_path, "arm").end_streams_and_close()
 
 
 def test_an_empty_stream_leaves_nothing(journal: NodeJournal, stream: NodeStream) -> None:
     until(lambda: stream.journal is not None)
-    journal.close()
+    journal.end_streams_and_close()
     assert not stream.folder.exists()
 
 
@@ -74,7 +74,7 @@ def test_if_it_is_not_known_what_servers_need_nothing_is_dropped_but_for_want_of
     (folder / "retention.json").write_bytes(b"damaged")
     journal = start(budget_bytes=60_000)
     assert "retention.json.damaged-1" in " ".join(journal.problems)
-    stream = journal.begin_stream(make_array())
+    stream = journal.switch_to_new_stream(make_array())
     store(journal, stream, 0, 299)
     time.sleep(2 * node_journal.SYNC_INTERVAL_S)  # for several looks at what is old
     assert stream.stored == Intervals([(0, 299)])
@@ -82,7 +82,7 @@ def test_if_it_is_not_known_what_servers_need_nothing_is_dropped_but_for_want_of
     store(journal, stream, 300, 1499)
     until(lambda: stream.stored.first != 0)
     assert stream.stored.last == 1499
-    assert journal.warnings == ()
+    assert journal.disk_warnings == ()
 
 
 def test_over_its_budget_it_drops_the_ring_first_and_then_stops_and_counts(
@@ -91,25 +91,25 @@ def test_over_its_budget_it_drops_the_ring_first_and_then_stops_and_counts(
     monkeypatch.setattr("storage.journal.open_segments.SEGMENT_DURATION_NS", 20_000_000)
     monkeypatch.setattr(node_journal, "MAX_WAITING_BYTES", 20_000)
     journal = start(budget_bytes=60_000)
-    stream = journal.begin_stream(make_array())
+    stream = journal.switch_to_new_stream(make_array())
     fill(journal, stream, 0, 99)
     until(lambda: not stream.waiting_bytes)
     journal.update_retention_request("laptop", wants((100, None)))
     for first in range(100, 1000, 50):
         fill(journal, stream, first, first + 49)
-        until(lambda: not stream.waiting_bytes or journal.warnings)
-    assert "is full" in journal.warnings[0]
+        until(lambda: not stream.waiting_bytes or journal.disk_warnings)
+    assert "is full" in journal.disk_warnings[0]
     fill(journal, stream, 1000, 1999)
     lost = stream.lost.by_reason
     assert lost["evicted"] == Intervals([(0, 99)])
-    full = lost["disk_full"].count
+    full = lost["disk_full"].number_count
     assert full > 500
     held = stream.available
-    assert held.count + full + 100 == 2000
+    assert held.number_count + full + 100 == 2000
     # A server has taken some of them after all: there is room, and it goes on.
     stream.record_acknowledgement("laptop", 100, 1999)
     fill(journal, stream, 2000, 2009)
-    until(lambda: journal.warnings == () and stream.stored.last == 2009)
+    until(lambda: journal.disk_warnings == () and stream.stored.last == 2009)
     assert "disk_full" not in stream.lost.to_pairs()
 
 
@@ -118,9 +118,9 @@ def test_what_sessions_need_and_no_server_has_is_undelivered(
 ) -> None:
     journal.update_retention_request("laptop", wants((50, None)))
     fill(journal, stream, 0, 99)
-    assert journal.undelivered_numbers(stream) == Intervals([(50, 99)])
+    assert journal.available_undelivered_numbers(stream) == Intervals([(50, 99)])
     stream.record_acknowledgement("laptop", 0, 79)
-    assert journal.undelivered_numbers(stream) == Intervals([(80, 99)])
+    assert journal.available_undelivered_numbers(stream) == Intervals([(80, 99)])
     assert journal.retention_requests.required_numbers_of("0" * 32) == Intervals([(50, NO_END)])
 
 
@@ -129,7 +129,7 @@ def test_what_the_nodes_own_session_needs_stays_whoever_has_it_besides(
 ) -> None:
     monkeypatch.setattr(retention, "RING_DURATION_NS", 100_000_000)
     monkeypatch.setattr("storage.journal.open_segments.SEGMENT_DURATION_NS", 20_000_000)
-    journal.retention_requests.set_local_numbers({stream.stream_id: Intervals([(0, NO_END)])})
+    journal.retention_requests.set_own_session_numbers({stream.stream_id: Intervals([(0, NO_END)])})
     fill(journal, stream, 0, 399)
     stream.record_acknowledgement("laptop", 0, 399)
     until(lambda: stream.stored.last == 399)
@@ -147,7 +147,7 @@ def test_what_one_server_has_another_still_gets(
     stream.record_acknowledgement("other", 0, 399)
     until(lambda: not stream.stored.restricted_to(200, 299))
     assert stream.stored.restricted_to(0, 199) == Intervals([(0, 199)])
-    assert journal.undelivered_numbers(stream) == Intervals([(0, 199)])
+    assert journal.available_undelivered_numbers(stream) == Intervals([(0, 199)])
 
 
 def test_frames_that_were_not_handed_over_are_named(

@@ -12,10 +12,10 @@ from storage.journal.node.retention_requests import RetentionRequest, RetentionR
 
 def test_a_servers_word_outlives_the_process(tmp_path: Path) -> None:
     wanted = RetentionRequests(tmp_path / "retention.json")
-    assert wanted.update_server_request(
+    assert wanted.update_request_in_memory(
         "laptop", RetentionRequest(streams={"a": ((5, 9), (20, None))})
     )
-    assert not wanted.update_server_request(
+    assert not wanted.update_request_in_memory(
         "laptop", RetentionRequest(streams={"a": ((5, 9), (20, None))})
     )
     wanted.save()
@@ -28,7 +28,7 @@ def test_while_a_session_is_recorded_a_stream_nobody_has_heard_of_belongs_to_it(
     tmp_path: Path,
 ) -> None:
     wanted = RetentionRequests(tmp_path / "retention.json")
-    wanted.update_server_request(
+    wanted.update_request_in_memory(
         "laptop", RetentionRequest(streams={"b": ((7, None),)}, recording=True, known=("a", "b"))
     )
     assert wanted.required_numbers_of("c") == Intervals([(0, NO_END)])
@@ -38,11 +38,11 @@ def test_while_a_session_is_recorded_a_stream_nobody_has_heard_of_belongs_to_it(
 
 def test_one_server_does_not_give_up_what_another_needs(tmp_path: Path) -> None:
     wanted = RetentionRequests(tmp_path / "retention.json")
-    wanted.update_server_request("laptop", RetentionRequest(streams={"a": ((0, 9),)}))
-    wanted.update_server_request("other", RetentionRequest(streams={"a": ((5, 14),)}))
-    wanted.set_local_numbers({"a": Intervals([(100, 109)])})
+    wanted.update_request_in_memory("laptop", RetentionRequest(streams={"a": ((0, 9),)}))
+    wanted.update_request_in_memory("other", RetentionRequest(streams={"a": ((5, 14),)}))
+    wanted.set_own_session_numbers({"a": Intervals([(100, 109)])})
     assert wanted.required_numbers_of("a") == Intervals([(0, 14), (100, 109)])
-    wanted.update_server_request("laptop", RetentionRequest())
+    wanted.update_request_in_memory("laptop", RetentionRequest())
     assert wanted.required_numbers_of("a") == Intervals([(5, 14), (100, 109)])
 
 
@@ -59,7 +59,7 @@ def test_a_damaged_file_is_set_aside_and_as_long_as_it_is_there_all_may_be_wante
     assert wanted.is_unknown
     assert "retention.json.damaged-1" in " ".join(wanted.problems)
     assert path.with_name("retention.json.damaged-1").read_bytes() == content
-    wanted.update_server_request("laptop", RetentionRequest(streams={"a": ((0, 9),)}))
+    wanted.update_request_in_memory("laptop", RetentionRequest(streams={"a": ((0, 9),)}))
     wanted.save()
     again = RetentionRequests(path)
     assert again.required_numbers_of("a") == Intervals([(0, 9)])
@@ -73,7 +73,7 @@ def test_a_damaged_file_is_set_aside_and_as_long_as_it_is_there_all_may_be_wante
 def test_a_flipped_bit_is_noticed_wherever_it_is(tmp_path: Path) -> None:
     path = tmp_path / "retention.json"
     wanted = RetentionRequests(path)
-    wanted.update_server_request(
+    wanted.update_request_in_memory(
         "laptop", RetentionRequest(streams={"a": ((0, 9),)}, recording=True, known=("a",))
     )
     wanted.save()
