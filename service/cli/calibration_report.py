@@ -90,7 +90,7 @@ def _tabulate_curves(calibration: Calibration) -> Table:
         *("rises", "repeats"),
     )
     for tile in calibration.tiles:
-        facts = tile.bench
+        facts = tile.rig
         last = facts.band_95[-1] if facts is not None else None
         files = f" in {facts.recordings}" if facts is not None and facts.recordings > 1 else ""
         table.add_row(
@@ -119,7 +119,7 @@ def _tabulate_ranges(calibration: Calibration) -> Table:
         *("drift\nkPa", "raw T\ncounts", "about\ndegC"),
     )
     for tile in calibration.tiles:
-        facts = tile.bench
+        facts = tile.rig
         if facts is None:
             table.add_row(tile.serial, _format_number(tile.range_kpa[1], 2), *["-"] * 7)
             continue
@@ -210,7 +210,7 @@ def calibration_to_json(calibration: Calibration) -> dict[str, object]:
 _TILE_FIELDS = {
     *("serial", "r2", "rmse_n", "cv_rmse_n", "hysteresis_n", "range_kpa", "monotonic"),
     *("coefficients", "absolute_scale", "repeats", "covariance", "baseline_kpa", "noise_kpa"),
-    *("bench", "weights"),
+    *("rig", "weights"),
 }
 
 

@@ -87,7 +87,7 @@ class TileCalibration(CalibrationPart):
     None: for any chip, as a preset is."""
     effects: Effects = Effects()
     """Parameters of the dome beside its static curve."""
-    bench: RigFacts | None = None
+    rig: RigFacts | None = None
     """Facts about the slow strokes; None for a preset, and for dead weights."""
     weights: WeightFacts | None = None
     """Dead weights that the curve was fitted to; None: slow strokes, or a preset."""
@@ -158,7 +158,7 @@ class Calibration(CalibrationPart):
             f"no calibration for tile {serial}{why}",
             where=f"calibration {self.name} ({self.id})",
             expected=f"one of {known}",
-            remedy="Press the tile on the bench and run `foottile calibrate`, or name another "
+            remedy="Press the tile on the test rig and run `foottile calibrate`, or name another "
             "calibration with --calibration",
         )
 

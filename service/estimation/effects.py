@@ -66,7 +66,7 @@ class GasEffect(CalibrationPart):
     gamma: Parameter
     tau_s: Parameter
     misfit: NonNegative
-    """Part of the correction that the bench shows to be wrong, root mean square."""
+    """Part of the correction that the test rig shows to be wrong, root mean square."""
 
     @model_validator(mode="after")
     def _check_invertible(self) -> Self:
@@ -88,7 +88,7 @@ class RubberEffect(CalibrationPart):
     scatter: NonNegative
     """Standard deviation of a new loading's gauge pressure, relative."""
     misfit: NonNegative
-    """Part of the correction that the bench shows to be wrong, root mean square."""
+    """Part of the correction that the test rig shows to be wrong, root mean square."""
     curve_misfit_n: NonNegative
     """Root mean square misfit of the cubic where slow strokes agree with one another."""
 

@@ -133,7 +133,7 @@ def _plot_curve(
         axis.grid(alpha=0.25)
     curve.tick_params(labelbottom=False)
     residual.set_xlabel("gauge pressure, kPa")
-    facts = tile.bench
+    facts = tile.rig
     end = f"range to {end_kpa:.2f} kPa"
     if facts is not None:
         beyond = "left to" if facts.spare_kpa >= 0.0 else "beyond"

@@ -105,7 +105,7 @@ class CalibrationJobs:
     def start_job(
         self, name: str, sessions: Sequence[str], options: Mapping[str, str]
     ) -> CalibrationJob:
-        """Start to fit bench recordings; called on the event loop.
+        """Start to fit test-rig recordings; called on the event loop.
 
         Args:
             name: name of the calibration.

@@ -1,8 +1,8 @@
 """Guided calibrations with known weights: one per node, recorded, marked and fitted here.
 
 The frames go into a session, in which markers say which weight stood on which tile; a fit of the
-server reads it, as it reads any bench recording. So `foottile calibrate SESSION` computes the same
-numbers later. Markers have the instants of the frames that were watched, not of their arrival.
+server reads it, as it reads any test-rig recording. So `foottile calibrate SESSION` computes the
+same numbers later. Markers have the instants of the frames that were watched, not of their arrival.
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ class StartFit(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     sessions: Annotated[tuple[SessionId, ...], Field(min_length=1, max_length=SESSIONS_MAX)] = (
-        Field(description="Bench recordings; repeats of a tile may be spread over several.")
+        Field(description="Test-rig recordings; repeats of a tile may be spread over several.")
     )
     name: Line = Field(examples=["left leg, November"])
     reference: Line = Field(default="not stated", description="Force sensor.")
@@ -244,7 +244,7 @@ async def list_calibration_jobs(server: ServerState) -> Page[FitView]:
     ),
 )
 async def start_calibration_job(body: StartFit, server: ServerState, response: Response) -> FitView:
-    """Fit every tile in bench recordings, as `foottile calibrate` does.
+    """Fit every tile in test-rig recordings, as `foottile calibrate` does.
 
     The job runs beside the server; poll it for its progress.
     """

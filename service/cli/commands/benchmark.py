@@ -40,7 +40,7 @@ def benchmark_command(
     out: Annotated[
         Path,
         typer.Option(
-            help="Folder for bench.json, bench.md and bench.png (broad.*); created if missing."
+            help="Folder for benchmark.json, .md and .png (broad.*); created if missing."
         ),
     ],
     scene: Annotated[
@@ -166,24 +166,24 @@ def benchmark_command(
     )
     with open_result_folder(out) as folder:
         with show_progress("starting") as report_step:
-            bench = run_benchmark(options, report_step)
-            text, png = format_benchmark_report(bench), plot_benchmark(bench.scenes)
-        content = to_json_text(bench.as_dict())
-        write_atomically(folder / "bench.json", content.encode())
-        write_atomically(folder / "bench.md", text.encode())
-        write_atomically(folder / "bench.png", png)
+            result = run_benchmark(options, report_step)
+            text, png = format_benchmark_report(result), plot_benchmark(result.scenes)
+        content = to_json_text(result.as_dict())
+        write_atomically(folder / "benchmark.json", content.encode())
+        write_atomically(folder / "benchmark.md", text.encode())
+        write_atomically(folder / "benchmark.png", png)
     if as_json:
-        print_json(bench.as_dict())
+        print_json(result.as_dict())
     else:
         echo_lines(text)
-        echo(f"{folder}: bench.json, bench.md, bench.png")
-    for name, failure in bench.failures:
+        echo(f"{folder}: benchmark.json, benchmark.md, benchmark.png")
+    for name, failure in result.failures:
         remark(f"not measured: {name}, {failure.what}: {failure.why}")
     missed = [
-        (name, goal) for name, goals in bench.goals.items() for goal in goals if not goal.is_met
+        (name, goal) for name, goals in result.goals.items() for goal in goals if not goal.is_met
     ]
     if check_goals:
         for name, goal in missed:
             remark(f"goal not met: {name}, {goal.mode}: {goal.figure}: {goal.value:.3g}")
-    if bench.failures or (check_goals and missed):
+    if result.failures or (check_goals and missed):
         raise typer.Exit(3)

@@ -67,38 +67,38 @@ def benchmark_broad(
     if seeds not in choices:
         raise UsageError(f"--seeds {seeds}", expected=" or ".join(choices))
     create_figure(1.0, 1.0)  # reports a missing package early
-    bench = run_broad_benchmark(
+    broad = run_broad_benchmark(
         BroadOptions(arrays, choices[seeds], jobs, folder, repeatability), remark
     )
-    text = format_broad_report(bench)
-    goals = compare_with_goals(bench.results)
+    text = format_broad_report(broad)
+    goals = compare_with_goals(broad.results)
     content = {
-        "software": bench.software,
-        "code": bench.code_hash,
-        "made": bench.run_at,
-        "machine": bench.machine,
+        "software": broad.software,
+        "code": broad.code_hash,
+        "made": broad.run_at,
+        "machine": broad.machine,
         "seeds": seeds,
-        "arrays": len(bench.results),
+        "arrays": len(broad.results),
         "repeatability": repeatability,
         "goals": goals,
-        "rows": summarize_cases(bench.results),
-        "models": count_models(bench.results),
-        "results": [result.model_dump() for result in bench.results],
+        "rows": summarize_cases(broad.results),
+        "models": count_models(broad.results),
+        "results": [result.model_dump() for result in broad.results],
     }
     write_atomically(folder / "broad.json", to_json_text(content).encode())
     write_atomically(folder / "broad.md", text.encode())
-    write_atomically(folder / "broad.png", plot_broad(bench.results))
+    write_atomically(folder / "broad.png", plot_broad(broad.results))
     if as_json:
         print_json(content)
     else:
         echo_lines(text)
         echo(f"{folder}: broad.json, broad.md, broad.png")
-    refused = [(f"array {r.number}, {f.what}", f.why) for r in bench.results for f in r.refusals]
-    for what, why in [*refused, *((f.what, f.why) for f in bench.lost_arrays)]:
+    refused = [(f"array {r.number}, {f.what}", f.why) for r in broad.results for f in r.refusals]
+    for what, why in [*refused, *((f.what, f.why) for f in broad.lost_arrays)]:
         remark(f"no result: {what}: {why}")
     missed = [goal for goal in goals if not goal.is_met]
     if check_goals:
         for goal in missed:
             remark(f"goal not met: {goal.mode}: {goal.figure}: {goal.value:.3g}")
-    if refused or bench.lost_arrays or (check_goals and missed):
+    if refused or broad.lost_arrays or (check_goals and missed):
         raise typer.Exit(3)

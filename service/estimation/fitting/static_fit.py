@@ -148,7 +148,7 @@ def fit_static_curve(*recordings: Indentation) -> TileCalibration:
         baseline_drift_kpa=drift_kpa,
         band_95=_make_band(tile),
     )
-    return tile.model_copy(update={"bench": facts})
+    return tile.model_copy(update={"rig": facts})
 
 
 @dataclass(frozen=True)

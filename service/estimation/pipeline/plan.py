@@ -154,7 +154,7 @@ def make_plan(
                 f"coefficients {tile.coefficient_words}, the calibrated one "
                 f"{entry.coefficient_words}",
                 where=f"calibration {calibration.name} ({calibration.id})",
-                remedy="Press this tile on the bench and calibrate it, or correct the serial",
+                remedy="Press this tile on the test rig and calibrate it, or correct the serial",
             )
     positions_m = np.array([(tile.x_m, tile.y_m, tile.z_m) for tile in info.tiles])
     baseline_kpa = tare.baseline_kpa[bearing]
@@ -238,7 +238,7 @@ def _compute_variance_inflation(
 
 
 def _compute_chip_max_kpa(entry: TileCalibration, baseline_kpa: float) -> float:
-    facts = entry.bench
+    facts = entry.rig
     if facts is None:
         return max(PRESSURE_MAX_KPA, baseline_kpa + entry.range_kpa[1])
     if facts.ended_by == "chip":

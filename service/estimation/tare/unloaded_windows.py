@@ -184,13 +184,13 @@ class TareFrames:
         Raises:
             TareError: a tile is far above its rig baseline, where that is known.
         """
-        for serial, baseline_kpa, bench_kpa in zip(
+        for serial, baseline_kpa, rig_kpa in zip(
             self.serials, tare.baseline_kpa, self.rig_baseline_kpa, strict=True
         ):
-            if baseline_kpa > bench_kpa + LOADED_KPA:
+            if baseline_kpa > rig_kpa + LOADED_KPA:
                 raise TareError(
                     f"tile {serial} reads {baseline_kpa:.2f} kPa in the interval, and "
-                    f"{bench_kpa:.2f} kPa unloaded on the bench: it seems to be loaded",
+                    f"{rig_kpa:.2f} kPa unloaded on the test rig: it seems to be loaded",
                     expected=f"at most {LOADED_KPA} kPa more",
                     remedy="Name an unloaded interval with --tare-s BEGIN,END, or calibrate at "
                     "this temperature",
@@ -327,7 +327,7 @@ def _find_unloaded_rows(seen: TareFrames, calibration: Calibration) -> slice:
         raise TareError(
             "no interval can be recognised as unloaded",
             expected=f"{WINDOW_NS / 1e9:g} s in which every tile is quiet and within "
-            f"{NEAR_BASELINE_KPA} kPa of its baseline on the bench",
+            f"{NEAR_BASELINE_KPA} kPa of its baseline on the test rig",
             remedy="Name an unloaded interval with --tare-s BEGIN,END",
         )
     return low[0].rows

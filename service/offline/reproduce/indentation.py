@@ -121,7 +121,7 @@ def merge_calibrations(calibrations: Sequence[Calibration], name: str) -> Calibr
 def evaluate_dome(dome: Dome, pressed: IndentedTile) -> DomeResult:
     """Evaluate a dome's recording."""
     tile = pressed.tile
-    beyond_kpa = 0.0 if tile.bench is None else tile.bench.spare_kpa
+    beyond_kpa = 0.0 if tile.rig is None else tile.rig.spare_kpa
     end_kpa = tile.range_kpa[1] + beyond_kpa
     at_kpa = np.array([end_kpa])
     return DomeResult(

@@ -77,9 +77,9 @@ def _format_comparison_table(result: Reproduction) -> Iterator[str]:
     rows: list[tuple[str, str, str]] = []
     if result.domes:
         means = [
-            one.indented_tile.tile.bench.r2_of_mean
+            one.indented_tile.tile.rig.r2_of_mean
             for one in result.domes
-            if one.indented_tile.tile.bench
+            if one.indented_tile.tile.rig
         ]
         each = [
             one.indented_tile.tile.r2
@@ -162,7 +162,7 @@ def _format_domes(result: Reproduction) -> Iterator[str]:
         tile, (full_n, half_n) = one.indented_tile.tile, one.full_scale_n
         low_n, high_n = one.expected_range.low_n, one.expected_range.high_n
         basis = "" if one.expected_range.source == "paper" else " (scaled)"
-        mean = tile.bench.r2_of_mean if tile.bench is not None else math.nan
+        mean = tile.rig.r2_of_mean if tile.rig is not None else math.nan
         yield (
             f"| {one.dome.name} | {one.dome.material.modulus_mpa} | {full_n:.1f} ± {half_n:.1f}"
             f"{'' if one.is_full_scale_reached else ', drawn out'} | "

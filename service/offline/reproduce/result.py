@@ -117,7 +117,7 @@ def _dome_to_dict(found: DomeResult) -> dict[str, object]:
         "expected_n": [found.expected_range.low_n, found.expected_range.high_n],
         "expected_from": found.expected_range.source,
         "r2": tile.r2,
-        "r2_of_mean": None if tile.bench is None else tile.bench.r2_of_mean,
+        "r2_of_mean": None if tile.rig is None else tile.rig.r2_of_mean,
         "rmse_n": tile.rmse_n,
         "repeatability": found.repeatability,
         "coefficients": tile.coefficients,

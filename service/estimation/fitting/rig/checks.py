@@ -29,7 +29,7 @@ LOAD_MIN_KPA = 3.0
 REPEATS_MIN = 2  # one has to be predicted from the others
 R2_MIN = 0.9
 """The paper has 0.9999 for the mean of four; four loadings with its scatter of 0.03 have 0.97 to
-0.997 on the emulated bench."""
+0.997 on the emulated test rig."""
 GAIN_DEVIATION_MAX = 0.3
 """The paper's scatter between loadings is 0.03 of the output, some 0.05 of the force where the
 curve is steep: six times that."""

@@ -25,16 +25,16 @@ from service.offline.benchmark.report import EMULATED, format_table
 _HEAVY = "a leg of 3.3 kg on firmer poppy seeds, up to 28 N a tile: for saturation, without a goal"
 
 
-def format_broad_report(bench: BroadBenchmarkResult) -> str:
+def format_broad_report(broad: BroadBenchmarkResult) -> str:
     """Format the report."""
-    o, results = bench.options, bench.results
+    o, results = broad.options, broad.results
     rows = summarize_cases(results)
     spent_s = sum(result.cpu_bench_s + result.cpu_scenes_s for result in results)
     alike = "each array's own, 0 to 3 %" if o.repeatability is None else f"{o.repeatability:g}"
     lines = [
         "# Unseen domes",
         "",
-        f"{bench.software}, code {bench.code_hash}, {bench.run_at}, on {bench.machine}.",
+        f"{broad.software}, code {broad.code_hash}, {broad.run_at}, on {broad.machine}.",
         "",
         f"{len(results)} arrays of four tiles of the broad family, seeds of {o.seeds}, each "
         f"calibrated on its own rig (repeatability there: {alike}), then run through every "
@@ -47,7 +47,7 @@ def format_broad_report(bench: BroadBenchmarkResult) -> str:
         "",
         "## Goals",
         "",
-        *_goals(bench),
+        *_goals(broad),
         "",
         "## Errors",
         "",
@@ -80,19 +80,19 @@ def format_broad_report(bench: BroadBenchmarkResult) -> str:
         f"A tile needs a model if its true effect on poppy seeds exceeds {MIN_EFFECT_N:g} N in the "
         "95th percentile of loaded frames; one in twenty has no effect at all.",
         "",
-        *_models(bench),
+        *_models(broad),
         "",
         "## Refusals",
         "",
-        *_refusals(bench),
+        *_refusals(broad),
     ]
     return "\n".join(lines) + "\n"
 
 
-def _goals(bench: BroadBenchmarkResult) -> list[str]:
+def _goals(broad: BroadBenchmarkResult) -> list[str]:
     errors, sigmas = (
-        _format_goals(compare_errors_with_goals(bench.results)),
-        _format_goals(compare_uncertainty_with_goals(bench.results)),
+        _format_goals(compare_errors_with_goals(broad.results)),
+        _format_goals(compare_uncertainty_with_goals(broad.results)),
     )
     missed = [row for row in sigmas if row[-1] == "NO"]
     head = ("figure", "mode", "measured", "goal", "met")
@@ -180,19 +180,19 @@ def _saturation(rows: Sequence[CaseSummary]) -> list[str]:
     return format_table(("scene", "condition", "mode", *head), cells)
 
 
-def _models(bench: BroadBenchmarkResult) -> list[str]:
+def _models(broad: BroadBenchmarkResult) -> list[str]:
     rows = [
         (m.name, str(m.needed), str(m.lost), str(m.lacking), str(m.invented))
-        for m in count_models(bench.results)
+        for m in count_models(broad.results)
     ]
     return format_table(
         ("model", "tiles that need it", "lost it", "without effect", "given it"), rows
     )
 
 
-def _refusals(bench: BroadBenchmarkResult) -> list[str]:
+def _refusals(broad: BroadBenchmarkResult) -> list[str]:
     rows, at_bound = [], Counter[str]()
-    for result in bench.results:
+    for result in broad.results:
         array = str(result.number)
         rows += [(array, refusal.what, "", refusal.why) for refusal in result.refusals]
         for tile in result.tiles:
@@ -202,7 +202,7 @@ def _refusals(bench: BroadBenchmarkResult) -> list[str]:
                 for name, why in tile.refused.items()
                 if name != "ambient" and (name in tile.lacks or needs_model(tile, name))
             ]
-    rows += [("", refusal.what, "", refusal.why) for refusal in bench.lost_arrays]
+    rows += [("", refusal.what, "", refusal.why) for refusal in broad.lost_arrays]
     lines = [
         "Every array and scene that gave nothing, and every model that a tile was refused although "
         "it needs it, or lacks the effect; with the true effect.",

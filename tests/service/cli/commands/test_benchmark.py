@@ -33,7 +33,7 @@ def test_bench_writes_json_tables_and_plot(run: Run, scene: Path, tmp_path: Path
     )
     outcome.fails(0, "rolling: 2 of 2 draws")
     folder = tmp_path / "new" / "folder"
-    content = json.loads((folder / "bench.json").read_text())
+    content = json.loads((folder / "benchmark.json").read_text())
     assert json.loads(outcome.out) == content
     (rolling,) = content["scenes"]
     assert (rolling["draws"], rolling["failures"]) == (2, [])
@@ -46,10 +46,10 @@ def test_bench_writes_json_tables_and_plot(run: Run, scene: Path, tmp_path: Path
             assert model_set[mode]["figures"]["grf_mae_n"]["n"] == 2
             assert model_set[mode]["coverage"]["all"]["frames"] > 1000
     assert sum(model_set["is_full_set"] for model_set in rolling["model_sets"]) == 1
-    text = (folder / "bench.md").read_text()
+    text = (folder / "benchmark.md").read_text()
     assert "an emulated foot" in text
     assert "forces in newtons are unreliable" in text
-    assert (folder / "bench.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "benchmark.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_goals_that_are_not_met_are_named_and_code_3_if_asked_for(run: Run, scene: Path) -> None:
@@ -74,8 +74,8 @@ def test_a_draw_that_fails_is_reported_and_the_others_count(
     monkeypatch.setattr(draws, "find_calibration", refuses)
     outcome = run("benchmark", "--scene", scene, "--draws", 2, *QUICK, "--out", "o")
     outcome.fails(3, "rolling, draw 1: tile T03 does not rise")
-    assert "- draw 1: tile T03 does not rise" in (tmp_path / "o" / "bench.md").read_text()
-    (rolling,) = json.loads((tmp_path / "o" / "bench.json").read_text())["scenes"]
+    assert "- draw 1: tile T03 does not rise" in (tmp_path / "o" / "benchmark.md").read_text()
+    (rolling,) = json.loads((tmp_path / "o" / "benchmark.json").read_text())["scenes"]
     assert rolling["draws"] == 1
     assert len(rolling["failures"]) == 1
 

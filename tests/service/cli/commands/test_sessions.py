@@ -242,7 +242,7 @@ def test_calibrate_prints_the_contract_and_draws(run: Run, tmp_path: Path, bench
         *("serial", "r2", "rmse_n", "cv_rmse_n", "hysteresis_n", "range_kpa"),
         *("monotonic", "coefficients"),
     }
-    assert tile["bench"]["ended_by"] == "load"
+    assert tile["rig"]["ended_by"] == "load"
     assert tile["absolute_scale"] == "measured"
     low_ms, high_ms = tile["effects"]["gas_tau_ms"]["interval_95"]
     assert low_ms < tile["effects"]["gas_tau_ms"]["value"] < high_ms

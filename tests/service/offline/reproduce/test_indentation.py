@@ -65,5 +65,5 @@ def test_a_dome_that_is_pressed_is_found_to_saturate_where_it_does() -> None:
     # Its slow force at 115 kPa is 30.4 N; creep, loop and loadings make some newtons of that.
     assert 25.0 <= full_n <= 35.0
     assert 0.2 < half_n < 4.0
-    assert found.indented_tile.tile.bench is not None
-    assert found.indented_tile.tile.bench.r2_of_mean > 0.999
+    assert found.indented_tile.tile.rig is not None
+    assert found.indented_tile.tile.rig.r2_of_mean > 0.999

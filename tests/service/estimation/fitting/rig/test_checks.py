@@ -50,7 +50,7 @@ def bench(
 
 
 def test_a_good_recording_states_where_it_ended_how_warm_and_how_repeats_agreed() -> None:
-    facts = fit_static_curve(bench(gains=(0.99, 1.0, 1.0, 1.01))).bench
+    facts = fit_static_curve(bench(gains=(0.99, 1.0, 1.0, 1.01))).rig
     assert facts is not None
     assert facts.end_absolute_kpa == pytest.approx(113.0, abs=0.2)
     assert facts.spare_kpa == pytest.approx(2.0, abs=0.2)
@@ -72,8 +72,8 @@ def test_a_good_recording_states_where_it_ended_how_warm_and_how_repeats_agreed(
 def test_the_band_in_the_file_is_t_based_over_the_repeats() -> None:
     gains = (0.97, 1.0, 1.0, 1.03)
     tile = fit_static_curve(bench(gains=gains))
-    assert tile.bench is not None
-    last = tile.bench.band_95[-1]
+    assert tile.rig is not None
+    last = tile.rig.band_95[-1]
     standard_error = np.std(gains, ddof=1) / 2
     assert last.mean_n == pytest.approx(3.182446 * standard_error * last.force_n, rel=1e-3)
     assert last.new_loading_n > last.mean_n
@@ -87,8 +87,8 @@ def test_repeats_of_two_files_count_together_each_above_its_own_zero() -> None:
         fit_static_curve(bench(gains=(0.98, 1.0, 1.0, 1.02))),
     )
     assert both.repeats == 4
-    assert both.bench is not None
-    assert both.bench.recordings == 2
+    assert both.rig is not None
+    assert both.rig.recordings == 2
     assert both.coefficients == pytest.approx(single.coefficients, rel=1e-9)
     np.testing.assert_allclose(both.covariance, single.covariance, rtol=1e-6, atol=1e-15)
     assert both.baseline_kpa == pytest.approx(100.75)
@@ -116,8 +116,8 @@ def test_a_baseline_that_creeps_away_between_repeats_is_refused_with_its_values(
 
 def test_the_rubbers_settling_after_the_first_repeat_is_no_drift() -> None:
     tile = fit_static_curve(bench(rest_kpa=(0.0, 0.5, 0.52, 0.49)))
-    assert tile.bench is not None
-    assert tile.bench.baseline_drift_kpa == pytest.approx(0.03)
+    assert tile.rig is not None
+    assert tile.rig.baseline_drift_kpa == pytest.approx(0.03)
     with pytest.raises(CalibrationError, match=r"drifts by 1\.20 kPa"):
         fit_static_curve(bench(rest_kpa=(0.0, 1.2, 1.2, 1.2)))
 
@@ -160,17 +160,17 @@ def test_a_chip_that_stands_still_ends_the_range_there() -> None:
     recording = bench()
     clipped = replace(recording, kpa=np.minimum(recording.kpa, BASELINE_KPA + 10.0))
     tile = fit_static_curve(clipped)
-    assert tile.bench is not None
-    assert tile.bench.ended_by == "chip"
+    assert tile.rig is not None
+    assert tile.rig.ended_by == "chip"
     assert tile.range_kpa[1] == pytest.approx(9.9, abs=0.1)
-    assert tile.bench.end_n == pytest.approx(force_n(np.array(9.9)), abs=0.5)
+    assert tile.rig.end_n == pytest.approx(force_n(np.array(9.9)), abs=0.5)
 
 
 def test_a_chip_that_wrapped_ends_the_range_before_it() -> None:
     recording = bench()
     wrapped = np.where(recording.kpa > BASELINE_KPA + 11.0, np.inf, recording.kpa)
     tile = fit_static_curve(replace(recording, kpa=wrapped))
-    assert tile.bench is not None
-    assert tile.bench.ended_by == "chip"
+    assert tile.rig is not None
+    assert tile.rig.ended_by == "chip"
     assert tile.range_kpa[1] == pytest.approx(11.0, abs=0.15)
-    assert tile.bench.spare_kpa == pytest.approx(4.0, abs=0.15)
+    assert tile.rig.spare_kpa == pytest.approx(4.0, abs=0.15)
