@@ -39,9 +39,7 @@ REPETITIONS, QUICK_REPETITIONS = 5, 3
 def benchmark_command(
     out: Annotated[
         Path,
-        typer.Option(
-            help="Folder for benchmark.json, .md and .png (broad.*); created if missing."
-        ),
+        typer.Option(help="Folder for benchmark.json, .md and .png (broad.*); created if missing."),
     ],
     scene: Annotated[
         list[str] | None,
