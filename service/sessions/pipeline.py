@@ -10,6 +10,7 @@ import json
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields
+from functools import partial
 from itertools import chain
 from typing import Any, Self
 
@@ -26,6 +27,7 @@ from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from service.estimation.quantization import Quantization
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded_windows import RECOGNITION_SPAN_NS, compute_recording_tare
+from service.estimation.tare_recovery import remove_recovery
 from storage.schema import ROUNDING_STEP_KEY
 
 Extra = Mapping[str, npt.NDArray[Any]]
@@ -243,6 +245,12 @@ class EstimateStream:
             self._options.calibration,
             self._info.serials,
             interval_s=self._options.tare_s,
+            remove_recovery=partial(
+                remove_recovery,
+                info=self._info,
+                calibration=self._options.calibration,
+                models=self._options.models,
+            ),
         )
 
     def make_plan(self, tare: Tare) -> EstimationPlan:

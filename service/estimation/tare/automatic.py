@@ -213,6 +213,10 @@ def propose_flight_tare(
         or tare.t_ns - present.t_ns < TARE_INTERVAL_MIN_NS
     ):
         return NO_TARE
+    is_renewal = tare.t_ns - present.t_ns >= RENEWAL_NS
+    if not _has_shifted(tare, present, is_load_bearing) and not is_renewal:
+        return NO_TARE
+    tare = recent.remove_recovery(tare)
     shift_kpa = np.where(is_load_bearing, tare.baseline_kpa - present.baseline_kpa, 0.0)
     doubt = _explain_excess_shift(
         tare, present, SHIFT_MAX_KPA, serials, is_load_bearing, "the last tare"
@@ -231,17 +235,24 @@ def propose_flight_tare(
     since_s = (tare.t_ns - present.t_ns) * 1e-9
     if (np.abs(shift_kpa) > SHIFT_RATE_MAX_KPA_PER_S * since_s).any():
         return NO_TARE  # perhaps in a minute
-    sigma_kpa = np.hypot(tare.baseline_sigma_kpa, present.baseline_sigma_kpa)
-    moved = np.abs(shift_kpa) > np.maximum(SHIFT_MIN_KPA, SHIFT_MIN_SIGMAS * sigma_kpa)
-    if not moved.any() and tare.t_ns - present.t_ns < RENEWAL_NS:
+    has_shifted = _has_shifted(tare, present, is_load_bearing)
+    if not has_shifted and not is_renewal:
         return NO_TARE
     most = int(np.argmax(np.abs(shift_kpa)))
     reason = (
         f"in flight; {serials[most]} by {shift_kpa[most]:+.2f} kPa in {since_s / 60:.0f} min"
-        if moved.any()
+        if has_shifted
         else f"in flight; nothing has moved in {since_s / 60:.0f} min"
     )
     return FlightTareResult(replace(tare, source="flight"), reason)
+
+
+def _has_shifted(tare: Tare, present: Tare, is_load_bearing: Bools) -> bool:
+    """Return whether a load-bearing tile's baseline has moved by more than chance."""
+    sigma_kpa = np.hypot(tare.baseline_sigma_kpa, present.baseline_sigma_kpa)
+    shift_kpa = np.abs(tare.baseline_kpa - present.baseline_kpa)
+    limit_kpa = np.maximum(SHIFT_MIN_KPA, SHIFT_MIN_SIGMAS * sigma_kpa)
+    return bool((shift_kpa > limit_kpa)[is_load_bearing].any())
 
 
 def propose_first_flight_tare(recent: TareFrames) -> FlightTareResult:
@@ -266,7 +277,8 @@ def propose_first_flight_tare(recent: TareFrames) -> FlightTareResult:
     if (off_kpa > NEAR_BASELINE_KPA).any() or stepped_ns < RECOVERY_NS:
         return NO_TARE
     return FlightTareResult(
-        replace(tare, source="flight"), "in flight, between two steps; there was none yet"
+        replace(recent.remove_recovery(tare), source="flight"),
+        "in flight, between two steps; there was none yet",
     )
 
 

@@ -10,7 +10,7 @@ gives a wrong force that looks right.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +41,10 @@ STUCK_SCATTER_MAX_COUNTS = 0.5
 """Scatter in counts above which a healthy chip does not read the same count twenty times."""
 
 
+RemoveRecovery = Callable[[Tare, FrameBatch], Tare]
+"""Removal of what earlier loads have left in a tare's interval; see `tare_recovery`."""
+
+
 @dataclass(frozen=True)
 class QuietWindow:
     """Window in which every tile is quiet and still.
@@ -64,6 +68,7 @@ class TareFrames:
         compensation: of the array's chips.
         calibration: of its tiles, with baselines in the rig.
         serials: of the tiles, in order.
+        remove_recovery: applied to tares that may follow a load; None: they stay as they are.
 
     Attributes:
         kpa: (n, tiles), absolute pressures; NaN where a tile gave none.
@@ -79,6 +84,7 @@ class TareFrames:
         compensation: Compensation,
         calibration: Calibration,
         serials: tuple[str, ...],
+        remove_recovery: RemoveRecovery | None = None,
     ) -> None:
         self.frames, _ = hold_temperature(frames)
         self.serials = serials
@@ -91,6 +97,11 @@ class TareFrames:
         self.rig_noise_kpa = np.array([e.noise_kpa if e else None for e in entries], dtype=float)
         self.is_calibrated = np.array([entry is not None for entry in entries])
         self._compensation = compensation
+        self._remove_recovery = remove_recovery
+
+    def remove_recovery(self, tare: Tare) -> Tare:
+        """Return a tare without what loads before its interval have left in it."""
+        return tare if self._remove_recovery is None else self._remove_recovery(tare, self.frames)
 
     @property
     def has_rig_baselines(self) -> bool:
@@ -262,6 +273,7 @@ def compute_recording_tare(
     serials: tuple[str, ...],
     *,
     interval_s: tuple[float, float] | None = None,
+    remove_recovery: RemoveRecovery | None = None,
 ) -> Tare:
     """Compute a recording's tare from `interval_s`, its lead, or an unloaded window.
 
@@ -271,19 +283,20 @@ def compute_recording_tare(
         calibration: of its tiles, with baselines in the rig.
         serials: of the tiles, in order.
         interval_s: the user's interval, in seconds from the first frame.
+        remove_recovery: applied to a tare that may follow a load: any but that of a lead.
 
     Raises:
         TareError: the interval holds too few readable frames, or none can be recognised.
     """
     if interval_s is not None:
         begin_s, end_s = interval_s
-        seen = TareFrames(frames, compensation, calibration, serials)
+        seen = TareFrames(frames, compensation, calibration, serials, remove_recovery)
         t_s = seen.since_ns * 1e-9
         rows = (t_s >= begin_s) & (t_s <= end_s)
         tare = seen.compute_tare(rows, "interval")
         seen.reject_loaded(tare)
         seen.reject_stuck(tare, rows)
-        return tare
+        return seen.remove_recovery(tare)
     lead = np.logical_and.accumulate((frames.frame_flags & FrameFlag.LEAD) != 0)
     if lead[0]:
         seen = TareFrames(frames, compensation, calibration, serials)
@@ -294,11 +307,11 @@ def compute_recording_tare(
     # The result must not depend on the number of frames passed.
     last_ns = frames.t_ns[0] + RECOGNITION_SPAN_NS
     frames = frames.slice_rows(0, int(np.searchsorted(frames.t_ns, last_ns, side="right")))
-    seen = TareFrames(frames, compensation, calibration, serials)
+    seen = TareFrames(frames, compensation, calibration, serials, remove_recovery)
     found = _find_unloaded_rows(seen, calibration)
     tare = seen.compute_tare(found, "recognised")
     seen.reject_stuck(tare, found)
-    return tare
+    return seen.remove_recovery(tare)
 
 
 def _find_unloaded_rows(seen: TareFrames, calibration: Calibration) -> slice:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import takewhile
 
 import numpy as np
@@ -28,6 +29,7 @@ from service.estimation.tare.automatic import (
 )
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded_windows import TareFrames, compute_recording_tare
+from service.estimation.tare_recovery import remove_recovery
 from service.server.estimates.ranges import TileRanges
 from service.sessions.pipeline import Columns, EstimateOptions, EstimateRun, EstimateStream
 
@@ -237,12 +239,20 @@ class LiveEstimator:
             raise TareError("no frames have come yet", remedy="Connect the node")
         frames = FrameBatch.concatenate(list(self._recent))
         seen = self._tare_frames(frames, calibration)
-        return compute_newest_unloaded_tare(
+        tare = compute_newest_unloaded_tare(
             seen, present=self.tare, is_load_bearing=self._is_loaded_tile
         )
+        return seen.remove_recovery(tare)
 
     def _tare_frames(self, frames: FrameBatch, calibration: Calibration) -> TareFrames:
-        return TareFrames(frames, self._compensation, calibration, self._info.serials)
+        info = self._info
+        # While the models are being compiled, an estimate would block the event loop.
+        removal = (
+            None
+            if is_compiling()
+            else partial(remove_recovery, info=info, calibration=calibration, models=info.models)
+        )
+        return TareFrames(frames, self._compensation, calibration, info.serials, removal)
 
     def _require_calibration(self) -> Calibration:
         if self._calibration is None:

@@ -252,7 +252,7 @@ def test_a_foot_whose_lead_failed_is_tared_as_soon_as_it_steps(foot_of: Any) -> 
     assert foot.history == [("flight", False)]
     assert foot.offset_counts == pytest.approx([2.0, 2.0], abs=0.6)
     assert foot.node.estimator.tare_controller.problem is None
-    assert "between two steps" in foot.node.estimator.tare_history.tares[0].reason
+    assert "between two steps" in foot.node.estimator.tare_history.all_tares[0].reason
 
 
 def test_a_foot_that_stands_from_the_beginning_is_never_tared_unasked(foot_of: Any) -> None:
