@@ -23,7 +23,8 @@ from devices.buses.i2c import open_bus
 from devices.clock import UtcAnchor, VirtualClock
 from devices.emulation.buses.gpio import EmulatedGpioLines
 from devices.emulation.world import World
-from devices.frames import FrameBatch, TileFlag
+from devices.flags import TileFlag
+from devices.frames import FrameBatch
 from devices.recovery.bus_recovery import GpioRecovery
 from devices.scene.scene_file import Scene, load_scene, validate_scene
 from tests.builders.witness import Verdict, Witness

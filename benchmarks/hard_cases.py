@@ -33,18 +33,12 @@ from devices.chips.compensation import Compensation
 from devices.clock import VirtualClock
 from devices.emulation.ground.load_trace import CopTransform, LoadTrace
 from devices.errors import FootTileError
-from devices.frames import (
-    NO_SERVO_AGE,
-    NO_SERVO_COUNTS,
-    ArrayInfo,
-    FrameBatch,
-    FrameFlag,
-    allocate_columns,
-)
+from devices.flags import EstimateFlag, FrameFlag
+from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, ArrayInfo, FrameBatch, allocate_columns
 from devices.scene.scene_file import Scene, load_scene
 from service.estimation.calibration import Calibration
 from service.estimation.estimate import Estimator
-from service.estimation.estimates import EstimateFlag, Estimates
+from service.estimation.estimates import Estimates
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from service.estimation.tare.unloaded_windows import compute_recording_tare
 from service.offline.calibration_lookup import find_calibration

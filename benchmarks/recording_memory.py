@@ -49,7 +49,7 @@ def array(tiles: int, rate_hz: float) -> Any:
 
 
 def minute(number: int, tiles: int, rate_hz: float) -> Any:
-    from devices.frames import FrameFlag
+    from devices.flags import FrameFlag
     from tests.builders.frames import make_frames
 
     rng = np.random.default_rng(number % 7)

@@ -23,7 +23,8 @@ import numpy as np
 import pyarrow as pa
 from recording_data import Recording, at_rate, batches, emulated
 
-from devices.frames import ArrayInfo, FrameBatch, FrameFlag
+from devices.flags import FrameFlag
+from devices.frames import ArrayInfo, FrameBatch
 from devices.scene.scene_file import load_scene
 from service.estimation.calibration import Calibration
 from service.node.frame_sender import NodeCallbacks

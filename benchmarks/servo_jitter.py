@@ -33,7 +33,7 @@ from devices.acquisition import Acquisition
 from devices.chips.dynamixel.driver import open_servo
 from devices.chips.dynamixel.position_sources import ThreadedServoSource
 from devices.clock import SystemClock, UtcAnchor
-from devices.frames import FrameFlag
+from devices.flags import FrameFlag
 from devices.realtime import set_timer_slack
 from tests.builders.servo import FaultyServo
 

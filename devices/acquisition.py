@@ -16,13 +16,12 @@ from devices.array.tile_io import Scan
 from devices.chips.compensation import Compensation
 from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 from devices.clock import Clock, UtcAnchor
+from devices.flags import FrameFlag, TileFlag
 from devices.frames import (
     NO_SERVO_AGE,
     NO_SERVO_COUNTS,
     NOT_READ,
     FrameBatch,
-    FrameFlag,
-    TileFlag,
     TileInfo,
     allocate_columns,
 )

@@ -8,7 +8,6 @@ the last value.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntFlag
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -32,43 +31,6 @@ NO_SERVO_COUNTS = -(2**31)
 NO_SERVO_AGE = -1
 SAME_PLACE_M = 1e-6
 """Tiles that differ by no more along an axis stand in one row."""
-
-
-class TileFlag(IntFlag):
-    """Flags of a tile in a frame; bits of `FrameBatch.status`."""
-
-    NO_ANSWER = 1
-    """The tile did not acknowledge; its counts are `NOT_READ`."""
-    STALE = 2
-    """The readings no longer change: the part must have stopped converting."""
-    RETRIED = 4
-    """The reading is good, but took a second attempt or a third reading."""
-    IMPLAUSIBLE = 8
-    """Impossible counts, counts that could not be confirmed, or counts of another part."""
-    OVER_RANGE = 16
-    """Pressure outside the chip's 50 to 115 kPa, or a count at the end of its range."""
-    NOT_CONVERTED = 32
-    """Zeros, as after power-up of the part, or no conversion finished in this frame."""
-
-    UNUSABLE = NO_ANSWER | STALE | IMPLAUSIBLE | NOT_CONVERTED
-    """Mask of the flags without a usable pressure."""
-
-
-class FrameFlag(IntFlag):
-    """Flags of a frame; bits of `FrameBatch.frame_flags`."""
-
-    OVERRUN = 1
-    """The frame began after its slot had passed; slots before it were missed."""
-    SERVO_STALE = 2
-    """The newest servo position is older than it should be."""
-    BUS_FAULT = 4
-    """The bus itself failed in this frame, not one tile."""
-    LEAD = 8
-    """The frame precedes a load trace: the foot is unloaded."""
-    NEW_ARRAY_INFO = 16
-    """The array was identified again before this frame."""
-    SERVO_TURN_UNKNOWN = 32
-    """The servo restarted or its count jumped: the position may be off by whole turns."""
 
 
 @dataclass(frozen=True)

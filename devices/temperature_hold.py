@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Times
-from devices.frames import NOT_READ, FrameBatch, TileFlag
+from devices.flags import TileFlag
+from devices.frames import NOT_READ, FrameBatch
 
 HOLD_MAX_NS = 1_000_000_000
 """Longest hold; an older temperature is not used."""

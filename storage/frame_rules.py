@@ -12,14 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Times
-from devices.frames import (
-    NO_SERVO_AGE,
-    NOT_READ,
-    ArrayInfo,
-    FrameBatch,
-    FrameFlag,
-    TileFlag,
-)
+from devices.flags import FrameFlag, TileFlag
+from devices.frames import NO_SERVO_AGE, NOT_READ, ArrayInfo, FrameBatch
 from devices.types import T_MONO_NS_END, T_NS_END
 
 MAX_RAW_COUNTS = 1023

@@ -18,6 +18,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from devices.errors import DamagedFileError, FileFormatError
+from devices.flags import EstimateFlag, FrameFlag, TileFlag, list_bits
 from devices.frames import (
     FRAME_COLUMNS,
     NO_SERVO_AGE,
@@ -83,12 +84,12 @@ MEASURED_COLUMNS = (
     _frame_column(
         "tile_flags",
         "bits",
-        "1 no_answer, 2 stale, 4 retried, 8 implausible, 16 over_range, 32 not_converted",
+        list_bits(TileFlag),
     ),
     _frame_column(
         "frame_flags",
         "bits",
-        "1 overrun, 2 servo_stale, 4 bus_fault, 8 lead, 16 new_array_info, 32 servo_turn_unknown",
+        list_bits(FrameFlag),
     ),
     _frame_column("reference_force_n", "N", "force of the calibration rig's sensor"),
 )
@@ -119,9 +120,7 @@ ESTIMATE_COLUMNS = (
         "estimate_flags",
         pa.uint16(),
         "bits",
-        "1 saturated, 2 extrapolated, 4 outlier_replaced, 8 gap, 16 cop_masked, 32 tile_missing, "
-        "64 assumed_scale, 128 tare_old, 256 over_rated, 512 tare_lost, "
-        "1024 after_saturation, 2048 stuck, 4096 clipped, 8192 baseline_lost",
+        list_bits(EstimateFlag),
     ),
 )
 """Columns that the estimator computes: `service.estimation.estimates.Estimates`."""

@@ -21,6 +21,7 @@ from typing import Any, get_args
 import pytest
 from pydantic import BaseModel
 
+from devices.flags import EstimateFlag
 from devices.scene.emulation_sections import (
     EmulationSection,
     FaultSection,
@@ -41,7 +42,6 @@ from service.api.logins import Logins
 from service.api.settings import Settings
 from service.cli.command_table import SUMMARIES, load_command
 from service.estimation.calibration import TileCalibration
-from service.estimation.estimates import EstimateFlag
 from service.protocol import LinkCloseCode
 from service.server.broadcast.force_span import summarize_force
 from service.server.broadcast.summary import PendingUpdate, summarize_frames

@@ -15,7 +15,7 @@ from devices.array.tile_health import TileHealth, classify_impossible_counts
 from devices.array.tile_io import Scan, TileIo
 from devices.clock import Clock
 from devices.errors import NoAcknowledgeError
-from devices.frames import TileFlag
+from devices.flags import TileFlag
 
 DISTURBED_NS = 1_000_000_000
 """Time after a disturbed reading in which an unconfirmed jump is flagged."""

@@ -12,7 +12,7 @@ from devices.array.tile_health import TileHealth
 from devices.array.tile_io import Scan, TileIo
 from devices.clock import Clock
 from devices.errors import NoAcknowledgeError, TileSetupError
-from devices.frames import TileFlag
+from devices.flags import TileFlag
 
 
 class TileReconnector:

@@ -28,7 +28,8 @@ from devices.buses.i2c import I2cBus
 from devices.chips.mpl115a2 import SAMPLE_DELAY_DIVISOR
 from devices.clock import Clock
 from devices.errors import BusFaultError, NoAcknowledgeError
-from devices.frames import NOT_READ, TileFlag, TileInfo
+from devices.flags import TileFlag
+from devices.frames import NOT_READ, TileInfo
 from devices.recovery.bus_recovery import BusRecovery
 from devices.scene.hardware_sections import ScheduleName
 

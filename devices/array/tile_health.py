@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections import Counter, deque
 
 from devices.chips.mpl115a2 import COUNTS_MAX, Coefficients, compute_kpa_per_padc
-from devices.frames import NOT_READ, TileFlag, TileInfo
+from devices.flags import TileFlag
+from devices.frames import NOT_READ, TileInfo
 
 JUMP_KPA = 0.5
 """Distance from the median of the last three above which a reading is read again. That affects

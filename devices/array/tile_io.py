@@ -14,7 +14,8 @@ from devices.chips.mpl115a2 import COUNTS_MAX, Mpl115a2
 from devices.chips.tca9548a import MuxRouter
 from devices.clock import Clock
 from devices.errors import BusFaultError
-from devices.frames import NOT_READ, TileFlag, TileInfo
+from devices.flags import TileFlag
+from devices.frames import NOT_READ, TileInfo
 
 
 class TileIo:

@@ -9,7 +9,8 @@ import numpy.typing as npt
 
 from devices.arrays import Floats
 from devices.chips.mpl115a2 import Coefficients, compensate_kpa, compute_kpa_per_padc
-from devices.frames import NOT_READ, FrameBatch, TileFlag, TileInfo
+from devices.flags import TileFlag
+from devices.frames import NOT_READ, FrameBatch, TileInfo
 
 _QUANTIZATION_SIGMA = 1.0 / np.sqrt(12.0)  # standard deviation of the quantization error, in counts
 

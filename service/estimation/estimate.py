@@ -15,9 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Floats, Times
+from devices.flags import EstimateFlag
 from devices.frames import FrameBatch
 from devices.jit import jit_cached, jit_inlined
-from service.estimation.estimates import EstimateFlag, Estimates
+from service.estimation.estimates import Estimates
 from service.estimation.foot import CONTACT_UNKNOWN
 from service.estimation.foot.contact import is_debounced
 from service.estimation.foot.geometry import transform_to_ground_x_m

@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Floats, Times
-from service.estimation.estimates import SIGMAS_95, EstimateFlag
+from devices.flags import EstimateFlag
+from service.estimation.estimates import SIGMAS_95
 from service.estimation.foot import CONTACT_UNKNOWN, LONG_GAP_NS
 from service.estimation.stance_peak import PeakSearch
 

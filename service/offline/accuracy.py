@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Bools, Floats
-from service.estimation.estimates import SIGMAS_95, EstimateFlag
+from devices.flags import EstimateFlag
+from service.estimation.estimates import SIGMAS_95
 
 ACCURACY_COLUMNS = (
     "t_ns",

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from devices.arrays import Floats
 from devices.errors import ComparisonError, FileFormatError, UsageError
-from service.estimation.estimates import EstimateFlag
+from devices.flags import EstimateFlag
 from service.offline.compare.alignment import Alignment, align_signals
 from service.offline.compare.clock_lag import ClockLag, describe_clock_contradiction
 from service.offline.compare.error_figures import ComparisonErrors, compute_errors

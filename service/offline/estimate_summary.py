@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from devices.flags import EstimateFlag
 from devices.frames import FrameBatch
-from service.estimation.estimates import EstimateFlag
 from service.estimation.stances import Stance, StanceDetector
 from service.offline.accuracy import ACCURACY_COLUMNS, Accuracy, compute_accuracy
 

@@ -28,7 +28,8 @@ from devices.clock import UtcAnchor, VirtualClock
 from devices.emulation.ground.load_trace import TileLoad
 from devices.emulation.world import World
 from devices.errors import UsageError
-from devices.frames import FrameBatch, TileFlag
+from devices.flags import TileFlag
+from devices.frames import FrameBatch
 from devices.scene.hardware_sections import AnySchedule, ServoSection
 from devices.scene.scene_file import Scene
 from service.offline.estimate_summary import EstimateSummarizer, EstimateSummary

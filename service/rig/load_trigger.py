@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from devices.frames import FrameBatch, TileFlag
+from devices.flags import TileFlag
+from devices.frames import FrameBatch
 
 if TYPE_CHECKING:
     from devices.emulation.world import World

@@ -20,7 +20,8 @@ from devices.chips.dynamixel.position_sources import ThreadedServoSource
 from devices.chips.mcp3208 import Mcp3208
 from devices.clock import Clock, SpinningClock, SystemClock, UtcAnchor
 from devices.errors import FootTileError, I2cError, TileSetupError, UsageError
-from devices.frames import ArrayInfo, FrameBatch, FrameFlag
+from devices.flags import FrameFlag
+from devices.frames import ArrayInfo, FrameBatch
 from devices.realtime import is_clock_set, set_timer_slack, use_realtime_priority
 from devices.recovery.bus_recovery import BusRecovery, GpioRecovery, open_gpio_recovery
 from devices.reference_force import ReferenceForceSensor

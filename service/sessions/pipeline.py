@@ -19,7 +19,8 @@ import numpy.typing as npt
 
 from devices.chips.compensation import Compensation
 from devices.errors import TareError, UsageError
-from devices.frames import ArrayInfo, FrameBatch, FrameFlag
+from devices.flags import FrameFlag
+from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
 from service.estimation.estimate import Estimator
 from service.estimation.estimates import Estimates

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from devices.frames import FrameBatch, FrameFlag, allocate_columns
+from devices.flags import FrameFlag
+from devices.frames import FrameBatch, allocate_columns
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 

@@ -10,14 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from devices.frames import (
-    FRAME_COLUMNS,
-    NO_SERVO_AGE,
-    NO_SERVO_COUNTS,
-    NOT_READ,
-    FrameBatch,
-    TileFlag,
-)
+from devices.flags import TileFlag
+from devices.frames import FRAME_COLUMNS, NO_SERVO_AGE, NO_SERVO_COUNTS, NOT_READ, FrameBatch
 from tests.builders.arrays import PERIOD_NS, UNLOADED_COUNTS, UTC_NS
 
 

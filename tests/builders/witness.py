@@ -16,7 +16,8 @@ from devices.arrays import Bools, Floats
 from devices.chips.compensation import Compensation
 from devices.chips.mpl115a2 import SAMPLE_DELAY_DIVISOR, Coefficients, compensate_kpa
 from devices.emulation.world import World
-from devices.frames import NOT_READ, FrameBatch, TileFlag, TileInfo
+from devices.flags import TileFlag
+from devices.frames import NOT_READ, FrameBatch, TileInfo
 from devices.temperature_hold import hold_temperature
 
 _ROUNDING_NS = 2_000  # offsets are whole microseconds

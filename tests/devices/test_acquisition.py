@@ -9,7 +9,8 @@ from devices.acquisition import Acquisition
 from devices.array.tile_array import TileArray
 from devices.array.timing_budget import BusTiming
 from devices.buses.i2c import I2cBus
-from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, FrameBatch, FrameFlag
+from devices.flags import FrameFlag
+from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, FrameBatch
 from devices.scene.hardware_sections import ScheduleName
 from devices.scene.scene_file import Scene
 from tests.builders.scenes import make_scene

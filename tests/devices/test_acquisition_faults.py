@@ -13,7 +13,8 @@ from smbus2 import i2c_msg
 from devices.buses.i2c import I2cAdapter
 from devices.clock import VirtualClock
 from devices.errors import BusMisuseError
-from devices.frames import NOT_READ, FrameBatch, FrameFlag, TileFlag
+from devices.flags import FrameFlag, TileFlag
+from devices.frames import NOT_READ, FrameBatch
 from devices.scene.scene_file import Scene
 from tests.builders.scenes import make_scene
 from tests.devices.feet import FRAME_NS, LIVELY, TYPICAL, Foot, at_its_own_pace, foot, reading

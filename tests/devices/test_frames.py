@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from devices.flags import FrameFlag, TileFlag
 from devices.frames import (
     FRAME_COLUMNS,
     NO_SERVO_AGE,
@@ -18,8 +19,6 @@ from devices.frames import (
     NOT_READ,
     ArrayInfo,
     FrameBatch,
-    FrameFlag,
-    TileFlag,
 )
 from tests.builders.arrays import NEWTON_CHIP, UTC_NS, make_array, make_servo
 

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.frames import NOT_READ, FrameBatch, TileFlag
+from devices.flags import TileFlag
+from devices.frames import NOT_READ, FrameBatch
 from devices.temperature_hold import HeldTemperature, hold_temperature
 from tests.builders.frames import make_frames
 

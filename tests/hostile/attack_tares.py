@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from service.estimation.estimates import EstimateFlag
+from devices.flags import EstimateFlag
 from service.protocol import Hello
 from service.server.node import ServerNode
 from service.server.nodes import NodeRegistry

@@ -16,11 +16,8 @@ import numpy as np
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection
 
-from devices.frames import (
-    ArrayInfo,
-    FrameBatch,
-    FrameFlag,
-)
+from devices.flags import FrameFlag
+from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
 from service.node_identity import generate_secret, make_proof
 from service.protocol import (

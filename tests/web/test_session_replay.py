@@ -11,7 +11,8 @@ import pyarrow.parquet as pq
 import pytest
 from playwright.sync_api import Page, expect
 
-from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileFlag
+from devices.flags import TileFlag
+from devices.frames import NOT_READ, ArrayInfo, FrameBatch
 from tests.builders.arrays import make_servo
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording

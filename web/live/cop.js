@@ -1,6 +1,6 @@
 // Centre of pressure on the foot: position, 95 % region and trail.
 
-import { ESTIMATE } from "../common/bits.js";
+import { ESTIMATE } from "../common/flags.js";
 import { place, svg } from "../common/svg.js";
 import { byId, number, setData, setText } from "../common/text.js";
 import { whyNot } from "./grf.js";

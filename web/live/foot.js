@@ -1,7 +1,7 @@
 // Foot: tiles coloured by force, from the side (line of tiles) or from above with toes up (heat map on a
 // grid), with the centre of pressure.
 
-import { FRAME } from "../common/bits.js";
+import { FRAME } from "../common/flags.js";
 import { FootLayout, isGrid, isPlan } from "../common/foot_layout.js";
 import { shadeOf, shadesOf } from "../common/heat.js";
 import { place, svg } from "../common/svg.js";

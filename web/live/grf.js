@@ -1,8 +1,7 @@
 // Ground reaction force with its uncertainty, or its lower bound.
 
-import { ESTIMATE } from "../common/bits.js";
+import { ESTIMATE } from "../common/flags.js";
 import { byId, number, plain, setData, setText } from "../common/text.js";
-import { keyOf } from "./why.js";
 
 /** Show the GRF of a frame. */
 export function drawGrf(node, frame) {
@@ -35,7 +34,7 @@ export function whyNot(node, frame) {
   if (!node.calibration) return "no calibration";
   const bearing = node.tiles.map((tile, i) => ({ tile, i })).filter(({ tile }) => !tile.reference);
   const missing = bearing.filter(({ i }) => !Number.isFinite(frame.force_n?.[i]));
-  if (missing.length === bearing.length && node.warnings?.some((warning) => keyOf(warning) === "compiling")) return "models are being compiled: pressures only";
+  if (missing.length === bearing.length && node.compiling) return "models are being compiled: pressures only";
   if (missing.length === bearing.length && bearing.some(({ i }) => Number.isFinite(frame.gauge_kpa?.[i]))) return "no estimate";
   const saturated = bearing.filter(({ i }) => frame.saturated?.[i]);
   const reasons = [tilesText(missing, bearing, "missing"), tilesText(saturated, bearing, "saturated")].filter(Boolean);

@@ -1,9 +1,9 @@
 // Warnings about the values on display. A flag is held for some seconds, so that it can be read.
 
-import { ESTIMATE, FRAME, TILE } from "../common/bits.js";
+import { ESTIMATE, FRAME, TILE } from "../common/flags.js";
 import { lossTexts } from "../common/losses.js";
 import { byId, el, localTime, number, roughly, setData, setText } from "../common/text.js";
-import { helpOf, keyOf, whyOf } from "./why.js";
+import { helpOf, whyOf } from "./why.js";
 
 const HOLD_MS = 3000;
 const FIRST_MS = 3000; // a warning this soon after opening may be older
@@ -157,7 +157,8 @@ function nodeWarnings(node, frame, serverNowMs) {
     doubts.forEach((doubt, i) => add("tare_doubt", `Tare in doubt: ${doubt}.`, `tare_doubt ${i}`));
     if (!doubts.length && bits & ESTIMATE.TARE_OLD) add("tare_doubt", `Tare in doubt (${tareAge(tare, serverNowMs)} old): lift the foot, press Tare.`);
   }
-  for (const warning of node.warnings ?? []) add(keyOf(warning), sentence(warning), warning);
+  if (node.compiling) add("compiling", "Models are being compiled, once on this machine: pressures only until then.");
+  for (const warning of node.warnings ?? []) add("", sentence(warning), warning);
   for (const [reason, text] of lossTexts(node.lost)) add("lost", `Lost ${text}.`, `lost ${reason}`);
   if (node.storage_problem) add("storage", `The server cannot record: ${node.storage_problem}`);
   // An emulated node has the clock of this machine.

@@ -42,12 +42,6 @@ const WARNINGS = {
     why: "The node's clock has not been set since it was switched on. Time differences are correct, dates and comparisons with other instruments may be wrong." },
 };
 
-/** Warnings that nodes and server send as sentences without a key. @type {[text: RegExp, key: string][]} */
-const SENT = [[/does not answer/, "tile_missing"], [/^The models are being compiled/i, "compiling"]];
-
-/** Return the key of a sentence of node or server; "": none. @param {string} text */
-export const keyOf = (text) => SENT.find(([pattern]) => pattern.test(text))?.[1] ?? "";
-
 /** Return reason and remedy, two sentences, or "". @param {string} key */
 export const whyOf = (key) => WARNINGS[key]?.why ?? "";
 

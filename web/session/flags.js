@@ -1,12 +1,13 @@
 // Faults of frames: texts, and how plots show them.
 
-import { ESTIMATE, FRAME, TILE } from "../common/bits.js";
+import { ESTIMATE_FLAGS, FRAME, FRAME_FLAGS, TILE, TILE_FLAGS } from "../common/flags.js";
 
-const UNREAD = TILE.NO_ANSWER | TILE.STALE | TILE.IMPLAUSIBLE | TILE.NOT_CONVERTED;
-const SATURATED = ESTIMATE.SATURATED | ESTIMATE.CLIPPED;
-const UNKNOWN = ESTIMATE.TILE_MISSING | ESTIMATE.STUCK | ESTIMATE.TARE_LOST;
-const DOUBT = ESTIMATE.EXTRAPOLATED | ESTIMATE.TARE_OLD | ESTIMATE.OVER_RATED
-  | ESTIMATE.AFTER_SATURATION | ESTIMATE.BASELINE_LOST;
+/** Return the bits of flags of a severity. @param {[bit: number, title: string, severity: string][]} flags */
+const bitsOf = (flags, severity) => flags.reduce((bits, [bit, , its]) => (its === severity ? bits | bit : bits), 0);
+const UNREAD = bitsOf(TILE_FLAGS, "unknown");
+const SATURATED = bitsOf(ESTIMATE_FLAGS, "bound");
+const UNKNOWN = bitsOf(ESTIMATE_FLAGS, "unknown");
+const DOUBT = bitsOf(ESTIMATE_FLAGS, "doubt");
 
 const anyTile = (bins, i, bits) => bins.serials.some((_, tile) => bins.columns[`tile_flags_${tile}`][i] & bits);
 const estimate = (bins, i) => bins.columns.estimate_flags?.[i] ?? 0;
@@ -47,39 +48,17 @@ export function stretchesOf(kind, bins, begin, end) {
   return found;
 }
 
-/** @type {[bit: number, text: string][]} */
-const ESTIMATE_TEXTS = [
-  [ESTIMATE.SATURATED, "tile saturated"],
-  [ESTIMATE.CLIPPED, "tile clipped below its range"],
-  [ESTIMATE.TILE_MISSING, "tile missing"],
-  [ESTIMATE.STUCK, "tile stuck"],
-  [ESTIMATE.TARE_LOST, "tare lost"],
-  [ESTIMATE.EXTRAPOLATED, "a tile below its calibrated range (suction or old tare)"],
-  [ESTIMATE.TARE_OLD, "tare in doubt"],
-  [ESTIMATE.BASELINE_LOST, "zero of a tile has dropped"],
-  [ESTIMATE.AFTER_SATURATION, "less certain: a tile saturated or not read just before"],
-  [ESTIMATE.OVER_RATED, "above the rated pressure"],
-  [ESTIMATE.OUTLIER_REPLACED, "outlier replaced"],
-  [ESTIMATE.ASSUMED_SCALE, "scale assumed"],
-];
-/** @type {[bit: number, text: string][]} */
-const FRAME_TEXTS = [
-  [FRAME.BUS_FAULT, "bus fault"],
-  [FRAME.OVERRUN, "node late: no frames sampled just before"],
-  [FRAME.SERVO_STALE, "servo angle stale"],
-  [FRAME.SERVO_TURN_UNKNOWN, "servo turn unknown"],
-  [FRAME.LEAD, "unloaded lead-in"],
-  [FRAME.NEW_ARRAY_INFO, "array scanned again"],
-];
+/** Return the titles of flags that are set. @param {[bit: number, title: string, severity: string][]} flags */
+const titlesOf = (flags, bits) => flags.filter(([bit]) => bits & bit).map(([, title]) => title);
 
 /** Return the texts of estimate flags. */
-export const estimateTexts = (bits) => ESTIMATE_TEXTS.filter(([bit]) => bits & bit).map(([, text]) => text);
+export const estimateTexts = (bits) => titlesOf(ESTIMATE_FLAGS, bits);
 
 /** Return the faults of a bin as texts. */
 export function flagTexts(bins, i) {
   const texts = [
     ...estimateTexts(estimate(bins, i)),
-    ...FRAME_TEXTS.filter(([bit]) => bins.columns.frame_flags[i] & bit).map(([, text]) => text),
+    ...titlesOf(FRAME_FLAGS, bins.columns.frame_flags[i]),
   ];
   const unread = bins.serials.filter((_, tile) => bins.columns[`tile_flags_${tile}`][i] & UNREAD);
   if (unread.length) texts.push(`no reading from ${unread.slice(0, 4).join(", ")}${unread.length > 4 ? " and others" : ""}`);

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 
-from devices.frames import NO_SERVO_COUNTS, FrameFlag
+from devices.flags import FrameFlag
+from devices.frames import NO_SERVO_COUNTS
 from devices.jit import jit_inlined
 from service.estimation.records import KernelRecord, RecordArray
 

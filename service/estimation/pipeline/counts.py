@@ -10,7 +10,8 @@ import numpy.typing as npt
 from devices.arrays import Times
 from devices.chips import mpl115a2
 from devices.chips.mpl115a2 import PRESSURE_MIN_KPA
-from devices.frames import NOT_READ, TileFlag
+from devices.flags import TileFlag
+from devices.frames import NOT_READ
 from devices.jit import jit_cached, jit_inlined
 from devices.temperature_hold import HOLD_MAX_NS
 from service.estimation.foot import LONG_GAP_NS

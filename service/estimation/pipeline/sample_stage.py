@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 
 from devices.chips.mpl115a2 import PRESSURE_MAX_KPA
+from devices.flags import EstimateFlag
 from devices.frames import NOT_READ
 from devices.jit import jit_cached, jit_inlined
-from service.estimation.estimates import EstimateFlag
 from service.estimation.fault_detection.baseline_loss import (
     ERROR_MIN_KPA,
     update_baseline_error_bound_kpa,

@@ -18,7 +18,8 @@ import numpy as np
 from devices.arrays import Bools, Floats, Times
 from devices.chips.compensation import Compensation
 from devices.errors import TareError
-from devices.frames import FrameBatch, FrameFlag
+from devices.flags import FrameFlag
+from devices.frames import FrameBatch
 from devices.temperature_hold import hold_temperature
 from service.estimation.calibration import Calibration
 from service.estimation.tare.correlated_noise import (

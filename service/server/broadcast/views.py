@@ -10,7 +10,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from devices.frames import ArrayInfo, ServoInfo
-from service.estimation.compilation import COMPILING_NOTE, is_compiling
+from service.estimation.compilation import is_compiling
 from service.estimation.tare.tare import (
     IntervalSource,
     compute_thermal_shift_kpa,
@@ -227,6 +227,9 @@ class NodeView(View):
     )
     missed_slots: int = Field(description="Slots that were not sampled in its present stream.")
     warnings: list[str] = Field(description="Present faults of its array or disk, as text.")
+    compiling: bool = Field(
+        description="Models are being compiled, once on this machine: frames have pressures only."
+    )
     fault_counts: dict[str, dict[str, int]] = Field(
         description="Faults of this stream, counted by serial and reason."
     )
@@ -285,11 +288,8 @@ class NodeView(View):
             lost=lost,
             backlog_frames=node.backlog_frames,
             missed_slots=node.present_stream.missed_slots,
-            warnings=[
-                *node.warnings,
-                *node.refusal_warnings,
-                *([COMPILING_NOTE] if is_compiling() else []),
-            ],
+            warnings=[*node.warnings, *node.refusal_warnings],
+            compiling=is_compiling(),
             fault_counts=node.fault_counts,
             last_seq=node.last_seq,
             last_t_ns=node.last_t_ns,

@@ -13,7 +13,8 @@ import numpy as np
 from devices.arrays import Floats
 from devices.chips.compensation import Compensation
 from devices.errors import FootTileError, TareError
-from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileFlag
+from devices.flags import TileFlag
+from devices.frames import NOT_READ, ArrayInfo, FrameBatch
 from devices.temperature_hold import hold_temperature
 from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration

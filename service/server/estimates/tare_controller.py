@@ -12,7 +12,8 @@ from typing import Literal
 import numpy as np
 
 from devices.errors import FileFormatError, TareError
-from devices.frames import ArrayInfo, FrameBatch, FrameFlag
+from devices.flags import FrameFlag
+from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.pipeline.plan import TARE_OLD_NS
 from service.estimation.tare.automatic import (
     RECOVERY_NS,

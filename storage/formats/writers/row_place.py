@@ -10,14 +10,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from devices.flags import EstimateFlag
 from devices.frames import ArrayInfo
 from storage.schema import Array
 
 COP = ("cop_x_m", "cop_y_m")
 NEEDED = ("grf_n", *COP, "estimate_flags")
 """Columns of a force with its point of application."""
-_COP_MASKED = 16
-"""Bit of `estimate_flags`: no centre of pressure."""
 
 
 def fill_cop_across_tile_row(columns: Mapping[str, Array], info: ArrayInfo) -> dict[str, Array]:
@@ -27,7 +26,7 @@ def fill_cop_across_tile_row(columns: Mapping[str, Array], info: ArrayInfo) -> d
         columns: `NEEDED` and any others, (n,) each.
         info: the array.
     """
-    is_stated = (columns["estimate_flags"] & _COP_MASKED) == 0
+    is_stated = (columns["estimate_flags"] & EstimateFlag.COP_MASKED) == 0
     placed = {
         name: np.where(is_stated & np.isnan(columns[name]), place_m, columns[name])
         for name, place_m in zip(COP, info.row_place_m, strict=True)

@@ -11,7 +11,8 @@ from smbus2 import i2c_msg
 from devices.buses.device_reopener import DeviceReopener
 from devices.buses.i2c import I2cBus
 from devices.errors import BusMisuseError, BusSetupError
-from devices.frames import NOT_READ, TileFlag
+from devices.flags import TileFlag
+from devices.frames import NOT_READ
 from devices.scene.emulation_sections import FaultKind
 from devices.scene.hardware_sections import ScheduleName
 from tests.devices.array.wiring import every_schedule, failing, to_tiles

@@ -10,7 +10,8 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from devices.frames import NOT_READ, FrameFlag, TileFlag
+from devices.flags import FrameFlag, TileFlag
+from devices.frames import NOT_READ
 from devices.scene.emulation_sections import BusFault, FaultKind, MuxFault, TileFault
 from devices.scene.hardware_sections import ScheduleName
 from tests.devices.array.fault_runs import (

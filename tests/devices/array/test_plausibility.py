@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from devices.array.tile_array import TileArray
-from devices.frames import TileFlag
+from devices.flags import TileFlag
 from tests.builders.arrays import FORUM_CHIP
 from tests.devices.rigs import FOUR, LOOK_FRAMES, Wires, settled_on
 

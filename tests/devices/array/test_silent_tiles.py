@@ -9,7 +9,8 @@ import pytest
 from smbus2 import i2c_msg
 
 from devices.array.tile_array import TileArray
-from devices.frames import NOT_READ, TileFlag
+from devices.flags import TileFlag
+from devices.frames import NOT_READ
 from devices.scene.hardware_sections import ScheduleName
 from tests.builders.arrays import FORUM_CHIP
 from tests.devices.array.wiring import BIT_NS, WHOLE_NS, every_schedule, failing, to_tiles

@@ -6,7 +6,8 @@ import pytest
 from smbus2 import i2c_msg
 
 from devices.errors import SceneError
-from devices.frames import NOT_READ, TileFlag
+from devices.flags import TileFlag
+from devices.frames import NOT_READ
 from devices.scene.hardware_sections import ScheduleName
 from tests.devices.array.wiring import BIT_NS, WHOLE_NS, every_schedule
 from tests.devices.rigs import (

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.array.tile_health import TileHealth, classify_impossible_counts
-from devices.frames import NOT_READ, TileFlag
+from devices.flags import TileFlag
+from devices.frames import NOT_READ
 from tests.builders.arrays import DATA_SHEET_CHIP
 from tests.devices.rigs import ONE, Wires
 

@@ -32,7 +32,7 @@ from devices.errors import (
     TileSetupError,
     UsageError,
 )
-from devices.frames import TileFlag
+from devices.flags import TileFlag
 from tests.devices.adapters import Adapter
 from tests.waiting import until
 

@@ -14,7 +14,7 @@ import pytest
 from websockets.sync.client import connect
 
 import service.api.runner
-from service.estimation.compilation import COMPILING_NOTE, is_compiling
+from service.estimation.compilation import is_compiling
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import ServeWith
 from tests.waiting import PATIENCE_S, until
@@ -50,7 +50,7 @@ def test_until_models_are_compiled_screens_have_pressures_and_then_forces(
     node = node_of(running)
     node.connect()
     node.tared()
-    assert running.node()["warnings"] == [COMPILING_NOTE]
+    assert running.node()["compiling"]
     session = node.record()
     node.deliver(300, [20.0, 60.0])
     so_far = running.http.get(f"/sessions/{session.id}/timeseries")
@@ -63,7 +63,7 @@ def test_until_models_are_compiled_screens_have_pressures_and_then_forces(
     assert session.now()["state"] != "sealed"
     compiled.touch()
     until(lambda: not is_compiling())
-    until(lambda: running.node()["warnings"] == [])
+    until(lambda: not running.node()["compiling"])
     until(lambda: shown(node)["grf_n"] is not None)
     until(lambda: session.now()["state"] == "sealed")
     assert "grf_n" in pq.read_schema(session.folder / "frames.parquet").names

@@ -21,10 +21,10 @@ from devices.chips.mpl115a2 import (
     compensate_kpa,
     compute_padc,
 )
+from devices.flags import EstimateFlag
 from devices.frames import NOT_READ, FrameBatch
 from devices.temperature_hold import hold_temperature
 from service.estimation.estimate import Estimator
-from service.estimation.estimates import EstimateFlag
 from service.estimation.pipeline.model_set import MODEL_NAMES
 from service.estimation.pipeline.plan import make_plan
 from service.estimation.tare.unloaded_windows import compute_recording_tare

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from devices.frames import TileFlag
-from service.estimation.estimates import EstimateFlag
+from devices.flags import EstimateFlag, TileFlag
 from service.estimation.models.temperature import TemperatureModel
 from service.estimation.pipeline.model_set import MODEL_NAMES
 from service.estimation.pipeline.plan import make_plan

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.estimation.estimates import EstimateFlag, Estimates
+from devices.flags import EstimateFlag
+from service.estimation.estimates import Estimates
 from tests.builders.arrays import array_at, make_servo
 from tests.builders.estimates import estimate, newton_plan
 from tests.builders.frames import cut_up, loaded_frames

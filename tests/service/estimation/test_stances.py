@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.estimation.estimates import EstimateFlag
+from devices.flags import EstimateFlag
 from service.estimation.foot import CONTACT_UNKNOWN
 from service.estimation.stances import Stance, StanceDetector, compute_stances
 

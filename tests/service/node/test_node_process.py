@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from devices.frames import NO_SERVO_COUNTS, FrameFlag, TileFlag
+from devices.flags import FrameFlag, TileFlag
+from devices.frames import NO_SERVO_COUNTS
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
 from storage.journal.node.in_flight import read_in_flight_of_this_boot

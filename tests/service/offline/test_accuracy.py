@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.estimation.estimates import EstimateFlag
+from devices.flags import EstimateFlag
 from service.json_output import to_json_value
 from service.offline.accuracy import (
     ACCURACY_COLUMNS,

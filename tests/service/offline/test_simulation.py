@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.chips.compensation import Compensation
-from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameFlag
+from devices.flags import FrameFlag
+from devices.frames import NO_SERVO_COUNTS, FrameBatch
 from devices.scene.emulation_sections import FaultSection
 from devices.scene.scene_file import load_scene
 from service.estimation.foot.geometry import compute_segment_rad_per_count

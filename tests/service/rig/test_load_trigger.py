@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from devices.clock import VirtualClock
 from devices.emulation.world import World
-from devices.frames import TileFlag
+from devices.flags import TileFlag
 from service.estimation.tare.unloaded_windows import FRAMES_MIN
 from service.rig.load_trigger import LEAD_TIMEOUT_NS, USABLE_FRAMES_MIN, LoadTrigger
 from tests.builders.frames import make_frames

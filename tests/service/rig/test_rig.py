@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from devices.array.startup import ReadyArray
-from devices.frames import FrameFlag
+from devices.flags import FrameFlag
 from devices.scene.scene_file import load_scene
 from service.rig.emulated_foot import EmulatedFoot
 from service.rig.options import RigOptions

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.estimation.estimates import EstimateFlag
+from devices.flags import EstimateFlag
 from service.sessions.tares import TareHistory
 from storage.checksummed_json import read_checksummed_json, write_checksummed_json
 from tests.service.fake_node import FakeNode

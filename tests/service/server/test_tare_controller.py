@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from devices.errors import StorageError, TareError
-from devices.frames import FrameBatch, FrameFlag, TileFlag
+from devices.flags import FrameFlag, TileFlag
+from devices.frames import FrameBatch
 from service.protocol import PROTOCOL, Hello
 from service.server.node import ServerNode
 from storage.intervals import Intervals

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from devices.frames import ArrayInfo, FrameBatch, FrameFlag
+from devices.flags import FrameFlag
+from devices.frames import ArrayInfo, FrameBatch
 from service.sessions.recovery import RecoveredSession, RecoveryReport, recover_folder
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes, compute_max_lost_tail_frames

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from devices.frames import ArrayInfo, FrameBatch, FrameFlag
+from devices.flags import FrameFlag
+from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
 from service.sessions.pipeline import EstimateOptions, EstimateStream
 from tests.builders.arrays import PERIOD_NS, make_array

@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import CalibrationError, TareError, UsageError
-from devices.frames import FrameBatch, TileFlag
+from devices.flags import TileFlag
+from devices.frames import FrameBatch
 from service.estimation.calibration import Calibration
 from service.estimation.estimate import Estimator
 from service.estimation.estimates import Estimates

@@ -12,7 +12,8 @@ import numpy.typing as npt
 from devices.arrays import Floats
 from devices.chips.mpl115a2 import PRESSURE_MAX_KPA
 from devices.emulation.world import World
-from service.estimation.estimates import SIGMAS_95, EstimateFlag
+from devices.flags import EstimateFlag
+from service.estimation.estimates import SIGMAS_95
 from service.offline.accuracy import ACCURACY_COLUMNS, PHASES, classify_phases, compute_accuracy
 from service.offline.benchmark.broad.results import CaseResult, PhaseCounts
 from service.offline.benchmark.draws import DrawRecording

@@ -16,7 +16,8 @@ import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
 from devices.chips.compensation import Compensation
-from devices.frames import NOT_READ, TileFlag
+from devices.flags import TileFlag
+from devices.frames import NOT_READ
 from storage.formats.export import Export
 from storage.formats.writers.mcap.frame_chunks import (
     ARROW_METRES_PER_NEWTON,

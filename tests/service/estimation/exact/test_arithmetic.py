@@ -16,7 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpmath import mp, mpf
 
-from devices.frames import NOT_READ, FrameBatch, TileFlag
+from devices.flags import TileFlag
+from devices.frames import NOT_READ, FrameBatch
 from service.estimation.calibration import TileCalibration, make_paper_shape_preset
 from service.estimation.estimates import Estimates
 from service.estimation.pipeline.plan import EstimationPlan, make_plan

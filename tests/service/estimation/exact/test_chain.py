@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from mpmath import mp, mpf
 
-from devices.frames import NOT_READ, FrameBatch, TileFlag
+from devices.flags import EstimateFlag, TileFlag
+from devices.frames import NOT_READ, FrameBatch
 from service.estimation.effects import FlowEffect, Parameter
-from service.estimation.estimates import EstimateFlag
 from service.estimation.pipeline.model_set import MODEL_NAMES
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from service.estimation.pipeline.smoothing_stage import BOUND_SIGMAS

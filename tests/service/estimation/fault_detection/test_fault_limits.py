@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from devices.arrays import Floats
 from devices.chips.mpl115a2 import TADC_PER_KELVIN
+from devices.flags import EstimateFlag
 from devices.frames import FrameBatch
-from service.estimation.estimates import EstimateFlag
 from service.estimation.pipeline.model_set import MODEL_NAMES
 from service.estimation.pipeline.plan import EstimationPlan
 from tests.builders.arrays import COUNT_KPA, PERIOD_NS, array_at

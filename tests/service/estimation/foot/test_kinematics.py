@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameFlag
+from devices.flags import FrameFlag
+from devices.frames import NO_SERVO_COUNTS, FrameBatch
 from service.estimation.estimate import Estimator
 from service.estimation.foot.kinematics import (
     ServoReading,

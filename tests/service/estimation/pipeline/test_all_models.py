@@ -14,8 +14,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.frames import NOT_READ, FrameBatch, TileFlag
-from service.estimation.estimates import EstimateFlag, Estimates
+from devices.flags import EstimateFlag, TileFlag
+from devices.frames import NOT_READ, FrameBatch
+from service.estimation.estimates import Estimates
 from service.estimation.pipeline.model_set import MODEL_NAMES
 from service.estimation.pipeline.plan import EstimationPlan
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP, array_at, make_servo

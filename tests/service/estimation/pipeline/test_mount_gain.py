@@ -7,10 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from devices.flags import EstimateFlag
 from devices.frames import NO_SERVO_COUNTS, ArrayInfo
 from service.estimation.calibration import Calibration, make_paper_shape_preset
 from service.estimation.effects import Parameter
-from service.estimation.estimates import EstimateFlag, Estimates
+from service.estimation.estimates import Estimates
 from service.estimation.mounting import MountCalibration
 from service.estimation.pipeline.plan import make_plan
 from tests.builders.arrays import array_at, make_servo

@@ -17,9 +17,10 @@ from devices.chips.mpl115a2 import (
     compute_padc,
 )
 from devices.errors import CalibrationError
+from devices.flags import EstimateFlag
 from service.estimation.calibration import TileCalibration
 from service.estimation.effects import Effects, GasEffect, Parameter
-from service.estimation.estimates import EstimateFlag, Estimates
+from service.estimation.estimates import Estimates
 from service.estimation.fitting.dome_model import DomeModel
 from service.estimation.models.gas import GasModel, compute_isothermal_lower_bound_kpa
 from tests.builders.arrays import COUNT_KPA, PERIOD_NS, UNLOADED_KPA, make_array

@@ -16,9 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.arrays import Bools, Floats
-from devices.frames import FrameBatch, TileFlag
+from devices.flags import EstimateFlag, TileFlag
+from devices.frames import FrameBatch
 from service.estimation.effects import GasEffect, HysteresisEffect, Parameter, RubberEffect
-from service.estimation.estimates import EstimateFlag, Estimates
+from service.estimation.estimates import Estimates
 from service.estimation.fitting.dome_model import DomeModel
 from service.estimation.pipeline.model_set import MODEL_NAMES
 from service.estimation.pipeline.plan import EstimationPlan, make_plan

@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from devices.chips.compensation import Compensation
 from devices.errors import TareError
-from devices.frames import FrameBatch, FrameFlag, TileFlag
+from devices.flags import FrameFlag, TileFlag
+from devices.frames import FrameBatch
 from service.estimation.calibration import Calibration, make_paper_shape_preset
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded_windows import (

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from devices.flags import EstimateFlag
 from devices.scene.scene_file import load_scene
 from service.estimation.estimate import Estimator
-from service.estimation.estimates import EstimateFlag
 from service.offline.benchmark.draws import (
     DrawRecording,
     RepeatedRecording,

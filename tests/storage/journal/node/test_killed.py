@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from devices.errors import StorageError
-from devices.frames import TileFlag
+from devices.flags import TileFlag
 from storage.checksummed_json import read_checksummed_json, write_checksummed_json
 from storage.intervals import Intervals
 from storage.journal.journal import Journal

@@ -10,9 +10,9 @@ import pytest
 
 from devices.clock import VirtualClock
 from devices.emulation.world import World
+from devices.flags import EstimateFlag
 from devices.scene.scene_file import Scene, load_scene
 from service.estimation.calibration import PRESETS
-from service.estimation.estimates import EstimateFlag
 from service.offline.benchmark.broad.arrays import CLEAN, _evaluate_case, _iterate_cases
 from service.offline.benchmark.broad.evaluation import evaluate_estimates
 from service.offline.benchmark.broad.results import make_case_key
