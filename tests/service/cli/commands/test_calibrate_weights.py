@@ -116,14 +116,14 @@ def test_the_command_guides_through_the_weights_and_writes_what_is_accepted(
     class Followed(weighing.Weighing):
         """A guide whose prompts somebody follows."""
 
-        def push(self, t_ns: npt.NDArray[np.int64], kpa: Floats) -> list[Action]:
+        def feed_pressures(self, t_ns: npt.NDArray[np.int64], absolute_kpa: Floats) -> list[Action]:
             # By now the prompt is there, and the markers before it are made.
             known = parse_weight(self.weights[self.weight_index]) if self.step == "put on" else None
             if known is not None:
                 play.force_n = known.force_n
             elif self.step == "empty":
                 play.force_n = 0.0
-            return super().feed_pressures(t_ns, kpa)
+            return super().feed_pressures(t_ns, absolute_kpa)
 
     monkeypatch.setattr(weighings, "Weighing", Followed)
     monkeypatch.setenv("FOOTTILE_TOKEN", tared.running.shown["Authorization"].split()[-1])
