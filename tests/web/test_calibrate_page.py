@@ -94,6 +94,8 @@ def test_a_tile_is_calibrated_and_used_by_its_node(
         expect(page.locator("#result-title")).to_have_text("left heel", timeout=SLOW_MS)
         expect(page.locator("#about")).to_contain_text("force sensor, 5 weights within ±0.5 %")
         expect(page.locator("#result tbody tr")).to_have_count(len(FORCES_N))
+        for heading in ("Noise", "Settled"):
+            expect(page.get_by_role("columnheader", name=heading)).to_be_in_viewport(ratio=1)
         expect(page.locator("#result svg.curve circle")).to_have_count(len(FORCES_N))
         assert complaints(page) == []
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
