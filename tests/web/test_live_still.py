@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -98,12 +100,17 @@ def test_a_recording_has_a_row_with_its_name_time_and_lost_frames(
         expect(row.locator(".recording-name")).to_have_text("“walk”")
         expect(row.locator(".recording-time")).to_contain_text("s")
         expect(row.locator(".recording-lost")).to_have_text("0 lost")
+        frames = row.locator(".recording-frames")
+        before = frames.inner_text()
+        expect(frames).not_to_have_text(before)  # it counts on
+        node.socket.send(json.dumps({"type": "status", "missed_slots": 5, "warnings": []}))
+        expect(row.locator(".recording-lost")).to_have_text(re.compile("^0 lost, .+ not sampled$"))
         expect(page.locator("#actions .primary")).to_have_attribute("id", "stop")
     first = node.seq
     node.frames(12)
     node.say_lost(evicted=[[first, first + 11]])
     node.deliver(20, now=True)
-    expect(row.locator(".recording-lost")).to_have_text("12 lost")
+    expect(row.locator(".recording-lost")).to_have_text(re.compile("^12 lost"))
     node.finish(session)
     last = page.locator("#last-session")
     expect(last).to_contain_text("lossy")

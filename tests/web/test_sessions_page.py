@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -129,6 +130,8 @@ def test_a_complete_session_says_how_much_was_not_sampled(
         time.sleep(0.5)
         node.socket.send(json.dumps({"type": "status", "missed_slots": 1000, "warnings": []}))
         wait_until(lambda: scripted.running.node()["missed_slots"] == 1000, "the missed slots")
+        during = open_page(f"{scripted.url}/sessions/{session.id}")
+        expect(during.locator("#state")).to_have_text(re.compile("^recording, .+ not sampled$"))
         session.stop()
         sealed = session.sealed()
     assert sealed["complete"] is True

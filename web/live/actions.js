@@ -1,7 +1,7 @@
 // Action bar: Tare, Record, Stop, Marker; fields, shortcuts and running recordings.
 
 import * as api from "../common/api.js";
-import { countLost } from "../common/losses.js";
+import { countLost, missedText } from "../common/losses.js";
 import { isOperator } from "../common/login.js";
 import { notice, showRefusal } from "../common/notices.js";
 import { byId, duration, el, isInside, localTime, setData, setText } from "../common/text.js";
@@ -195,7 +195,7 @@ export class Actions {
       setText(row.querySelector(".recording-time"), duration(elapsedS));
       setText(row.querySelector(".recording-frames"), `${session.frames.toLocaleString("en-GB")} frames`);
       const losses = row.querySelector(".recording-lost");
-      setText(losses, `${lost.toLocaleString("en-GB")} lost`);
+      setText(losses, [`${lost.toLocaleString("en-GB")} lost`, missedText(session)].filter(Boolean).join(", "));
       setData(losses, "bad", String(lost > 0));
     }
   }

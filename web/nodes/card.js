@@ -176,7 +176,7 @@ export class Card {
     this.sessionKey = key;
     const markers = session.marker_count ? `, ${session.marker_count} marker${session.marker_count === 1 ? "" : "s"}` : "";
     const frames = `${session.frames.toLocaleString("en-GB")} frames`;
-    const state = recording ? `recording, ${duration(Math.floor(session.duration_s))}` : `${short}, ${frames}`;
+    const state = recording ? `${short}, ${duration(Math.floor(session.duration_s))}` : `${short}, ${frames}`;
     this.sessionLine.replaceChildren(
       el("a", { href: `/sessions/${encodeURIComponent(session.id)}`, text: session.name || session.id }), ` ${state}${markers}`,
       ...(long && !recording ? [el("span", { cls: "why", text: ` ${long}` })] : []));
