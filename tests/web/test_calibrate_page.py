@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -117,6 +118,10 @@ def test_a_failed_calibration_shows_its_reason_and_can_be_repeated(
 ) -> None:
     with Play(scripted.node, 5.0, alive=True):
         page = open_page(f"{scripted.url}/calibrate?node=bench", *size)
+        for field in ("#reference", "#name"):
+            expect(page.locator(field)).to_have_attribute(
+                "placeholder", re.compile("^for example ")
+            )
         page.uncheck("#tiles input[value=T01]")
         page.check("#tiles input[value=T01]")  # now it is the second one
         page.fill("#weights", "200 g, 500 g, 1 kg, 2 kg")

@@ -308,6 +308,12 @@ def test_in_the_sun_every_page_is_black_on_white_whatever_the_machine_prefers(
         }"""
         assert page.evaluate(colours) != ["rgb(0, 0, 0)", "rgb(255, 255, 255)"]
         page.click("#sun")
+        empty = """() => {
+          const field = document.querySelector("#session-name");
+          const { color, fontStyle } = getComputedStyle(field, "::placeholder");
+          return [color, fontStyle];
+        }"""
+        assert page.evaluate(empty) == ["rgb(60, 67, 74)", "italic"]  # not as a value
         assert page.evaluate(colours) == ["rgb(0, 0, 0)", "rgb(255, 255, 255)"]
         expect(page.locator("#sun")).to_have_attribute("aria-pressed", "true")
         page.wait_for_function(OF_THEIR_FORCE)
