@@ -104,7 +104,7 @@ const handlers = {
     if (isNew || !state.node) selectNode();
   },
   session: ({ session }) => updateSession(session),
-  counted: ({ sessions: counts }) => Object.entries(counts).forEach(([id, progress]) => updateProgress(id, progress)),
+  session_progress: ({ sessions: counts }) => Object.entries(counts).forEach(([id, progress]) => updateProgress(id, progress)),
   deleted: ({ session_id: id }) => removeSession(id),
   heartbeat(message) {
     state.received.heartbeat = message.nodes?.[state.node?.node] ?? null;

@@ -47,7 +47,7 @@ def make_accuracy_table(a: Accuracy) -> Table:
         ("GRF when published", a.grf_published_mae_n, "N", "the truth one look-ahead later"),
         ("GRF in flight, mean", a.flight_mean_n, "N", "frames without load"),
         ("GRF in flight, mean absolute", a.flight_mae_n, "N", "frames without load"),
-        ("GRF peak", a.peak_error_n, "N", stances),
+        ("GRF, largest frame", a.peak_error_n, "N", stances),
         ("GRF impulse", a.impulse_error_ns, "N s", stances),
         ("COP mean", 1e3 * a.cop_mean_m, "mm", cop),
         ("COP 95th percentile", 1e3 * a.cop_p95_m, "mm", cop),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -94,6 +95,8 @@ def test_a_tile_is_calibrated_and_used_by_its_node(
         expect(page.locator("#result-title")).to_have_text("left heel", timeout=SLOW_MS)
         expect(page.locator("#about")).to_contain_text("force sensor, 5 weights within ±0.5 %")
         expect(page.locator("#result tbody tr")).to_have_count(len(FORCES_N))
+        for heading in ("Noise", "Settled"):
+            expect(page.get_by_role("columnheader", name=heading)).to_be_in_viewport(ratio=1)
         expect(page.locator("#result svg.curve circle")).to_have_count(len(FORCES_N))
         assert complaints(page) == []
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
@@ -115,6 +118,10 @@ def test_a_failed_calibration_shows_its_reason_and_can_be_repeated(
 ) -> None:
     with Play(scripted.node, 5.0, alive=True):
         page = open_page(f"{scripted.url}/calibrate?node=bench", *size)
+        for field in ("#reference", "#name"):
+            expect(page.locator(field)).to_have_attribute(
+                "placeholder", re.compile("^for example ")
+            )
         page.uncheck("#tiles input[value=T01]")
         page.check("#tiles input[value=T01]")  # now it is the second one
         page.fill("#weights", "200 g, 500 g, 1 kg, 2 kg")

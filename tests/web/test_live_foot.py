@@ -274,6 +274,23 @@ def test_tiles_are_shown_as_traces_and_this_is_remembered(
         expect(page.locator("#bars .tile")).to_have_count(2)
 
 
+def test_the_automatic_range_covers_the_traces_in_view(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    with Play(scripted.node, 15.0) as play:
+        page = open_page(scripted.url)
+        expect(page.locator(LIVE)).to_have_count(1)
+        page.click("#as-traces")
+        page.click("#range")
+        expect(page.locator("#range")).to_have_text("Range: auto")
+        top = page.locator("#foot .heat-legend text").first
+        expect(top).to_have_text("15 N")
+        play.force_n = 2.0
+        page.wait_for_timeout(6000)  # of the ten seconds in view
+        expect(top).to_have_text("15 N")
+        expect(top).to_have_text("2 N")  # slowly, once the step has left the view
+
+
 def test_in_the_sun_every_page_is_black_on_white_whatever_the_machine_prefers(
     scripted: Scripted, browser: Browser
 ) -> None:
@@ -291,6 +308,12 @@ def test_in_the_sun_every_page_is_black_on_white_whatever_the_machine_prefers(
         }"""
         assert page.evaluate(colours) != ["rgb(0, 0, 0)", "rgb(255, 255, 255)"]
         page.click("#sun")
+        empty = """() => {
+          const field = document.querySelector("#session-name");
+          const { color, fontStyle } = getComputedStyle(field, "::placeholder");
+          return [color, fontStyle];
+        }"""
+        assert page.evaluate(empty) == ["rgb(60, 67, 74)", "italic"]  # not as a value
         assert page.evaluate(colours) == ["rgb(0, 0, 0)", "rgb(255, 255, 255)"]
         expect(page.locator("#sun")).to_have_attribute("aria-pressed", "true")
         page.wait_for_function(OF_THEIR_FORCE)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -68,6 +70,23 @@ def test_warnings_pauses_messages_and_recordings_leave_everything_where_it_is(
         assert page.evaluate("document.documentElement.scrollWidth") == size[0]
 
 
+@SIZES
+def test_digits_and_signs_of_the_force_leave_the_cards_where_they_are(
+    scripted: Scripted, open_page: OpenPage, size: tuple[int, int]
+) -> None:
+    with Play(scripted.node, 15.0):
+        page = open_page(scripted.url, *size)
+        expect(page.locator(LIVE)).to_have_count(1)
+    # Nothing is sent any more: the force that is written here stays.
+    write = """([n, sigma]) => import("/static/live/grf.js").then(({ drawGrf }) => {
+      drawGrf({ calibration: {}, tare: {}, tiles: [] }, { grf_n: n, grf_sigma_n: sigma });
+      return ["trace-card", "foot-card"].map((id) => document.getElementById(id).offsetTop);
+    })"""
+    tops = [page.evaluate(write, force) for force in ([0.1, 0.1], [-9.9, 1.0], [-99.9, 51.0])]
+    assert tops[0] == tops[1] == tops[2]
+    assert page.evaluate("document.documentElement.scrollWidth") == size[0]
+
+
 def test_a_recording_has_a_row_with_its_name_time_and_lost_frames(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
@@ -81,12 +100,17 @@ def test_a_recording_has_a_row_with_its_name_time_and_lost_frames(
         expect(row.locator(".recording-name")).to_have_text("“walk”")
         expect(row.locator(".recording-time")).to_contain_text("s")
         expect(row.locator(".recording-lost")).to_have_text("0 lost")
+        frames = row.locator(".recording-frames")
+        before = frames.inner_text()
+        expect(frames).not_to_have_text(before)  # it counts on
+        node.socket.send(json.dumps({"type": "status", "missed_slots": 5, "warnings": []}))
+        expect(row.locator(".recording-lost")).to_have_text(re.compile("^0 lost, .+ not sampled$"))
         expect(page.locator("#actions .primary")).to_have_attribute("id", "stop")
     first = node.seq
     node.frames(12)
     node.say_lost(evicted=[[first, first + 11]])
     node.deliver(20, now=True)
-    expect(row.locator(".recording-lost")).to_have_text("12 lost")
+    expect(row.locator(".recording-lost")).to_have_text(re.compile("^12 lost"))
     node.finish(session)
     last = page.locator("#last-session")
     expect(last).to_contain_text("lossy")

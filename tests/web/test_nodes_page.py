@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 
 from service.node_identity import compute_fingerprint
 from tests.service.fake_node import FakeNode, Play
@@ -143,8 +143,19 @@ def test_tare_all_tares_who_can_be_tared_says_who_cannot_and_can_be_undone(
             for name in ("bench", "loaded"):
                 expect(page.locator(live(name))).to_have_count(1)
             page.wait_for_timeout(3000)  # frames to tare from
+            held: list[Route] = []
+            # The lambda is needed: Playwright sets an attribute of it.
+            page.route("**/tare", lambda route: held.append(route))  # noqa: PLW0108
             page.keyboard.press("t")
+            expect(page.locator("#notices")).to_have_text(re.compile("^Taring 2 nodes"))
+            while len(held) < 2:
+                page.wait_for_timeout(50)
+            for route in held:
+                route.continue_()
             expect(page.locator("#notices")).to_contain_text("1 node tared")
+            expect(page.locator("#notices")).not_to_contain_text("Taring")
+            tared = page.locator(f"{card('bench')} .node-facts div", has_text="Tare")
+            expect(tared).to_have_text(re.compile(r"^Tare\d{4}-\d\d-\d\d \d\d:\d\d:\d\d$"))
             expect(page.locator(f"{card('loaded')} .refused")).to_contain_text("Not tared: ")
             expect(page.locator(f"{card('bench')} .refused")).to_have_count(0)
             assert tares("bench") == [False, *before]

@@ -39,6 +39,9 @@ def test_no_peak_hides_at_any_zoom(walk: Recording, open_page: OpenPage, query: 
     inside = (since_s >= first_s - 1e-6) & (since_s <= last_s + 1e-6)
     assert summary(page, "frames") == inside.sum()
     assert summary(page, "grf-max") == pytest.approx(np.nanmax(grf_n[inside]), abs=1e-5)
+    box = page.locator("#summary")  # not the peak of the stance beside it, free of noise
+    expect(box).to_contain_text(f"largest frame {np.nanmax(grf_n[inside]):.1f} N at")
+    expect(box).to_have_attribute("title", re.compile("noise included"))
     assert summary(page, "grf-min") == pytest.approx(np.nanmin(grf_n[inside]), abs=1e-5)
 
 

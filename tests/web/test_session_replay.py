@@ -175,6 +175,24 @@ def test_keys_step_from_frame_to_frame_over_what_is_lost_and_by_a_tenth_of_a_sec
     shows(page, stored, gap - 3)
 
 
+def test_space_plays_after_a_click_on_a_button_and_presses_a_button_of_the_keyboard(
+    session: Recording, open_page: OpenPage
+) -> None:
+    page = opened(session, open_page, 0.0, 1.0)
+    play = page.locator("#play")
+    for button in ("#zoom-in", "#stance-next", '[data-speed="0.1"]'):
+        page.click(button)
+        page.keyboard.press(" ")
+        expect(play).to_have_attribute("data-going", "true")
+        page.keyboard.press(" ")
+        expect(play).to_have_attribute("data-going", "false")
+    page.focus('[data-speed="4"]')
+    page.keyboard.press(" ")
+    expect(page.locator('[data-speed="4"]')).to_have_attribute("aria-pressed", "true")
+    expect(page.locator('[data-speed="4"]')).to_be_focused()
+    expect(play).to_have_attribute("data-going", "false")
+
+
 def test_played_it_ends_with_the_last_frame_and_space_holds_it(
     session: Recording, stored: dict[str, np.ndarray], open_page: OpenPage
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -31,6 +32,7 @@ def test_recordings_that_run_at_once_are_all_shown_marked_and_stopped_one_by_one
             page.fill("#session-name", name)
             page.click("#record")
             expect(page.locator("#recordings")).to_contain_text(name)
+            time.sleep(1.0)  # within it a press is the second of a double tap
         expect(page.locator("#recordings li")).to_have_count(2)
         page.fill("#marker-label", "a stone")
         page.click("#marker")
@@ -128,6 +130,8 @@ def test_a_complete_session_says_how_much_was_not_sampled(
         time.sleep(0.5)
         node.socket.send(json.dumps({"type": "status", "missed_slots": 1000, "warnings": []}))
         wait_until(lambda: scripted.running.node()["missed_slots"] == 1000, "the missed slots")
+        during = open_page(f"{scripted.url}/sessions/{session.id}")
+        expect(during.locator("#state")).to_have_text(re.compile("^recording, .+ not sampled$"))
         session.stop()
         sealed = session.sealed()
     assert sealed["complete"] is True
@@ -181,6 +185,26 @@ def test_what_is_said_of_a_session_can_be_changed(scripted: Scripted, open_page:
     found = session.now()
     assert (found["subject"], found["tags"]) == ("leg 2", ["wet", "slow"])
     assert found["notes"] == "first line\nsecond"
+
+
+def test_a_double_tap_records_once_and_stop_ends_all_recordings_of_the_node(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    with Play(scripted.node):
+        page = open_page(scripted.url)
+        expect(page.locator("body")).to_have_attribute("data-live", "true")
+        page.dblclick("#record")
+        page.keyboard.press("r")
+        expect(page.locator("#recordings li")).to_have_count(1)
+        time.sleep(1.0)  # no double tap any more
+        assert len(scripted.running.sessions()) == 1
+        expect(page.locator("#stop-text")).to_have_text("Stop")
+        page.keyboard.press("r")
+        expect(page.locator("#stop-text")).to_have_text("Stop all 2")
+        page.click("#stop")
+        expect(page.locator("#notices")).to_contain_text("Stopped 2 recordings.")
+        expect(page.locator("#recordings li")).to_have_count(0)
+    assert "recording" not in {session["state"] for session in scripted.running.sessions()}
 
 
 def test_a_phone_has_room_for_several_recordings_and_all_buttons(

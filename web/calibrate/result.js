@@ -64,13 +64,12 @@ function card(tile) {
     const isOutlier = Math.abs(row.residual_n) > row.half_width_n;
     return el("tr", { "data-outlier": String(isOutlier) },
       el("td", { text: plainWeight(row.weight) }), el("td", { text: number(row.force_n, 2) }), el("td", { text: number(row.gauge_kpa, 2) }),
-      el("td", { cls: "narrow", text: number(row.noise_kpa, 2) }), el("td", { cls: "narrow", text: signed(row.settle_kpa, 2) }),
+      el("td", { text: number(row.noise_kpa, 2) }), el("td", { text: signed(row.settle_kpa, 2) }),
       el("td", { cls: "residual", text: signed(row.residual_n, 2) }), el("td", { text: `±${number(row.half_width_n, 2)}` }));
   });
   const head = ["Weight", "Force|N", "Pressure|kPa", "Noise|kPa", "Settled|kPa", "Residual|N", "95 %|N"].map((text) => {
     const [title, unit] = text.split("|");
-    const cls = ["Noise", "Settled"].includes(title) ? "narrow" : "";
-    return el("th", { scope: "col", cls }, title, ...(unit ? [el("br"), el("span", { cls: "unit", text: unit })] : []));
+    return el("th", { scope: "col" }, title, ...(unit ? [el("br"), el("span", { cls: "unit", text: unit })] : []));
   });
   return el("section", { cls: "curve-card", "aria-label": `Tile ${tile.serial}` },
     el("h3", { text: `Tile ${tile.serial}` }),

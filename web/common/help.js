@@ -6,7 +6,11 @@ import { byId, el, isInside } from "./text.js";
 export function helpWithKeys(text) {
   const dialog = byId("help-dialog", HTMLDialogElement);
   if (text) dialog.querySelector(".row").before(el("p", { text }));
-  const open = () => { if (!dialog.open) dialog.showModal(); };
+  const open = () => {
+    if (dialog.open) return;
+    dialog.showModal();
+    dialog.scrollTop = 0; // the focus on Close would hide the heading
+  };
   byId("help").addEventListener("click", open);
   document.addEventListener("keydown", (event) => {
     if (event.key !== "?" || event.ctrlKey || event.metaKey || event.altKey || isInside(event, "input, textarea, select, dialog[open]")) return;

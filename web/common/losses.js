@@ -31,6 +31,12 @@ export function missedShare({ frames: recorded, lost, missed_slots: missed }) {
   return slots ? missed / slots : 0;
 }
 
+/** Return the share of slots that were not sampled, such as "12 % not sampled"; "" without any. @param {Session} session */
+export function missedText(session) {
+  const percent = 100 * missedShare(session);
+  return percent ? `${percent < 1 ? "<1" : Math.round(percent)}\u00a0% not sampled` : "";
+}
+
 /** Return the number of lost frames. @param {Record<string, number>} [lost] by reason */
 export const countLost = (lost) => Object.values(lost ?? {}).reduce((sum, count) => sum + count, 0);
 

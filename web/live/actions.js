@@ -1,12 +1,13 @@
 // Action bar: Tare, Record, Stop, Marker; fields, shortcuts and running recordings.
 
 import * as api from "../common/api.js";
-import { countLost } from "../common/losses.js";
+import { countLost, missedText } from "../common/losses.js";
 import { isOperator } from "../common/login.js";
 import { notice, showRefusal } from "../common/notices.js";
 import { byId, duration, el, isInside, localTime, setData, setText } from "../common/text.js";
 
 const UNDO_KEY = "foottile.undo"; // survives a reload, not the tab
+const DOUBLE_TAP_MS = 1000; // a second press of Record within it is no second recording
 
 /** Action bar of the live page. */
 export class Actions {
@@ -19,6 +20,7 @@ export class Actions {
     this.markers = markers;
     this.onSession = onSession;
     this.busy = new Set();
+    this.recordedMs = -Infinity; // latest start, by performance.now()
     this.rows = new Map(); // session id -> row
     for (const name of ["tare", "undo", "record", "stop", "marker"]) {
       byId(name).addEventListener("click", () => this.run(name));
@@ -101,9 +103,11 @@ export class Actions {
   }
 
   async record(node) {
+    if (performance.now() - this.recordedMs < DOUBLE_TAP_MS) return;
     const field = byId("session-name", HTMLInputElement);
     const name = field.value.trim() || localTime(new Date());
     const session = await api.startSession(node.node, name);
+    this.recordedMs = performance.now();
     field.value = "";
     this.onSession(session);
     notice(`Recording “${session.name}”.`);
@@ -111,13 +115,17 @@ export class Actions {
     if (document.activeElement === document.body || document.activeElement === byId("record")) byId("stop").focus();
   }
 
-  /** Stop a recording; by default the latest of the selected node. */
-  async stop(_node, id = this.running()[0].id) {
-    const session = await api.stopSession(id);
-    this.onSession(session);
-    notice(session.state === "pending"
-      ? `Stopped “${session.name}”. It is sealed once its last frames arrive.`
-      : `Stopped “${session.name}”.`);
+  /** Stop recordings; by default all of the selected node. */
+  async stop(_node, ids = this.running().map(({ id }) => id)) {
+    const sessions = [];
+    for (const id of ids) {
+      sessions.push(await api.stopSession(id));
+      this.onSession(sessions.at(-1));
+    }
+    const [{ name }] = sessions;
+    const pending = sessions.filter(({ state }) => state === "pending").length;
+    notice(sessions.length > 1 ? `Stopped ${sessions.length} recordings.${pending ? " They are sealed once their last frames arrive." : ""}`
+      : `Stopped “${name}”.${pending ? " It is sealed once its last frames arrive." : ""}`);
     this.draw();
     if (document.activeElement === document.body) byId("record").focus();
   }
@@ -156,6 +164,7 @@ export class Actions {
     setText(box, reason ? `Cannot record or tare: ${reason[0].toLowerCase()}${reason.slice(1)}` : "");
     byId("stop", HTMLButtonElement).disabled = byId("marker", HTMLButtonElement).disabled = !running.length;
     setText(byId("record-text"), running.length ? "Record another" : "Record");
+    setText(byId("stop-text"), running.length > 1 ? `Stop all ${running.length}` : "Stop");
     if (this.undoId === undefined) {
       try { this.undoId = sessionStorage.getItem(UNDO_KEY); } catch { this.undoId = null; }
     }
@@ -186,7 +195,7 @@ export class Actions {
       setText(row.querySelector(".recording-time"), duration(elapsedS));
       setText(row.querySelector(".recording-frames"), `${session.frames.toLocaleString("en-GB")} frames`);
       const losses = row.querySelector(".recording-lost");
-      setText(losses, `${lost.toLocaleString("en-GB")} lost`);
+      setText(losses, [`${lost.toLocaleString("en-GB")} lost`, missedText(session)].filter(Boolean).join(", "));
       setData(losses, "bad", String(lost > 0));
     }
   }
@@ -197,7 +206,7 @@ export class Actions {
     stop.addEventListener("click", async () => {
       stop.disabled = true;
       try {
-        await this.stop(null, session.id);
+        await this.stop(null, [session.id]);
       } catch (error) {
         showRefusal(error);
         stop.disabled = false;

@@ -66,11 +66,11 @@ export class TileTraces {
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
     if (!width || !height) return;
     const context = fit(canvas, width, height);
-    this.range.update(node, points.at(-1)?.tiles, nowMs);
     if (!this.colours) this.readColours();
     const colours = live ? this.colours : { ...this.colours, fill: this.colours.stale, band: this.colours.stale };
     const recent = points.filter((point) => point.tiles);
     const known = [...tileHistory.filter((point) => point.timeS > endS - windowS), ...recent];
+    this.range.update(node, greatestOf(known), nowMs);
     const box = { width: width - RIGHT_PX - LEFT_PX, height, rowPx: height / node.tiles.length };
     const rows = node.tiles.map((tile, i) => {
       const unit = unitOf(tile, unitChosen);
@@ -156,4 +156,13 @@ export class TileTraces {
     });
     strip.show(this.context, LEFT_PX, 0, width, height);
   }
+}
+
+/** Return the greatest values of the visible points, in the form of a frame. @param {TilePoint[]} points */
+function greatestOf(points) {
+  const most = { force_max_n: [0], gauge_max_kpa: [0] };
+  for (const { tiles } of points) {
+    for (const [name, found] of Object.entries(most)) for (const value of tiles[name] ?? []) if (value > found[0]) found[0] = value;
+  }
+  return most;
 }

@@ -4,7 +4,7 @@ import { lossCounts } from "../common/losses.js";
 import { quietly } from "../common/notices.js";
 import { ReplacementWarning } from "../common/replacement.js";
 import { loadModule } from "../common/request.js";
-import { duration, el, number, perSecond, plain, roughly, setData, setText } from "../common/text.js";
+import { duration, el, localTime, number, perSecond, plain, roughly, setData, setText } from "../common/text.js";
 import { drawContact, whyNot } from "../live/grf.js";
 import { Warnings } from "../live/notes.js";
 import { stateText } from "../sessions/state.js";
@@ -44,7 +44,7 @@ export class Card {
     const strip = el("canvas", { cls: "node-trace", role: "img", "aria-label": `Ground reaction force of ${name} over the last 10 seconds` });
     this.trace = new SmallTrace(strip, () => this.node.stream_id);
     const facts = el("dl", { cls: "node-facts" });
-    this.facts = Object.fromEntries(["Frames/s", "Losses", "Backlog"].map((title) => {
+    this.facts = Object.fromEntries(["Frames/s", "Losses", "Backlog", "Tare"].map((title) => {
       const value = el("dd");
       const row = el("div", {}, el("dt", { text: title, cls: title === "Losses" ? "unseen" : "" }), value);
       facts.append(row);
@@ -150,6 +150,8 @@ export class Card {
     fact("Losses", lossCounts(lost, missed), lost > 0 || slow);
     const backlog = heartbeat.backlog_frames ?? node.backlog_frames ?? 0;
     this.facts.Backlog.row.hidden = backlog < SHOWN_BACKLOG_S * (node.nominal_rate_hz || 400);
+    this.facts.Tare.row.hidden = !node.tare || node.tare.undone;
+    fact("Tare", node.tare ? localTime(new Date(node.tare.t_ns / 1e6)) : "", false);
     fact("Backlog", `${backlog.toLocaleString("en-GB")} frames`, false);
   }
 
@@ -176,7 +178,7 @@ export class Card {
     this.sessionKey = key;
     const markers = session.marker_count ? `, ${session.marker_count} marker${session.marker_count === 1 ? "" : "s"}` : "";
     const frames = `${session.frames.toLocaleString("en-GB")} frames`;
-    const state = recording ? `recording, ${duration(Math.floor(session.duration_s))}` : `${short}, ${frames}`;
+    const state = recording ? `${short}, ${duration(Math.floor(session.duration_s))}` : `${short}, ${frames}`;
     this.sessionLine.replaceChildren(
       el("a", { href: `/sessions/${encodeURIComponent(session.id)}`, text: session.name || session.id }), ` ${state}${markers}`,
       ...(long && !recording ? [el("span", { cls: "why", text: ` ${long}` })] : []));

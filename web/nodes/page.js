@@ -42,7 +42,7 @@ const handlers = {
     if (isNew) arrange();
   },
   session: ({ session }) => updateSession(session),
-  counted: ({ sessions }) => Object.entries(sessions).forEach(([id, progress]) => {
+  session_progress: ({ sessions }) => Object.entries(sessions).forEach(([id, progress]) => {
     const session = recordings.get(id);
     if (session) updateSession({ ...session, ...progress });
   }),

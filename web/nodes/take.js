@@ -3,7 +3,7 @@
 import * as api from "../common/api.js";
 import { isOperator } from "../common/login.js";
 import { countLost } from "../common/losses.js";
-import { notice, quietly, showRefusal } from "../common/notices.js";
+import { notice, quietly, showRefusal, withdraw } from "../common/notices.js";
 import { byId, duration, isInside, localTime, setData, setText } from "../common/text.js";
 import { MarkerQueue } from "../live/markers.js";
 
@@ -114,7 +114,9 @@ export class Takes {
   /** Tare each node by itself: a loaded one does not keep the others from it. */
   async tare() {
     const names = this.page.connected();
+    notice(`Taring ${nodes(names.length)} …`, { about: ["taring"], stays: true });
     const answers = await Promise.allSettled(names.map((name) => api.tareNow(name)));
+    withdraw("taring");
     const tared = names.flatMap((name, i) => (answers[i].status === "fulfilled" ? [{ name, id: answers[i].value.id }] : []));
     const failed = {};
     answers.forEach((answer, i) => {

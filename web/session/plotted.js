@@ -4,7 +4,7 @@ import * as api from "../common/api.js";
 import { isOperator } from "../common/login.js";
 import { notice, quietly, showRefusal } from "../common/notices.js";
 import { loadModule, unlessRefused } from "../common/request.js";
-import { byId, copyText, setText } from "../common/text.js";
+import { byId, copyText, isInside, setText } from "../common/text.js";
 import { offsetAt } from "./clock.js";
 import { axisText, moveClock, moveStances } from "./time_axis.js";
 import { Downloads } from "./downloads.js";
@@ -177,6 +177,10 @@ export class Plotted {
       picture: () => savePicture(plots, this.session),
     };
     for (const [name, act] of Object.entries(buttons)) byId(name).addEventListener("click", act);
+    byId("plots-card").addEventListener("click", (event) => {
+      // After a click with a pointer the space bar plays; it does not press that button again.
+      if (event.detail > 0 && isInside(event, "button:focus")) byId("plots").focus({ preventScroll: true });
+    });
     byId("marker-here").addEventListener("submit", (event) => {
       event.preventDefault();
       quietly(() => this.markers.add(this.cursorS ?? this.middle));

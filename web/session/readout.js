@@ -5,6 +5,7 @@ import { flagTexts } from "./flags.js";
 import { timeText } from "./overlay.js";
 
 const TILES_MAX = 8;
+const LARGEST_FRAME = "GRF of single frames, noise included. The peak force of a stance is estimated without the bias of this noise: it is usually smaller.";
 
 /** Return "3.1" of a single frame, "1.2 to 3.1" of several. */
 function span(bins, i, [lowName, highName], factor = 1, decimals = 1) {
@@ -119,12 +120,13 @@ export function drawSummary(bins, view, box) {
   const missing = bins.sum("missing", begin, end);
   if (missing) parts.push(`${missing.toLocaleString("en-GB")} lost`);
   const grf = bins.estimated ? bins.extremes("grf_n_min", "grf_n_max", begin, end) : null;
-  if (grf) parts.push(`GRF ${number(grf.low)} to ${number(grf.high)} N, max at ${time(bins.first[grf.at])}`);
+  if (grf) parts.push(`largest frame ${number(grf.high)} N at ${time(bins.first[grf.at])}, smallest ${number(grf.low)} N`);
   const unknown = bins.estimated ? bins.sum("grf_unknown", begin, end) : 0;
   if (unknown) parts.push(`GRF unknown in ${unknown.toLocaleString("en-GB")} frames`);
   if (!bins.estimated) parts.push("no estimates, raw counts");
   parts.push(bins.framesInBin === 1 ? "every frame drawn" : `${bins.framesInBin} frames per pixel column, min to max`);
   setText(box, `${parts.join(", ")}.`);
+  box.title = grf ? LARGEST_FRAME : "";
   setData(box, "grfMax", grf ? String(grf.high) : "");
   setData(box, "grfMin", grf ? String(grf.low) : "");
   setData(box, "missing", String(missing));

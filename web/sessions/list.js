@@ -117,7 +117,7 @@ export class Sessions {
     if (!session) return;
     const now = { ...session, ...progress };
     const shown = this.rows.get(id);
-    if (stateText(now)[1] !== stateText(session)[1] || !shown) return this.update(now);
+    if (String(stateText(now)) !== String(stateText(session)) || !shown) return this.update(now);
     this.sessions.set(id, now);
     shown.key = this.keyOf(now);
     for (const [cls, text] of Object.entries(counts(now))) setText(shown.row.querySelector(`.${cls}`), text);

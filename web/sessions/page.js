@@ -28,7 +28,7 @@ const handlers = {
     look(); // the login may have ended with the server
   },
   session: ({ session }) => updateSession(session),
-  counted: ({ sessions: counts }) => Object.entries(counts).forEach(([id, progress]) => sessions.updateProgress(id, progress)),
+  session_progress: ({ sessions: counts }) => Object.entries(counts).forEach(([id, progress]) => sessions.updateProgress(id, progress)),
   deleted: ({ session_id: id }) => removeSession(id),
 };
 

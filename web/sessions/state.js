@@ -1,6 +1,6 @@
 // State of a session as text.
 
-import { countLost, frames, lossCounts, lossTexts, missedShare } from "../common/losses.js";
+import { countLost, frames, lossCounts, lossTexts, missedShare, missedText } from "../common/losses.js";
 
 const MISSED_SHARE_MAX = 0.01; // more is a warning
 
@@ -15,15 +15,14 @@ export function stateText(session) {
   const losses = lossTexts(session.lost).map(([, text]) => `${text}.`);
   if (session.max_lost_tail_frames) losses.push(`Up to ${frames(session.max_lost_tail_frames)} at the end may be lost (power failure).`);
   const missing = losses.length ? ` Missing: ${losses.join(" ")}` : "";
-  const percent = 100 * missedShare(session);
-  const share = percent ? `, ${percent < 1 ? "<1" : Math.round(percent)}\u00a0% not sampled` : "";
-  const missed = percent ? `${lossCounts(countLost(session.lost), session.missed_slots)} (node late).` : "";
+  const share = session.missed_slots ? `, ${missedText(session)}` : "";
+  const missed = share ? `${lossCounts(countLost(session.lost), session.missed_slots)} (node late).` : "";
   switch (session.state) {
-    case "recording": return ["recording", missing.trim(), "run"];
+    case "recording": return [`recording${share}`, missing.trim(), "run"];
     case "pending": {
-      return ["pending", `${WAITS[session.pending_reason]?.(session) ?? "All frames received; sealing."}${missing}${why}`, "warn"];
+      return [`pending${share}`, `${WAITS[session.pending_reason]?.(session) ?? "All frames received; sealing."}${missing}${why}`, "warn"];
     }
-    case "sealing": return ["sealing", `Writing files.${missing}${why}`, "run"];
+    case "sealing": return [`sealing${share}`, `Writing files.${missing}${why}`, "run"];
     case "sealed":
       if (session.complete === true) return [`complete${share}`, `${missed}${why}`.trim(), missedShare(session) > MISSED_SHARE_MAX ? "warn" : "good"];
       if (session.complete === "lossy") return [`lossy${share}`, `${missing.trim() || "Frames are lost."}${missed && ` ${missed}`}${why}`, "warn"];

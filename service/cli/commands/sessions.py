@@ -125,7 +125,7 @@ def sessions_command(
             f"{session['duration_s']:.1f}",
             str(session["frames"]),
             str(session.get("marker_count", "")),
-            session["state"] + lossy + assumed,
+            session["state"] + lossy + _format_missed(session) + assumed,
         )
     stdout.print(table)
 
@@ -297,6 +297,15 @@ def export_command(
         remark(f"without markers: there is no {MARKERS_NAME} beside {sources[0].name}")
 
 
+def _format_missed(session: Mapping[str, Any]) -> str:
+    """Return the share of slots that were not sampled, as the pages do; empty without any."""
+    missed = session["missed_slots"]
+    if not missed:
+        return ""
+    percent = 100 * missed / (session["frames"] + sum(session["lost"].values()) + missed)
+    return f", {'<1' if percent < 1 else round(percent)} % not sampled"
+
+
 def _parse_clock(clock: str) -> ClockName:
     """Return the clock of an option.
 
@@ -369,6 +378,8 @@ def _list_folder_sessions(data: Path, filters: SessionFilter) -> list[Mapping[st
         {
             **session.model_dump(mode="json", exclude=_UNLISTED_FIELDS),
             "complete": complete(session),
+            "missed_slots": 0 if session.ledger is None else session.ledger.missed_slots,
+            "lost": {} if session.ledger is None else session.ledger.lost,
             "marker_count": len(session.markers),
         }
         for session in sessions

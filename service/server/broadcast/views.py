@@ -381,6 +381,7 @@ class SessionProgress(View):
     pending_frames: int
     pending_reason: Literal["frames", "end"] | None
     lost: dict[str, int]
+    missed_slots: int
     duration_s: float
 
     @classmethod
@@ -392,6 +393,7 @@ class SessionProgress(View):
             pending_frames=ledger.pending,
             pending_reason=recorder.pending_reason(session, ledger),
             lost=ledger.lost,
+            missed_slots=ledger.missed_slots,
             duration_s=round(recorder.compute_duration_s(session, ledger.recorded), 1),
         )
 

@@ -350,6 +350,18 @@ def test_a_list_of_sessions_goes_on_behind_a_damaged_one(run: Run, data: Path) -
     assert "0000ff" not in found.err
 
 
+def test_a_list_of_sessions_says_how_much_was_not_sampled(run: Run, data: Path) -> None:
+    run("recover", data)
+    folder = SessionsFolder(data / "sessions")
+    session = folder.load(ID)
+    assert session.ledger is not None
+    ledger = session.ledger.model_copy(update={"missed_slots": 25})
+    folder.save(session.model_copy(update={"ledger": ledger}))
+    assert "sealed, 20 % not sampled" in run("sessions", "--data", data).out
+    (listed,) = run("sessions", "--data", data, "--json").printed()["items"]
+    assert (listed["missed_slots"], listed["lost"]) == (25, {})
+
+
 def test_verify_says_what_it_may_not_read(
     run: Run, data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
