@@ -31,7 +31,8 @@ _VERDICT_SENTENCES = {
     "complete": "Everything is whole and complete.",
     "lossy": "Everything is whole, but some frames are lost for good: they are counted above.",
     "pending": "Everything is whole, but not every session is sealed yet.",
-    "damaged": "Something is damaged: do not trust what is named above.",
+    "damaged": "Something is damaged: do not trust what is named above. Pull a damaged session "
+    "again (`foottile pull ID --out FOLDER`), or restore it from a backup.",
     "unproven": "Nothing is damaged, but not all of it can be proven: it is named above.",
     "export": "An export: it proves nothing; the session that it was made from does.",
 }
@@ -114,6 +115,8 @@ def _verify_many(
     )
     codes = {_EXIT_CODES[verdict] for verdict in summary.verdicts if _EXIT_CODES[verdict]}
     codes |= {EXIT_INCOMPLETE} if summary.states["failed"] else set()
+    if summary.verdicts["damaged"] and not as_json:
+        echo(_VERDICT_SENTENCES["damaged"])
     if codes:
         raise typer.Exit(min(codes))
 
