@@ -16,7 +16,14 @@ from service.cli.multi_session import (
     is_single_session,
     run_task,
 )
-from service.cli.options import JsonOption, echo, print_json, resolve_data_folder, show_progress
+from service.cli.options import (
+    SESSION_REMEDY,
+    JsonOption,
+    echo,
+    print_json,
+    resolve_data_folder,
+    show_progress,
+)
 
 if TYPE_CHECKING:
     from storage.sessions.folder import Ledger
@@ -133,6 +140,7 @@ def _find_path(target: str, data: Path | None) -> Path:
         f"no session, file or folder {target!r}",
         where=str(root),
         expected="a path, or the id of a session in --data",
+        remedy=SESSION_REMEDY,
     )
 
 
