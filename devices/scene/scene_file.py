@@ -118,11 +118,13 @@ def load_scene(name_or_path: str) -> Scene:
         return parse_scene(text, where=f"scene {name_or_path}")
     try:
         text = read_text(Path(name_or_path))
-    except (OSError, ValueError) as error:
+    except FileNotFoundError as error:
         raise SceneError(
-            f"no scene {name_or_path!r}: {error}",
+            f"no file {name_or_path!r} and no built-in scene of this name",
             expected=f"one of {', '.join(list_builtin_scenes())}, or the path of a scene file",
         ) from error
+    except (OSError, ValueError) as error:
+        raise SceneError(f"scene {name_or_path!r} cannot be read: {error}") from error
     return parse_scene(text, where=name_or_path)
 
 

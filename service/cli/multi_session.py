@@ -158,6 +158,9 @@ def run_jobs_with_report(
                 report.flush()
             if as_json:
                 echo(line)
+            else:
+                for problem in outcome.facts.get("problems", ()):
+                    remark(f"{outcome.place}: damaged: {problem}")
             show_outcome(outcome)
     if results is not None:
         results.remove_work_folder()
@@ -240,7 +243,9 @@ def _print_summary(counts: OutcomeCounts, command: str, out: str | None, *, as_j
     states = counts.states
     if not as_json:
         where = f"{out}: " if out is not None else ""
-        parts = [f"{states['made']} made", f"{states['there']} there before"]
+        parts = [f"{states['made']} {'verified' if command == 'verify' else 'made'}"]
+        if out is not None:  # else nothing is kept
+            parts.append(f"{states['there']} there before")
         verdicts = ", ".join(f"{n} {verdict}" for verdict, n in sorted(counts.verdicts.items()))
         failed = f", {states['failed']} failed" if states["failed"] else ""
         echo(f"{where}{command}: {', '.join(parts)}{failed}{'; ' if verdicts else ''}{verdicts}")

@@ -61,6 +61,11 @@ CaOption = Annotated[
         help="Further trusted CA certificates in PEM, for an https server.",
     ),
 ]
+SESSION_REMEDY = (
+    "`foottile sessions` lists a server's sessions, `foottile pull ID --out here` downloads one; or "
+    "name the data folder with --data"
+)
+"""Remedy if a session is not on this computer."""
 StartOption = Annotated[
     float | None, typer.Option(help="First instant, seconds after the first frame.")
 ]

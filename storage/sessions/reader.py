@@ -353,7 +353,9 @@ def _open_with_footer(
         try:
             file = pq.ParquetFile(path, metadata=own.metadata, page_checksum_verification=True)
         except Exception as error:  # gone meanwhile, or damaged
-            raise FileFormatError(f"cannot be read as Parquet: {error}", where=str(path)) from error
+            raise FileFormatError(
+                f"cannot be read as Parquet: {str(error).strip()}", where=str(path)
+            ) from error
         if footer is not None or stamps == read_file_stamps_or_empty(path):
             return own, file
         file.close()

@@ -179,18 +179,15 @@ def _check_sealed(report: SessionReport, folder: Path, metadata: StoredMetadata)
         problems.append(f"{FRAMES_NAME} is missing")
         return
     file = _verify_frames(report, folder)
-    if report.sha256 != content.get("sha256"):
+    if report.sha256 == content.get("sha256"):
+        _compare_metadata(problems, metadata, file, path.stat().st_size)
+    elif not file.problems:
         problems.append(
-            f"{FRAMES_NAME} is not the file that {SESSION_NAME} names: its SHA-256 is "
-            f"{report.sha256}, not {content.get('sha256')}"
+            f"{FRAMES_NAME} is not the file that {SESSION_NAME} names: it is of session "
+            f"{file.session.get('id', 'none')}, and its SHA-256 is {report.sha256}, not "
+            f"{content.get('sha256')}"
         )
-    _compare_metadata(problems, content, file, path.stat().st_size)
-    if metadata.ledger is not None:
-        report.ledger = metadata.ledger
-        if file.ledger is not None and file.ledger != metadata.ledger:
-            problems.append(f"the ledgers of {SESSION_NAME} and {FRAMES_NAME} are not the same")
-    if file.session and file.session.get("parts") != [p.model_dump() for p in metadata.parts]:
-        problems.append(f"{SESSION_NAME} and {FRAMES_NAME} are not of the same parts")
+    report.ledger = metadata.ledger or report.ledger
     session = metadata.session
     _check_events(report, folder / MARKERS_NAME, session.markers if session is not None else None)
     _check_clock(report, folder / CLOCK_NAME, session)
@@ -199,9 +196,10 @@ def _check_sealed(report: SessionReport, folder: Path, metadata: StoredMetadata)
 
 
 def _compare_metadata(
-    problems: list[str], content: dict[str, Any], file: SealedFileReport, size: int
+    problems: list[str], metadata: StoredMetadata, file: SealedFileReport, size: int
 ) -> None:
     """Compare the file's facts in `session.json` with the file."""
+    content = metadata.content
     first_last = [(part.t_mono_ns_first, part.t_mono_ns_last) for part in file.parts]
     duration_s = sum(last - first for first, last in first_last) * 1e-9
     found: dict[str, Any] = {"frames": file.frame_count, "bytes": size}
@@ -223,19 +221,23 @@ def _compare_metadata(
             f"{SESSION_NAME} says that it lasted {content['duration_s']} s, and {FRAMES_NAME} "
             f"{duration_s} s"
         )
+    if None not in (metadata.ledger, file.ledger) and file.ledger != metadata.ledger:
+        problems.append(f"the ledgers of {SESSION_NAME} and {FRAMES_NAME} are not the same")
+    if file.session and file.session.get("parts") != [p.model_dump() for p in metadata.parts]:
+        problems.append(f"{SESSION_NAME} and {FRAMES_NAME} are not of the same parts")
 
 
 def _verify_frames(report: SessionReport, folder: Path) -> SealedFileReport:
-    """Verify the frames, and add the findings to the report."""
+    """Verify the frames, and add the findings to the report, damage of the file as one."""
     path = folder / FRAMES_NAME
     try:
         file = verify_sealed_file(path)
         report.sha256 = compute_sha256(path)
     except (FileFormatError, OSError) as error:
         what = error.what if isinstance(error, FileFormatError) else str(error)
-        report.problems.append(f"{FRAMES_NAME}: {what}")
-        return SealedFileReport(path)
-    report.problems += [f"{FRAMES_NAME}: {problem}" for problem in file.problems]
+        file = SealedFileReport(path, [what])
+    if file.problems:
+        report.problems.append(f"{FRAMES_NAME}: {'; '.join(file.problems)}")
     report.unproven += file.unproven
     report.id = report.id if report.id is not None else file.session.get("id")
     report.ledger = report.ledger or file.ledger

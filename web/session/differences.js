@@ -32,9 +32,9 @@ export function drawDifferences(stances, others, name) {
   byId("differences-card").hidden = false;
   setText(byId("differences-about"), Math.min(own.length, other.length) < STANCES_MIN
     ? `No differences to ${name}: both sessions need ${STANCES_MIN} whole stances (${own.length} here, ${other.length} there).`
-    : `${name} minus this session, mean of whole stances, ± 95 % from their scatter. An error that all stances share (calibration, tare) adds to it.`);
-  setText(byId("differences-own"), `This (${own.length})`);
-  setText(byId("differences-other"), `Other (${other.length})`);
+    : `Other: ${name}. sd: standard deviation of the stances; 95 %: interval of the difference of the means, from that scatter. An error that all stances share (calibration, tare) adds to it.`);
+  setText(byId("differences-own"), `This (${own.length}), ±\u00a0sd`);
+  setText(byId("differences-other"), `Other (${other.length}), ±\u00a0sd`);
   byId("differences-rows").replaceChildren(...FIGURES.map(({ key, label, value, unit, factor, decimals }) => {
     const text = (mean, spread) => (Number.isFinite(mean) ? `${number(mean * factor, decimals)}${Number.isFinite(spread) ? ` ± ${number(spread * factor, decimals)}` : ""}` : "–");
     const both = [own, other].map((all) => momentsOf(all, value));

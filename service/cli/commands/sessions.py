@@ -20,6 +20,7 @@ from service.cli.multi_session import (
     run_task,
 )
 from service.cli.options import (
+    SESSION_REMEDY,
     CaOption,
     EndOption,
     JsonOption,
@@ -164,7 +165,13 @@ def pull_command(
     from storage.formats.writers.registry import get_format, get_multi_session_format
 
     if (session is None) == (take is None):
-        raise UsageError("nothing to pull is named, or twice", expected="a session's id, or --take")
+        raise UsageError(
+            "nothing to pull is named"
+            if take is None
+            else "a session and --take exclude each other",
+            expected="a session's id, or --take",
+            remedy="List both with `foottile sessions --json`" if take is None else "Name one",
+        )
     clock_name = _parse_clock(clock)
     writer = get_format(to) if take is None else get_multi_session_format(to)
     part = Slice(start_s, end_s, _parse_names(columns))
@@ -393,17 +400,18 @@ def find_sealed_file(session: str, data: Path | None) -> Path:
     Raises:
         UsageError: no sealed file.
     """
-    from storage.sessions.folder import FRAMES_NAME, SessionsFolder
+    from storage.sessions.folder import FRAMES_NAME, SESSION_ID
 
     path = Path(session)
     if path.is_file():
         return path
-    if not path.is_dir():
-        path = SessionsFolder(resolve_data_folder(data) / "sessions").get_path(session)
+    if not path.is_dir() and SESSION_ID.fullmatch(session):
+        path = resolve_data_folder(data) / "sessions" / session
     if not (path / FRAMES_NAME).is_file():
         raise UsageError(
             f"no sealed session {session!r}",
             where=str(path),
             expected=f"a file, a folder with {FRAMES_NAME}, or the id of a session in --data",
+            remedy=SESSION_REMEDY,
         )
     return path / FRAMES_NAME

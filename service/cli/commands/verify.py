@@ -16,7 +16,14 @@ from service.cli.multi_session import (
     is_single_session,
     run_task,
 )
-from service.cli.options import JsonOption, echo, print_json, resolve_data_folder, show_progress
+from service.cli.options import (
+    SESSION_REMEDY,
+    JsonOption,
+    echo,
+    print_json,
+    resolve_data_folder,
+    show_progress,
+)
 
 if TYPE_CHECKING:
     from storage.sessions.folder import Ledger
@@ -31,7 +38,8 @@ _VERDICT_SENTENCES = {
     "complete": "Everything is whole and complete.",
     "lossy": "Everything is whole, but some frames are lost for good: they are counted above.",
     "pending": "Everything is whole, but not every session is sealed yet.",
-    "damaged": "Something is damaged: do not trust what is named above.",
+    "damaged": "Something is damaged: do not trust what is named above. Pull a damaged session "
+    "again (`foottile pull ID --out FOLDER`), or restore it from a backup.",
     "unproven": "Nothing is damaged, but not all of it can be proven: it is named above.",
     "export": "An export: it proves nothing; the session that it was made from does.",
 }
@@ -114,6 +122,8 @@ def _verify_many(
     )
     codes = {_EXIT_CODES[verdict] for verdict in summary.verdicts if _EXIT_CODES[verdict]}
     codes |= {EXIT_INCOMPLETE} if summary.states["failed"] else set()
+    if summary.verdicts["damaged"] and not as_json:
+        echo(_VERDICT_SENTENCES["damaged"])
     if codes:
         raise typer.Exit(min(codes))
 
@@ -130,6 +140,7 @@ def _find_path(target: str, data: Path | None) -> Path:
         f"no session, file or folder {target!r}",
         where=str(root),
         expected="a path, or the id of a session in --data",
+        remedy=SESSION_REMEDY,
     )
 
 

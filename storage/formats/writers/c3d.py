@@ -327,7 +327,7 @@ def _make_parameter(types: Any, value: Sequence[Any] | np.ndarray) -> dict[str, 
 C3D = ExportFormat(
     "c3d",
     "C3D",
-    "Visual3D, Mokka, QTM, Vicon",
+    "C3D programs (tried: ezc3d, c3d)",
     "application/octet-stream",
     _encode,
     group_encoder=_encode_together,

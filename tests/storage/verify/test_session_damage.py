@@ -90,6 +90,17 @@ def test_a_file_that_was_cut_anywhere_is_damage(tmp_path: Path, name: str) -> No
         assert verify_session(path.parent).problems != [], size
 
 
+def test_a_damaged_or_exchanged_file_is_one_finding(tmp_path: Path) -> None:
+    path = sealed(tmp_path) / "frames.parquet"
+    whole = path.read_bytes()
+    other = (sealed(tmp_path, OTHER_ID) / "frames.parquet").read_bytes()
+    for content in (whole + b"x", whole[:300] + b"x" + whole[301:], other, b"x"):
+        path.write_bytes(content)
+        (problem,) = verify_session(path.parent).problems
+        assert problem.startswith("frames.parquet")
+        assert (f"it is of session {OTHER_ID}" in problem) == (content == other)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

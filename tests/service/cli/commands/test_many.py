@@ -61,7 +61,7 @@ def test_many_sessions_are_estimated_each_into_its_folder(
     assert [line["state"] for line in said] == ["there", "there"]
     proof = run("verify", "out", "data", "--jobs", 1)
     assert proof.code == 0, proof.err
-    assert "4 complete" in proof.out
+    assert "verify: 4 verified; 4 complete" in proof.out
     alone = run("verify", "out", "--jobs", 1)
     assert alone.code == 0, alone.err
     assert "2 complete" in alone.out
@@ -93,7 +93,9 @@ def test_a_damaged_session_among_many_is_told_by_the_exit_code(run: Run, data: P
     (data / "sessions" / IDS[1] / "clock.parquet").unlink()
     done = run("verify", f"{data}/sessions/*", "--jobs", 1, "--out", "proofs")
     assert done.code == 1
-    assert "1 complete, 1 damaged" in done.out
+    assert "2 verified, 0 there before; 1 complete, 1 damaged" in done.out
+    assert f"{IDS[1]}: damaged: clock.parquet is missing" in done.err
+    assert "pull a damaged session again" in done.out.lower()
 
 
 @pytest.mark.parametrize(

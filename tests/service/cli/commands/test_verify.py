@@ -104,8 +104,9 @@ def test_damage_is_said_and_is_exit_code_1(run: Run, data: Path) -> None:
     for target in (path, path.parent, data):
         found = run("verify", target)
         assert found.code == 1
-        assert "  damaged: " in found.out
+        assert found.out.count("  damaged: ") == 1
         assert "do not trust" in found.out.splitlines()[-1]
+        assert "`foottile pull ID" in found.out.splitlines()[-1]
     assert json.loads(run("verify", path, "--json").out)["complete"] is False
 
 
