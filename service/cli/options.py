@@ -62,8 +62,8 @@ CaOption = Annotated[
     ),
 ]
 SESSION_REMEDY = (
-    "`foottile sessions` lists a server's sessions, `foottile pull ID --out here` downloads one; or "
-    "name the data folder with --data"
+    "`foottile sessions` lists a server's sessions, `foottile pull ID --out here` downloads one; "
+    "or name the data folder with --data"
 )
 """Remedy if a session is not on this computer."""
 StartOption = Annotated[

@@ -180,7 +180,9 @@ def test_the_difference_of_two_sessions_has_the_interval_of_a_welch_test(
     expect(page.locator("#beside-summary")).to_contain_text(re.compile(r"\(recorded \d+ s later\)"))
     expect(page.locator("#differences-rows tr")).to_have_count(4)
     head = page.locator("#differences-card thead")
-    expect(head).to_contain_text(re.compile(r"This .*±\ssd.*Other .*±\ssd.*Other − this, ±\s95\s%"))
+    expect(head).to_contain_text(
+        re.compile(r"This .*±\ssd.*Other .*±\ssd.*Other \u2212 this, ±\s95\s%")
+    )
     values = ([9.6, 9.9, 9.1, 9.4], [10.2, 10.9, 9.8])
     found = page.evaluate(
         """([own, other]) => import("/static/session/differences.js").then((module) => {
