@@ -37,6 +37,7 @@ CURVE_MISFIT_HALF_FORCE_N = 0.2
 are 0 at zero load."""
 CUBIC_TERMS = 3
 """Number of coefficients of a cubic without constant term."""
+_SHOWN_SERIALS = 4
 _TILES_MAX = 256
 """Largest number of tiles of a calibration, which may exceed that of an array."""
 _ROWS_MAX = 1000
@@ -150,16 +151,33 @@ class Calibration(CalibrationPart):
         Raises:
             CalibrationError: there is none.
         """
-        if (found := self.find_tile(serial)) is not None:
-            return found
-        known = ", ".join(tile.serial for tile in self.tiles)
-        why = f": it was refused ({self.refused[serial]})" if serial in self.refused else ""
-        raise CalibrationError(
-            f"no calibration for tile {serial}{why}",
-            where=f"calibration {self.name} ({self.id})",
-            expected=f"one of {known}",
-            remedy="Press the tile on the test rig and run `foottile calibrate`, or name another "
-            "calibration with --calibration",
+        return self.get_tiles([serial])[0]
+
+    def get_tiles(self, serials: Sequence[str]) -> list[TileCalibration]:
+        """Return the entries for serials, as `get_tile`.
+
+        Raises:
+            CalibrationError: one is missing.
+        """
+        if problem := self.describe_missing_tiles(serials):
+            raise CalibrationError(
+                problem,
+                where=f"calibration {self.name} ({self.id})",
+                remedy="Load these tiles too and fit all recordings with `foottile calibrate`, or "
+                "name another calibration with --calibration",
+            )
+        return [found for serial in serials if (found := self.find_tile(serial)) is not None]
+
+    def describe_missing_tiles(self, serials: Sequence[str]) -> str:
+        """Return which tiles it covers and which of the serials it does not; empty: it does all."""
+        missing = [serial for serial in serials if self.find_tile(serial) is None]
+        if not missing:
+            return ""
+        known = _format_serials([tile.serial for tile in self.tiles]) or "nothing"
+        text = f"it covers {known}, but not {_format_serials(missing)}"
+        refused = [serial for serial in missing if serial in self.refused]
+        return text + "".join(
+            f"; {serial} was refused: {self.refused[serial]}" for serial in refused
         )
 
     def find_mount_gain(self, serial: str) -> Parameter | None:
@@ -338,3 +356,9 @@ class WeightFacts(CalibrationPart):
         """Interpolate the half width of a new loading's 95 % interval; constant beyond the band."""
         grid = [point.gauge_kpa for point in self.band_95]
         return float(np.interp(gauge_kpa, grid, [point.new_loading_n for point in self.band_95]))
+
+
+def _format_serials(serials: Sequence[str]) -> str:
+    shown = ", ".join(serials[:_SHOWN_SERIALS])
+    more = len(serials) - _SHOWN_SERIALS
+    return f"{shown} and {more} more" if more > 0 else shown

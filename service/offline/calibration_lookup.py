@@ -81,8 +81,7 @@ def find_calibration(
             tiles=tuple(tile for entry in entries for tile in entry.tiles),
         )
     calibration = PRESETS[name]() if name in PRESETS else read_calibration(Path(name))
-    for serial in serials:
-        calibration.get_tile(serial)
+    calibration.get_tiles(serials)
     return calibration
 
 

@@ -41,7 +41,7 @@ export class Result {
     setText(byId("about"), result ? `Reference: ${weighing.reference}, ${tolerances(weighing.weights)}; ${localTime(new Date(result.date))}.` : "");
     byId("curves").replaceChildren(...refused.map((text) => el("p", { cls: "state bad", text })), ...(result?.tiles ?? []).map(card));
     byId("legend").hidden = !result;
-    setText(byId("misfit"), result?.misfit ? `Does not fit ${node}. ${result.misfit}.` : "");
+    setText(byId("misfit"), result?.misfit ? `Does not fit ${node}: ${result.misfit}.` : "");
     byId("accept").hidden = !result || Boolean(result.misfit);
     setText(byId("accept"), `Accept and use for ${node}`);
     setText(byId("save"), result ? "Save only" : "Close");

@@ -171,8 +171,11 @@ class WeighingResultView(View):
         """Return the result of a calibration for the tiles of a node."""
         misfit = None
         bearing = [tile.serial for tile in node.last_info.tiles if not tile.reference]
-        if lacking := [serial for serial in bearing if calibration.find_tile(serial) is None]:
-            misfit = f"It has no curve of {', '.join(lacking)}: calibrate all tiles in one go"
+        if missing := calibration.describe_missing_tiles(bearing):
+            misfit = (
+                f"{missing}. Calibrate all tiles in one go, or fit this recording and those of the "
+                "other tiles with `foottile calibrate`"
+            )
         else:
             try:
                 check_fits(node, calibration)

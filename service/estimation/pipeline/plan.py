@@ -145,7 +145,7 @@ def make_plan(
     if not len(bearing):
         raise UsageError("every tile of the array is a reference tile: nothing bears load")
     model_set = make_model_set(info, calibration, tare, models)
-    entries = [calibration.get_tile(info.tiles[i].serial) for i in bearing]
+    entries = calibration.get_tiles([info.tiles[i].serial for i in bearing])
     for i, entry in zip(bearing, entries, strict=True):
         tile = info.tiles[i]
         if entry.coefficient_words not in (None, tile.coefficient_words):

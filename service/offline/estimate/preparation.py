@@ -106,8 +106,7 @@ def _find_calibration(
     where = str(session.path)
     serials = [tile.serial for tile in session.info.tiles if not tile.reference]
     if isinstance(wanted, Calibration):
-        for serial in serials:
-            wanted.get_tile(serial)
+        wanted.get_tiles(serials)
         return wanted
     inside = None
     if "calibration" in notes:

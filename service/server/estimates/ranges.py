@@ -38,7 +38,7 @@ class TileRanges:
         """
         serials = info.serials
         bearing = [i for i, tile in enumerate(info.tiles) if not tile.reference]
-        curves = StaticCurves([calibration.get_tile(serials[i]) for i in bearing])
+        curves = StaticCurves(calibration.get_tiles([serials[i] for i in bearing]))
         gains = [calibration.find_mount_gain(serials[i]) for i in bearing]
         gain = np.array([1.0 if one is None else one.value for one in gains])
 

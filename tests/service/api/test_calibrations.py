@@ -247,7 +247,9 @@ def test_what_does_not_fit_the_tiles_is_refused_and_changes_nothing(
     running: Running, tared: FakeNode
 ) -> None:
     before = running.node()["calibration"]
-    assert_refused(assign(running, stiffer("T01")), 422, "does not fit", "T02")
+    assert_refused(
+        assign(running, stiffer("T01")), 422, "does not fit", "it covers T01, but not T02"
+    )
     body = {"id": NONE}
     assert_refused(running.http.put("/nodes/bench/calibration", json=body), 404, NONE)
     assert_refused(running.http.put("/nodes/nobody/calibration", json=body), 404, "nobody")

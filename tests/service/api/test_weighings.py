@@ -5,12 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
+from service.api.routes.weighings import WeighingResultView
 from service.estimation.dead_weights import parse_weight
 from service.server import weighing, weighings
+from tests.builders.arrays import make_array
+from tests.builders.calibrations import make_calibration, newton_tile
 from tests.service.fake_node import FakeNode, NodeOf, Play
 from tests.service.running import Running, ServeWith, assert_refused
 from tests.waiting import until
@@ -100,6 +104,13 @@ def test_tiles_are_calibrated_one_after_the_other_and_the_node_can_use_it(
     assert used.json()["calibration"]["name"] == "left leg"
     assert running.http.delete(URL).status_code == 204
     assert is_closed(running)
+
+
+def test_a_result_of_one_tile_says_what_it_does_not_cover() -> None:
+    node = SimpleNamespace(last_info=make_array(2))
+    view = WeighingResultView.of(make_calibration(newton_tile("T01")), cast("Any", node))
+    assert view.misfit is not None
+    assert view.misfit.startswith("it covers T01, but not T02. Calibrate all tiles in one go, or ")
 
 
 @pytest.mark.parametrize(

@@ -104,15 +104,15 @@ def test_an_edit_of_any_field_of_the_file_is_refused() -> None:
             at = at[key]
         at[path[-1]] = changed(at[path[-1]])
         with pytest.raises(CalibrationError) as caught:
-            Calibration.from_json(json.dumps(content), where="benchmark.json")
-        assert "benchmark.json" in str(caught.value), path
+            Calibration.from_json(json.dumps(content), where="bench.json")
+        assert "bench.json" in str(caught.value), path
 
 
 def test_an_edited_number_is_named_as_an_edit_and_not_as_a_format_error() -> None:
     calibration = make_calibration(newton_tile("T01"))
     text = calibration.to_json().replace('"repeats": 4', '"repeats": 5')
     with pytest.raises(CalibrationError, match="edited by hand or damaged") as caught:
-        Calibration.from_json(text, where="benchmark.json")
+        Calibration.from_json(text, where="bench.json")
     assert calibration.id in str(caught.value)
 
 
@@ -122,7 +122,7 @@ def test_an_edited_number_is_named_as_an_edit_and_not_as_a_format_error() -> Non
 )
 def test_a_text_that_is_no_calibration_is_refused_by_name(text: str) -> None:
     with pytest.raises(CalibrationError, match=r"bench\.json: not a calibration"):
-        Calibration.from_json(text, where="benchmark.json")
+        Calibration.from_json(text, where="bench.json")
 
 
 def test_an_unknown_field_and_a_missing_one_are_named() -> None:
@@ -177,8 +177,10 @@ def test_a_missing_serial_is_named_with_what_there_is_and_the_remedy() -> None:
     with pytest.raises(CalibrationError) as caught:
         calibration.get_tile("T07")
     text = str(caught.value)
-    assert "T07" in text
-    assert "T01, T02" in text
+    assert "it covers T01, T02, but not T07" in text
+    serials = [f"T0{number}" for number in range(1, 10)]
+    missing = calibration.describe_missing_tiles(serials)
+    assert missing == "it covers T01, T02, but not T03, T04, T05, T06 and 3 more"
     assert calibration.id in text
     assert "foottile calibrate" in text
 

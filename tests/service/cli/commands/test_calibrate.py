@@ -57,7 +57,7 @@ def test_a_tile_without_a_curve_is_named_and_the_others_are_written(run: Run, be
     assert "saturated" in printed["refused"]["T02"]
     assert "tile T02 refused" in outcome.err
     estimate = run("estimate", "bench.parquet", "--out", "e.parquet", "--calibration", "cal.json")
-    estimate.fails(1, "no calibration for tile T02: it was refused")
+    estimate.fails(1, "it covers T01, but not T02; T02 was refused: ")
 
 
 def test_an_assumed_scale_is_said_in_text_json_and_file(run: Run) -> None:
