@@ -49,6 +49,9 @@ def remove_recovery(
     """
     begin_t_ns = tare.t_ns - round((tare.end_s - tare.begin_s) * 1e9)
     first = int(np.searchsorted(frames.t_ns, begin_t_ns - HISTORY_NS))
+    begin = int(np.searchsorted(frames.t_ns, begin_t_ns))
+    if begin == first:  # no load is known before it
+        return tare
     end = int(np.searchsorted(frames.t_ns, tare.t_ns, side="right"))
     plan = make_plan(info, calibration, tare, models=models, lag_ms=LIVE_LAG_MS)
     estimator = Estimator(plan)
@@ -56,7 +59,7 @@ def remove_recovery(
     last = estimator.finish()
     force_n = due.force_n if last is None else np.concatenate([due.force_n, last.force_n])
     columns = plan.load_bearing_columns
-    force_n = force_n[np.searchsorted(frames.t_ns, begin_t_ns) - first :, columns]
+    force_n = force_n[begin - first :, columns]
     known = np.isfinite(force_n)
     left_n = np.where(known, force_n, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
     baseline_kpa, sigma_kpa = tare.baseline_kpa.copy(), tare.baseline_sigma_kpa.copy()
