@@ -67,6 +67,11 @@ def test_every_flag_has_its_texts(name: str) -> None:
     assert set(texts) == set(flags)
 
 
+def test_a_tile_whose_pressure_is_unknown_is_one_that_is_not_used() -> None:
+    unknown = [flag for flag, text in TILE_FLAGS.items() if text.severity == "unknown"]
+    assert sum(unknown) == TileFlag.UNUSABLE
+
+
 def test_the_pages_have_bits_and_titles_of_the_table() -> None:
     assert written(ROOT / "web/common/flags.js", "", script()) == script()
 

@@ -234,11 +234,9 @@ def is_increasing_cubic(
 ) -> bool:
     """Return whether the cubic rises all over a range, by its slope at ends and vertex."""
     _, c1, c2, c3 = coefficients
-    places = list(scaled_pressure_range)
-    if (
-        c3 != 0.0
-        and scaled_pressure_range[0] < (vertex := -c2 / (3 * c3)) < scaled_pressure_range[1]
-    ):
+    low, high = scaled_pressure_range
+    places = [low, high]
+    if c3 != 0.0 and low < (vertex := -c2 / (3 * c3)) < high:
         places.append(vertex)
     return all(c1 + u * (2 * c2 + u * 3 * c3) > 0.0 for u in places)
 

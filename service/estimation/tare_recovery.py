@@ -16,10 +16,9 @@ from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
 from service.estimation.estimate import Estimator
 from service.estimation.pipeline.plan import make_plan
+from service.estimation.tare.automatic import HISTORY_NS
 from service.estimation.tare.tare import Tare
 
-HISTORY_NS = 10_000_000_000
-"""Time before a tare whose loads are considered."""
 RECOVERY_UNCERTAINTY = 0.5
 """Uncertain part of the removed pressure: the models' own misfit, and loads before the history."""
 

@@ -107,7 +107,7 @@ class NodeIdentities:
         """Refuse a false claim; return whether it is proven, False if the node has no secret here.
 
         Raises:
-            CloseConnection: (same text)
+            CloseConnection: the name belongs to another machine.
             StorageError: as `read_secret_or_set_aside`.
         """
         node, answer = claim.node, claim.proof

@@ -1,11 +1,11 @@
 // Reading of one tile in one unit: value, bound, or the reason for none.
 
-import { TILE_FLAGS } from "../common/flags.js";
+import { TILE, TILE_FLAGS } from "../common/flags.js";
 
 const FALLBACK = { kPa: 15, N: 30 };
 
 /** @type {[bit: number, state: string, text: string][]} */
-const FAULTS = TILE_FLAGS.map(([bit, title]) => [bit, title.replace(" ", "_"), title]);
+const FAULTS = TILE_FLAGS.map(([bit, title]) => [bit, Object.keys(TILE).find((name) => TILE[name] === bit).toLowerCase(), title]);
 export const FAULT_STATES = new Set(FAULTS.map(([, state]) => state));
 
 /** Return the unit of a tile: a reference tile bears no load, so it has no newtons. */

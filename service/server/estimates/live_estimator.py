@@ -212,7 +212,7 @@ class LiveEstimator:
             anchor: tare with which an automatic one is compared; None without a tare.
         """
         calibration, tare = self._calibration, self.tare
-        if calibration is None or not self._recent:
+        if calibration is None or not self._recent or is_compiling():
             return FlightTareResult()
         frames = FrameBatch.concatenate(list(self._recent))
         if tare is None:
@@ -247,7 +247,7 @@ class LiveEstimator:
 
     def _tare_frames(self, frames: FrameBatch, calibration: Calibration) -> TareFrames:
         info = self._info
-        # While the models are being compiled, an estimate would block the event loop.
+        # While the models are being compiled, an estimate would wait, and the event loop with it.
         removal = (
             None
             if is_compiling()

@@ -72,7 +72,7 @@ class LosslessCursor:
         """Return the next event and go on to the one after; None: nothing yet.
 
         Raises:
-            CloseConnection: (same text)
+            CloseConnection: the reader cannot go on; the reason has the position to resume from.
         """
         memory = self._buffer
         if (position := self.position) is None:

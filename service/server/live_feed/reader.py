@@ -36,7 +36,7 @@ def start_position(
     """Return the first frame for a reader; None: the next one that comes.
 
     Raises:
-        CloseConnection: (same text)
+        CloseConnection: no stream has this id.
     """
     if stream_id is None and from_seq is None:
         return None
