@@ -203,8 +203,8 @@ async def _watch(
         if big is not None:
             url = f"{server.url}/api/v1{big}"
             downloading = await big_download.begun(url, options.download_mb_s)
-        end_s = time.monotonic() + options.seconds
         before = await asyncio.to_thread(Look.at, server)
+        end_s = time.monotonic() + options.seconds
         while time.monotonic() < end_s:
             ages_ms = screens[0].ages_ms if screens else []
             ages_ms.clear()

@@ -195,6 +195,7 @@ def test_a_stop_in_the_middle_of_what_has_not_come_yet_waits_for_it(
     assert whole_parts_of(sealed) == [(tared.stream_id, 70, 149)]
 
 
+@pytest.mark.real_time
 def test_a_stop_among_frames_that_are_lost_is_placed_by_the_rate(tared: FakeNode) -> None:
     session = tared.record()
     tared.deliver(50)
