@@ -228,12 +228,26 @@ def test_of_a_stance_that_was_not_seen_whole_the_line_says_so(
     page.tap("#stance-next")
     expect(page.locator("#stance-text")).to_contain_text("start not recorded")
     row = page.locator("#stances-rows tr").first
-    expect(row.get_by_text("start not recorded")).to_be_visible()
+    expect(row.get_by_text("⚠ cut")).to_be_visible()
+    expect(row.locator(".why")).to_have_attribute("title", "start not recorded")
     page.tap("#stance-next")
     expect(page.locator("#stance-which")).to_have_text("Stance 2 of 2")
     expect(page.locator("#stance-flags")).to_be_empty()
     assert page.evaluate("document.documentElement.scrollWidth") == PHONE["width"]
     assert complaints(page) == []
+
+
+def test_a_laptop_shows_four_rows_of_stances_and_the_foot(
+    hops: Recording, open_page: OpenPage
+) -> None:
+    page = opened(open_page, hops)
+    box = page.locator("#stances-scroll").bounding_box()
+    fourth = page.locator("#stances-rows tr").nth(3).bounding_box()
+    assert box is not None
+    assert fourth is not None
+    assert fourth["y"] + fourth["height"] <= box["y"] + box["height"]
+    for part in ("#grf", "#contact", "#foot", "#cop"):
+        expect(page.locator(part)).to_be_in_viewport(ratio=1)
 
 
 def test_a_phone_is_not_told_of_keys(hops: Recording, open_page: OpenPage) -> None:

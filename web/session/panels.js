@@ -13,7 +13,7 @@ const TITLE_PX = 19; // above a plot; tiles have it inside
  * @property {"series" | "heat"} kind
  * @property {[string, string]} [columns] min and max
  * @property {[string, string]} [band] interval around it
- * @property {string} [note] after the title
+ * @property {string} [note] after the title; a phone has room for three words
  * @property {string} [bound] column of the lower bound
  * @property {string} [group] panels with a common scale
  * @property {number} [factor] from the column's unit to the one shown
@@ -88,7 +88,7 @@ export function panelsOf(bins, asHeat, beside = null) {
 }
 
 /** Return a note if a coordinate of the COP is not measured: across a single row of tiles. */
-const unmeasured = (bins, axis) => (bins.has(`cop_${axis}_m_max`) ? {} : { note: `COP ${axis} not measured: tiles in one row` });
+const unmeasured = (bins, axis) => (bins.has(`cop_${axis}_m_max`) ? {} : { note: `${axis} not measured` });
 
 /** Return true if a coordinate changes: on a line of tiles one is constant. */
 function isVariable(bins, stem) {

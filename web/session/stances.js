@@ -28,6 +28,14 @@ function flagsOf(stance) {
   return texts.join(", ");
 }
 
+/** Make the sign of a stance's faults: one word in the table; all of them in its title and to screen readers. */
+function faultSign(stance) {
+  const text = flagsOf(stance);
+  if (!text) return "";
+  const word = !stance.begun || !stance.ended ? " cut" : stance.missing_frames || stance.unknown_frames ? " gaps" : "";
+  return el("small", { cls: "why", title: text }, el("span", { "aria-hidden": "true", text: `⚠${word}` }), el("span", { cls: "unseen", text }));
+}
+
 /** Return the index of the stance at an instant; -1: none. Stances are sorted by time. */
 export function stanceAt(stances, timeS) {
   return timeS === null ? -1 : stances.findIndex(({ from, to }) => timeS >= from - EDGE_S && timeS <= to + EDGE_S);
@@ -106,8 +114,7 @@ export class Stances {
         const [value, interval] = figureOf(stance, figure);
         return el("td", { role: "cell" }, `${value} `, el("small", { text: interval }));
       }),
-      el("td", { role: "cell", text: timeText(stance.from, 0.01) }),
-      el("td", { role: "cell", cls: "why", text: flagsOf(stance) }));
+      el("td", { role: "cell" }, timeText(stance.from, 0.01), faultSign(stance)));
     row.addEventListener("click", () => this.onGo(index));
     return row;
   }
