@@ -83,12 +83,12 @@ export class Beside {
     return columns ? bins.extremes(...columns, ...bins.within(view)) : null;
   }
 
-  draw(context, key, view, x, y, colour) {
+  draw(context, key, view, x, y, colour, widthPx) {
     const columns = this.columns[key];
     if (!columns) return;
     const bins = this.best(view);
     const [begin, end] = bins.within(view);
-    drawSeries(context, bins, Math.max(0, begin - 1), Math.min(bins.count, end + 1), x, y, columns, colour);
+    drawSeries(context, bins, Math.max(0, begin - 1), Math.min(bins.count, end + 1), x, y, columns, colour, widthPx);
   }
 
   /**

@@ -20,6 +20,12 @@ const NAMES = [
 ];
 const CONTACT = 2;
 
+function clipTo(context, box, left, right) {
+  context.beginPath();
+  context.rect(left, box.top - 3, right - left, box.bottom - box.top + 6);
+  context.clip();
+}
+
 /** Canvas of the plots. */
 export class Plots {
   constructor() {
@@ -112,12 +118,16 @@ export class Plots {
       return { panel, box, y: this.drawPanel(context, panel, box, view, x, scales.get(panel.group ?? panel.key)) };
     });
     this.drawFlags(context, view, x);
-    const force = this.drawn.find(({ panel }) => panel.key === "grf");
-    if (force) drawPeaks(this, context, view, x, force.box, force.y);
+    this.drawPeaks(context, view, x);
     drawTime(this, context, view, x, bottom);
     drawMarkers(this, context, view, x, bottom);
     setData(this.box, "framesInBin", String(this.best(view).framesInBin));
     setData(this.box, "kinds", this.shownKinds.map(({ key }) => key).join(" "));
+  }
+
+  drawPeaks(context, view, x) {
+    const force = this.drawn.find(({ panel }) => panel.key === "grf");
+    if (force) drawPeaks(this, context, view, x, force.box, force.y);
   }
 
   drawPanel(context, panel, box, view, x, scale) {
@@ -130,37 +140,42 @@ export class Plots {
       const shown = (value) => box.bottom - ((value - scale.low) / (scale.high - scale.low)) * (box.bottom - box.top);
       y = (value) => shown(value * factor);
       this.drawScale(context, box, scale, shown);
-      for (const [bins, from, to] of panel.besideOnly ? [] : this.layers(view)) {
-        const [begin, end] = bins.within({ from, to });
-        context.save();
-        context.beginPath();
-        context.rect(x(from), box.top - 3, x(to) - x(from), box.bottom - box.top + 6);
-        context.clip();
-        // One bin more on both sides: lines run to the edges.
-        const [b, e] = [Math.max(0, begin - 1), Math.min(bins.count, end + 1)];
-        if (panel.key === "grf") this.drawContact(context, bins, b, e, x, box);
-        const isCop = panel.key.startsWith("cop");
+      const isCop = panel.key.startsWith("cop");
+      const layers = panel.besideOnly ? [] : this.layers(view);
+      this.drawLayers(context, box, layers, x, (bins, begin, end) => {
+        if (panel.key === "grf") this.drawContact(context, bins, begin, end, x, box);
         if (isCop) context.globalAlpha = 0.3;
-        if (panel.band) drawBand(context, bins, b, e, x, y, panel.band, isCop ? colours.cop : colours.interval);
-        context.globalAlpha = 1;
-        drawSeries(context, bins, b, e, x, y, panel.columns, isCop ? colours.cop : colours.series);
-        if (panel.bound) drawBound(context, bins, b, e, x, y, panel.bound, colours["warn-line"]);
-        context.restore();
-      }
+        if (panel.band) drawBand(context, bins, begin, end, x, y, panel.band, isCop ? colours.cop : colours.interval);
+      });
       this.drawBeside(context, panel, box, view, x, y);
+      this.drawLayers(context, box, layers, x, (bins, begin, end) => {
+        drawSeries(context, bins, begin, end, x, y, panel.columns, isCop ? colours.cop : colours.series);
+        if (panel.bound) drawBound(context, bins, begin, end, x, y, panel.bound, colours["warn-line"]);
+      });
     }
     this.drawTitle(context, panel, box);
     return y;
   }
 
+  /** Draw each layer within its part of the time axis. */
+  drawLayers(context, box, layers, x, draw) {
+    for (const [bins, from, to] of layers) {
+      const [begin, end] = bins.within({ from, to });
+      context.save();
+      clipTo(context, box, x(from), x(to));
+      // One bin more on both sides: lines run to the edges.
+      draw(bins, Math.max(0, begin - 1), Math.min(bins.count, end + 1));
+      context.restore();
+    }
+  }
+
+  /** Draw the overlay below this session's series, wider, so that both show where they agree. */
   drawBeside(context, panel, box, view, x, y) {
     if (!this.beside?.columns[panel.key]) return;
     context.save();
-    context.beginPath();
-    context.rect(box.left, box.top - 3, box.right - box.left, box.bottom - box.top + 6);
-    context.clip();
-    context.globalAlpha = panel.besideOnly ? 1 : 0.7; // keep ours visible below
-    this.beside.draw(context, panel.key, view, x, y, panel.besideOnly ? this.colours.text : this.colours.other);
+    clipTo(context, box, box.left, box.right);
+    const [colour, widthPx] = panel.besideOnly ? [this.colours.text, 1.5] : [this.colours.other, 3.5];
+    this.beside.draw(context, panel.key, view, x, y, colour, widthPx);
     context.restore();
   }
 
@@ -274,6 +289,7 @@ export class Plots {
     context.moveTo(x(timeS), HEAD_PX - 6);
     context.lineTo(x(timeS), bottom + 5);
     context.stroke();
+    this.drawPeaks(context, view, x); // again, as the line hides them
     if (i < 0) return;
     for (const { panel, y } of this.drawn) {
       const value = y && bins.columns[panel.columns[1]]?.[i];

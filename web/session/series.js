@@ -43,7 +43,7 @@ export function drawBand(context, bins, begin, end, x, y, [lowName, highName], c
 }
 
 /** Draw a quantity: min-max columns keep every peak; single frames as dots and lines. */
-export function drawSeries(context, bins, begin, end, x, y, [lowName, highName], colour) {
+export function drawSeries(context, bins, begin, end, x, y, [lowName, highName], colour, widthPx = 1.5) {
   const [lows, highs] = [bins.columns[lowName], bins.columns[highName]];
   context.fillStyle = context.strokeStyle = colour;
   context.lineJoin = "round";
@@ -51,13 +51,13 @@ export function drawSeries(context, bins, begin, end, x, y, [lowName, highName],
     && (x(bins.last[end - 1]) - x(bins.first[begin])) / (end - begin) > 5;
   for (const [start, stop] of runs(bins, begin, end, (i) => lows[i] !== null && highs[i] !== null)) {
     if (bins.framesInBin > 1) {
-      context.lineWidth = 1;
+      context.lineWidth = widthPx - 0.5; // beside the filled area
       outline(context, bins, [start, stop], x, y, lows, highs);
       context.fill();
       context.stroke();
       continue;
     }
-    context.lineWidth = 1.5;
+    context.lineWidth = widthPx;
     context.beginPath();
     for (let i = start; i < stop; i++) context.lineTo(x(bins.first[i]), y(highs[i]));
     context.stroke();

@@ -15,7 +15,7 @@ const updateSession = (session) => sessions.update(session);
 
 function removeSession(id) {
   sessions.drop(id);
-  trash.reload();
+  trash.load();
 }
 
 const trash = new Trash(updateSession);
@@ -24,7 +24,7 @@ const sessions = new Sessions({ onSession: updateSession, onDeleted: removeSessi
 const handlers = {
   hello() {
     sessions.reload();
-    trash.reload();
+    trash.load();
     look(); // the login may have ended with the server
   },
   session: ({ session }) => updateSession(session),

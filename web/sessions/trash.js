@@ -1,23 +1,18 @@
-// Trash: deleted sessions, to restore or to delete permanently. Loaded when opened.
+// Trash: deleted sessions, to restore or to delete permanently.
 
 import * as api from "../common/api.js";
 import { ask } from "../common/dialogs.js";
 import { notice, quietly, withdraw } from "../common/notices.js";
 import { byId, bytes, el, localTime, setText } from "../common/text.js";
 
+const countOf = (items) => `${items.length} session${items.length === 1 ? "" : "s"}`;
+
 /** List of deleted sessions. */
 export class Trash {
   /** `onRestored(session)` receives a restored session. */
   constructor(onRestored) {
     this.onRestored = onRestored;
-    this.card = byId("trash-card", HTMLDetailsElement);
-    this.card.addEventListener("toggle", () => this.card.open && this.load());
     byId("trash-empty").addEventListener("click", () => this.empty());
-  }
-
-  /** Load again after a change, while it is open. */
-  reload() {
-    if (this.card.open) this.load();
   }
 
   async load() {
@@ -26,7 +21,7 @@ export class Trash {
       this.items = items;
       byId("trash").replaceChildren(...items.map((session) => this.row(session)));
       byId("trash-empty").hidden = !items.length;
-      setText(byId("trash-legend"), items.length ? "deleted sessions, can be restored" : "empty");
+      setText(byId("trash-legend"), items.length ? `${countOf(items)}, can be restored` : "empty");
     });
   }
 
@@ -51,8 +46,7 @@ export class Trash {
   }
 
   async empty() {
-    const count = this.items?.length ?? 0;
-    const what = count === 1 ? "1 session" : `${count} sessions`;
+    const what = countOf(this.items ?? []);
     if (!await ask("Empty the trash?", `${what} will be deleted permanently.`, `Delete ${what}`)) return;
     await quietly(async () => {
       const emptied = await api.emptyTrash();
