@@ -27,11 +27,11 @@ from scipy.signal import lfilter
 from devices.arrays import Floats
 from devices.errors import ComparisonError
 from devices.scene.scene_file import load_scene
-from service.offline.benchmark.draws import compute_estimates, record_with_calibration
 from service.offline.calibration_lookup import find_calibration
 from service.offline.compare.alignment import Alignment, align_signals
 from service.offline.compare.signals import ForceSignal
 from storage.formats.load_trace import read_load_trace
+from studies.benchmark.draws import compute_estimates, record_with_calibration
 
 MARK = "<!-- tables -->"
 PARAMETERS = ("lag_s", "drift_ppm", "offset_n", "scale")

@@ -20,7 +20,10 @@ from devices.emulation.ground.load_trace import CopTransform
 from devices.scene.scene_file import Scene, load_scene
 from service.estimation.calibration import PRESETS
 from service.estimation.pipeline.model_set import MODEL_NAMES
-from service.offline.benchmark.draws import (
+from service.offline.calibration_lookup import find_calibration
+from service.rig.emulated_foot import EmulatedFoot
+from storage.formats.load_trace import read_load_trace
+from studies.benchmark.draws import (
     BATCH_FRAMES,
     LAGS_MS,
     DrawRecording,
@@ -29,15 +32,12 @@ from service.offline.benchmark.draws import (
     record_with_calibration,
     time_model_sets,
 )
-from service.offline.benchmark.figures import (
+from studies.benchmark.figures import (
     ModelSetFigures,
     find_pareto_front,
     summarize_model_sets,
 )
-from service.offline.benchmark.model_sets import ComparedModelSet, list_model_sets
-from service.offline.calibration_lookup import find_calibration
-from service.rig.emulated_foot import EmulatedFoot
-from storage.formats.load_trace import read_load_trace
+from studies.benchmark.model_sets import ComparedModelSet, list_model_sets
 
 MARK = "<!-- tables -->"
 FRAMES = {"live": 1000, "offline": 8 * BATCH_FRAMES["offline"]}

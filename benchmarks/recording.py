@@ -29,7 +29,7 @@ from recording_sealing import sealed
 from recording_sizes import sizes
 from recording_turns import slices, writing
 
-from service.offline.benchmark.run import describe_machine
+from studies.benchmark.run import describe_machine
 
 Lines = list[str]
 

@@ -51,7 +51,7 @@ from devices.text import escape_control_chars
 
 Extra = Literal["server", "client", "emulation", "plot", "gpio", "rig", "archive", "mocap", "mcap"]
 
-OUR_PACKAGES = ("devices", "storage", "service", "foottile")
+OUR_PACKAGES = ("devices", "storage", "service", "studies", "foottile")
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDERS = ("devices", "foottile", "service", "storage")
+FOLDERS = ("devices", "foottile", "service", "storage", "studies")
 
 OPENING = re.compile(
     r"(What|Who|Whose|Whether|Which|Is|Are|Has|Have|Does|Do|May|Can|Of|It|They|Those|One of|As|"

@@ -239,7 +239,7 @@ DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 
 
 def sources() -> Iterator[Path]:
-    for folder in ("devices", "storage", "service", "tests", "benchmarks"):
+    for folder in ("devices", "storage", "service", "studies", "tests", "benchmarks"):
         yield from sorted((ROOT / folder).rglob("*.py"))
 
 

@@ -87,7 +87,7 @@ def test_no_other_place_reads_a_variable_of_ours() -> None:
         ROOT / "foottile" / "environment.py",
         # It passes its whole environment on, and names the token for the node that it starts.
         ROOT / "service" / "cli" / "commands" / "demo.py",
-        ROOT / "service" / "cli" / "laboratory.py",
+        ROOT / "studies" / "reproduce" / "laboratory.py",
         # Read or set for a library.
         ROOT / "devices" / "jit.py",
         ROOT / "service" / "memory.py",
@@ -96,7 +96,7 @@ def test_no_other_place_reads_a_variable_of_ours() -> None:
     }
     found = {
         path
-        for folder in ("devices", "storage", "service", "foottile")
+        for folder in ("devices", "storage", "service", "studies", "foottile")
         for path in (ROOT / folder).rglob("*.py")
         if "environ" in path.read_text().replace("environment", "") or "getenv(" in path.read_text()
     }

@@ -105,7 +105,7 @@ def _row(name: str, outcome: Outcome, seconds: float, seed: int) -> str:
 
 def _commit() -> str:
     """The one that is checked out; with a + if code was changed since."""
-    code = ("devices", "storage", "service", "web", "tests")
+    code = ("devices", "storage", "service", "studies", "web", "tests")
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], cwd=_ROOT, capture_output=True, text=True
     )

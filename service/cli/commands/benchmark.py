@@ -135,11 +135,11 @@ def benchmark_command(
                 as_json=as_json,
             )
         return
-    from service.offline.benchmark.plot import plot_benchmark
-    from service.offline.benchmark.report import format_benchmark_report
-    from service.offline.benchmark.run import BenchmarkOptions, run_benchmark
     from service.offline.figure_output import create_figure
     from storage.durable_files import write_atomically
+    from studies.benchmark.plot import plot_benchmark
+    from studies.benchmark.report import format_benchmark_report
+    from studies.benchmark.run import BenchmarkOptions, run_benchmark
 
     scenes = tuple(load_scene(name) for name in scene or SCENES)
     names = [the_scene.name for the_scene in scenes]

@@ -51,17 +51,17 @@ def benchmark_broad(
         UsageError: no such seeds.
         Exit: 3, for a missing result, or with `check_goals` a missed goal.
     """
-    from service.offline.benchmark.broad.figures import (
+    from service.offline.figure_output import create_figure
+    from storage.durable_files import write_atomically
+    from studies.broad.figures import (
         compare_with_goals,
         count_models,
         summarize_cases,
     )
-    from service.offline.benchmark.broad.plot import plot_broad
-    from service.offline.benchmark.broad.report import format_broad_report
-    from service.offline.benchmark.broad.results import Seeds
-    from service.offline.benchmark.broad.run import BroadOptions, run_broad_benchmark
-    from service.offline.figure_output import create_figure
-    from storage.durable_files import write_atomically
+    from studies.broad.plot import plot_broad
+    from studies.broad.report import format_broad_report
+    from studies.broad.results import Seeds
+    from studies.broad.run import BroadOptions, run_broad_benchmark
 
     choices: dict[str, Seeds] = {name: name for name in get_args(Seeds)}
     if seeds not in choices:

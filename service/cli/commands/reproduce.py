@@ -54,12 +54,12 @@ def reproduce_command(
     force plate. Node and server are processes, over loopback and in real time. Exit codes: 0
     success, 1 failure, 2 wrong usage, 3 written, but with missing results.
     """
-    from service.cli.reproduction import QUICK_TRIALS, ReproduceOptions, run_reproduction
     from service.offline.figure_output import create_figure
-    from service.offline.reproduce.figures import draw_figures
-    from service.offline.reproduce.report import format_reproduction_report
-    from service.offline.reproduce.setups import TRIALS
     from storage.durable_files import write_atomically
+    from studies.reproduce.figures import draw_figures
+    from studies.reproduce.report import format_reproduction_report
+    from studies.reproduce.run import QUICK_TRIALS, ReproduceOptions, run_reproduction
+    from studies.reproduce.trials import TRIALS
 
     create_figure(1.0, 1.0)  # reports a missing package early
     options = ReproduceOptions(

@@ -10,8 +10,8 @@ import pytest
 
 from devices.errors import FootTileError
 from service.estimation.calibration import Calibration
-from service.offline.benchmark import draws
 from service.offline.calibration_lookup import find_calibration
+from studies.benchmark import draws
 from tests.service.cli.outcome import Run, scene_text, static_only
 
 pytestmark = pytest.mark.slow

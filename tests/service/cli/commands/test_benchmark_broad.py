@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from service.offline.benchmark.broad import run
-from service.offline.benchmark.broad.arrays import ArrayTask
-from service.offline.benchmark.broad.results import ArrayResult, RefusedItem
+from studies.broad import run
+from studies.broad.arrays import ArrayTask
+from studies.broad.results import ArrayResult, RefusedItem
 from tests.service.cli.outcome import Run
-from tests.service.offline.benchmark.broad.kept import made
+from tests.studies.broad.kept import made
 
 pytestmark = pytest.mark.slow
 
@@ -45,7 +45,7 @@ def test_seeds_of_judgement_have_to_be_asked_for(run: Run, tmp_path: Path, quick
 def test_what_gave_no_result_is_named_and_code_3(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from service.offline.benchmark.broad import run as broad_run
+    from studies.broad import run as broad_run
 
     def refused(task: ArrayTask) -> ArrayResult:
         refusal = RefusedItem(what="calibration of T02", why="it drifts")

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from devices.errors import FootTileError
-from service.cli import reproduction
-from service.cli.laboratory import Laboratory, RecordingJob
+from studies.reproduce import run as reproduction
+from studies.reproduce.laboratory import Laboratory, RecordingJob
 from tests.service.cli.outcome import Run
 
 pytestmark = pytest.mark.slow

@@ -1,0 +1,1 @@
+"""Studies of FootTile: benchmarks of its models, and the paper's experiments again. No product."""
