@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from devices.errors import DamagedFramesError, FileFormatError
 from devices.text import escape_control_chars
-from service.sessions.part_end import SessionStream, find_seqs_around
+from service.sessions.part_end import SeqsAround, SessionStream, find_seqs_around
 from storage.checksummed_json import read_checksummed_json
 from storage.durable_files import ASIDE_SUFFIX, remove_dead_process_temporaries
 from storage.intervals import CORRUPT, NO_END, Intervals, Losses
@@ -62,9 +61,15 @@ class OpenedStream:
             missed_slots=notes.missed_slots,
             info=self.journal.info,
             journal=self.journal,
-            find_seqs_around=partial(find_seqs_around, self.journal),
+            find_seqs_around=self._find_seqs_around,
             offset_ns=0 if self.is_node_folder else measured_ns,  # a node stops by its own clock
         )
+
+    def _find_seqs_around(
+        self, t_ns: int, *, min_seq: int, may_be_stale: bool = False
+    ) -> SeqsAround | None:
+        del may_be_stale  # nothing is cached here
+        return find_seqs_around(self.journal, t_ns, min_seq=min_seq)
 
     def save_damage(self) -> None:
         """Save the damage found: once cut off, no other record exists.

@@ -177,7 +177,7 @@ class FeedReader:
         if step.until_seq is not None and last >= step.until_seq:  # the buffer has the rest
             found = slice_batch(found, 0, step.until_seq - first)
         rows = FrameRows(position.stream_id, found, is_recomputed=True)
-        self._cursor.mark_sent(rows)
+        self._cursor.position = Position(rows.stream_id, rows.last_seq + 1)
         return rows
 
     def _unreadable_error(self, at: Position, why: object) -> CloseConnection:
