@@ -99,10 +99,7 @@ def _subtract_recovery(
     since_s = (soak_ns - ends_ns[last]) * 1e-9
     t_s = np.concatenate([points.t_s, points.t_s[-1] + since_s])
     force_n = np.concatenate([points.force_n, np.zeros(len(since_s))])
-    left_kpa = (
-        model.compute_pressures_and_force_lag(t_s, force_n)[len(points.t_s) :, 0]
-        - model.baseline_kpa
-    )
+    left_kpa = model.compute_response(t_s, force_n).kpa[len(points.t_s) :] - model.baseline_kpa
     return replace(soaking, kpa=soaking.kpa - left_kpa)
 
 
@@ -245,8 +242,7 @@ def replay_release_and_tap(
     late_s += 0.0 if effects.late_s is None else effects.late_s.value
     force_n = make_clamped_pchip_force(points.t_s, points.force_n)(points.t_s + late_s)
     static_kpa, modelled_kpa = (
-        each.compute_pressures_and_force_lag(points.t_s, force_n)[:, 0] - baseline_kpa
-        for each in (static, model)
+        each.compute_response(points.t_s, force_n).kpa - baseline_kpa for each in (static, model)
     )
     measured_kpa = points.kpa - baseline_kpa
     found: dict[str, ReplaySection] = {}
