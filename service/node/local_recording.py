@@ -146,7 +146,7 @@ class LocalRecording:
     def _find_interrupted_session(self) -> Session | None:
         """Find the newest interrupted session of this name that no other one continues."""
         for session in self._unsealed:
-            is_its_own = self._name in (session.name, split_number(session.name)[0])
+            is_its_own = self._name in (session.name, split_number(session.name).given)
             if is_its_own and session.state != "pending":
                 return session
         return None

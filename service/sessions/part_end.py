@@ -25,12 +25,10 @@ from storage.sessions.ledger import StreamState
 
 
 class SeqsAround(NamedTuple):
-    """Numbers of the stored frames next to a time."""
+    """Stored frames next to a time; `last` is one less than the first that counts if none is."""
 
     last: int
-    """Last frame until it; one less than the first that counts if there is none."""
     after: int
-    """First frame after it."""
 
 
 class SeqsAroundFinder(Protocol):

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from devices.errors import DamagedFramesError, FileFormatError
 from devices.text import escape_control_chars
@@ -113,9 +113,16 @@ class OpenedStream:
                 return
 
 
+class MendedStreams(NamedTuple):
+    """Streams by node and stream id, and failures as text."""
+
+    streams: dict[tuple[str, str], OpenedStream]
+    problems: list[str]
+
+
 def open_and_mend_streams(
     data: Path, report_step: Callable[[str], None], *, is_node_folder: bool
-) -> tuple[dict[tuple[str, str], OpenedStream], list[str]]:
+) -> MendedStreams:
     """Open and mend every journal of a data folder: cut off partial batches, sync the rest.
 
     Args:
@@ -123,14 +130,11 @@ def open_and_mend_streams(
         report_step: called with a description of each step.
         is_node_folder: True: a node's own folder.
 
-    Returns:
-        Streams by node and stream id, and failures as text.
-
     Raises:
         StorageError: the disk is full or not writable.
     """
-    streams: dict[tuple[str, str], OpenedStream] = {}
-    problems: list[str] = []
+    mended = MendedStreams({}, [])
+    problems = mended.problems
     for folder in sorted((data / "journal").glob("*/*")):
         if not folder.is_dir() or not (
             (folder / NOTES_FILE).exists() or any(folder.glob("*" + SUFFIX))
@@ -149,8 +153,8 @@ def open_and_mend_streams(
             continue
         stream = OpenedStream(journal, notes, journal.lost.numbers, is_node_folder)
         stream.save_damage()
-        streams[(folder.parent.name, folder.name)] = stream
-    return streams, problems
+        mended.streams[folder.parent.name, folder.name] = stream
+    return mended
 
 
 def read_hello_or_empty(data: Path, node: str) -> dict[str, Any]:

@@ -32,14 +32,11 @@ _FLATTEST = 0.05
 
 
 class DomeResponse(NamedTuple):
-    """Pressures of a tile under n forces, and how far its force lags."""
+    """Absolute pressure, that without the gas' heat, and force less apparent force; (n,) each."""
 
     kpa: Floats
-    """(n,), absolute pressure."""
     isothermal_kpa: Floats
-    """(n,), pressure without the gas' heat."""
     force_lag_n: Floats
-    """(n,), force less the apparent force."""
 
 
 @dataclass(frozen=True)

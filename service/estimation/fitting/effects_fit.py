@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -52,7 +53,7 @@ def fit_effects(
         reference_delay: of the reference; `late_s` of the answer contains it (see
             `separate_delays`).
     """
-    points, baseline_kpa = collect_loadings_and_baseline_kpa(recordings)
+    points, baseline_kpa = collect_loadings(recordings)
     noise_kpa = float(
         np.mean([measure_initial_unloaded(each).noise_kpa for each in select_loaded(recordings)])
     )
@@ -173,10 +174,15 @@ def _center_curve(effects: Effects) -> Effects:
     return effects.model_copy(update={"rubber": in_u})
 
 
-def collect_loadings_and_baseline_kpa(
-    recordings: Sequence[Indentation],
-) -> tuple[LoadingPoints, float]:
-    """Collect every loading of a tile, shifted to one common baseline, and that baseline in kPa."""
+class TileLoadings(NamedTuple):
+    """All loadings of a tile, shifted to one common baseline."""
+
+    points: LoadingPoints
+    baseline_kpa: float
+
+
+def collect_loadings(recordings: Sequence[Indentation]) -> TileLoadings:
+    """Collect every loading of a tile, shifted to one common baseline."""
     recordings = select_loaded(recordings)
     zeros = [measure_initial_unloaded(recording) for recording in recordings]
     baseline_kpa = float(np.mean([zero.baseline_kpa for zero in zeros]))
@@ -184,7 +190,7 @@ def collect_loadings_and_baseline_kpa(
     for recording, zero in zip(recordings, zeros, strict=True):
         part = extract_loading_points(recording, zero)
         parts.append(replace(part, kpa=part.kpa - (zero.baseline_kpa - baseline_kpa)))
-    return join_loading_points(parts), baseline_kpa
+    return TileLoadings(join_loading_points(parts), baseline_kpa)
 
 
 def convert_centred_cubic_to_unit(coefficients: Sequence[float]) -> Floats:
@@ -228,7 +234,7 @@ def replay_release_and_tap(
     """
     if not any(np.isin(recording.phase, ("release", "tap")).any() for recording in recordings):
         return {}
-    points, baseline_kpa = collect_loadings_and_baseline_kpa(recordings)
+    points, baseline_kpa = collect_loadings(recordings)
     effects = tile.effects
     # The mean curve of slow strokes contains creep and loop.
     static = DomeModel(

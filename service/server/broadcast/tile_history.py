@@ -24,14 +24,11 @@ Halves = npt.NDArray[np.float16]
 
 
 class TileSpans(NamedTuple):
-    """Consecutive frames of all tiles, merged to n spans."""
+    """Merged spans: fields of `ForceSpan` (n,), and extremes (n, tiles)."""
 
     rows: npt.NDArray[np.void]
-    """(n,), frame numbers and times: fields of `ForceSpan`."""
     minimum: Halves
-    """(n, tiles)."""
     maximum: Halves
-    """(n, tiles)."""
 
 
 class TileHistory:

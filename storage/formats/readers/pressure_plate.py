@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -63,8 +64,15 @@ def read_npz_pressure_plate(path: Path, values_max: int) -> ForceTable:
     return make_table_with_standard_names(where, columns, columns, notes=notes)
 
 
-def compute_total_force_and_cop(force_n: Floats, x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
-    """Return the total force (n,) and its centre of pressure (2, n) in m.
+class TotalForce(NamedTuple):
+    """Force of all cells (n,), and its centre of pressure (2, n), NaN without load."""
+
+    force_n: Floats
+    cop_m: Floats
+
+
+def compute_total_force_and_cop(force_n: Floats, x_m: Floats, y_m: Floats) -> TotalForce:
+    """Add up the cells of each of n frames.
 
     Args:
         force_n: (n, cells along x, cells along y), force of each cell.
@@ -73,7 +81,7 @@ def compute_total_force_and_cop(force_n: Floats, x_m: Floats, y_m: Floats) -> tu
     """
     total_n = force_n.sum(axis=(1, 2))
     moments = np.stack([force_n.sum(axis=2) @ x_m, force_n.sum(axis=1) @ y_m])
-    return total_n, moments / np.where(total_n > 0.0, total_n, np.nan)
+    return TotalForce(total_n, moments / np.where(total_n > 0.0, total_n, np.nan))
 
 
 def _read_arrays(path: Path, bytes_max: int) -> dict[str, Floats]:
