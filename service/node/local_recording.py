@@ -186,7 +186,7 @@ class LocalRecording:
             needed = {
                 stream.stream_id: Intervals([(0, NO_END)]) for stream in self._journal.streams
             }
-        self._journal.retention_requests.set_own_session_numbers(needed)
+        self._journal.retention_requests.set_node_session_numbers(needed)
 
 
 def _make_session_stream(stream: NodeStream) -> SessionStream:

@@ -212,16 +212,18 @@ class ServerNode:
         self.estimator.restart_if_changed(hello)
         self.is_dirty = True
 
-    def frames_to_request(self, needed: Mapping[str, Intervals]) -> tuple[StreamNumbers, ...]:
+    def frames_to_request(self, needed_first: Mapping[str, Intervals]) -> tuple[StreamNumbers, ...]:
         """Return the frames to request: first those needed by sessions, then the others.
 
+        Of earlier streams only the needed ones.
+
         Args:
-            needed: frames that sessions need, by stream id.
+            needed_first: frames that sessions need, by stream id.
         """
         found = []
         for name in self.stream_order:
             stream, present = self.streams[name], name == self.stream_id
-            wanted = needed.get(name, Intervals())
+            wanted = needed_first.get(name, Intervals())
             requested = stream.frames_to_request(wanted, include_unneeded=present)
             first = (requested & wanted).restricted_to(
                 0, self.hello.next_seq - 1 if present else NO_END
@@ -231,7 +233,7 @@ class ServerNode:
                 found.append(StreamNumbers(stream_id=name, numbers=to_open_pairs(numbers)))
         return tuple(found)
 
-    def on_disconnect(self) -> None:
+    def mark_disconnected(self) -> None:
         """Mark the node as disconnected; its frames stay."""
         self.is_connected = False
         self._rate_meter.clear()

@@ -232,7 +232,7 @@ class Server:
         """Damage found in the data folder, and the consequence, as text."""
         return [
             *self.data_folder.problems,
-            *self.nodes.problems,
+            *self.nodes.file_problems,
             *self.identities.problems,
             *self.sessions.problems,
             *self.calibrations.problems,

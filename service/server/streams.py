@@ -278,7 +278,7 @@ class ServerStream:
         end = self.notes.next_seq
         wrong = describe_first_broken_rule(frames, self.info)
         if not wrong and self.limit is not None:
-            ahead = self.limit.find_violation(frames, now_t_ns)
+            ahead = self.limit.describe_frames_ahead(frames, now_t_ns)
             if ahead:
                 return ahead
         if not wrong and end is not None and last >= end:

@@ -120,7 +120,7 @@ class ClockTable:
         )
         return found._replace(is_certain=found.is_certain & sane)
 
-    def summarize(self) -> ClockSummary:
+    def summarize_streams(self) -> ClockSummary:
         """Return stretches, drifts, steps and state of every stream, in the session's order."""
         return ClockSummary(
             streams=tuple(self._summarize_stream(stream) for stream in self._streams)

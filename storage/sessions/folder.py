@@ -266,7 +266,7 @@ class SessionsFolder:
     def load_all(self) -> LoadedSessions:
         """Load all sessions, newest first."""
         found = LoadedSessions([], {})
-        for session_id in self.list_ids():
+        for session_id in self.list_ids_newest_first():
             try:
                 found.sessions.append(self.load(session_id))
             except FootTileError as error:
@@ -354,7 +354,7 @@ class SessionsFolder:
             sync_folder(self._folder)
         return doomed
 
-    def list_ids(self) -> Iterator[str]:
+    def list_ids_newest_first(self) -> Iterator[str]:
         """Yield the ids of all sessions, newest first."""
         if self._folder.is_dir():
             names = [

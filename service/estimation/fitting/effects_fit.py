@@ -40,12 +40,12 @@ _U_OF_X = np.array([[0.5, 0.5, 0.375], [0.0, 0.25, 0.375], [0.0, 0.0, 0.125]])
 """Transform of a cubic without constant term from x = gauge / range to u = 2 x - 1."""
 
 
-def fit_effects(
+def fit_determined_effects(
     recordings: Sequence[Indentation],
     tile: TileCalibration,
     reference_delay: Parameter = DEFAULT_REFERENCE_DELAY,
 ) -> Effects:
-    """Fit the effects that the recordings determine.
+    """Fit the effects that the recordings determine; others are None, with the reason.
 
     Args:
         recordings: of the tile in the rig, all of one chip.

@@ -188,7 +188,7 @@ class TareFrames:
         """Return the standard uncertainty of rounding to a count, (tiles,)."""
         return self._compensation.compute_quantization_sigma_kpa(temperature_counts)
 
-    def reject_loaded(self, tare: Tare) -> None:
+    def reject_above_rig_baseline(self, tare: Tare) -> None:
         """Reject a tare under load, which would make every later force too small.
 
         A colder tile reads less than in the rig, and no load does that: only more is rejected.
@@ -295,14 +295,14 @@ def compute_recording_tare(
         t_s = seen.since_ns * 1e-9
         rows = (t_s >= begin_s) & (t_s <= end_s)
         tare = seen.compute_tare(rows, "interval")
-        seen.reject_loaded(tare)
+        seen.reject_above_rig_baseline(tare)
         seen.reject_stuck(tare, rows)
         return seen.remove_recovery(tare)
     lead = np.logical_and.accumulate((frames.frame_flags & FrameFlag.LEAD) != 0)
     if lead[0]:
         seen = TareFrames(frames, compensation, calibration, serials)
         tare = seen.compute_tare(lead, "lead")
-        seen.reject_loaded(tare)
+        seen.reject_above_rig_baseline(tare)
         seen.reject_stuck(tare, lead)
         return tare
     # The result must not depend on the number of frames passed.

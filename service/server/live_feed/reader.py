@@ -139,7 +139,7 @@ class FeedReader:
             raise CloseConnection(
                 LinkCloseCode.TRY_LATER, f"its journal cannot be read; {self._cursor.position}"
             )
-        return ServerStreamView.find(self._node, stream_id, self._needed_frames)
+        return ServerStreamView.find_known(self._node, stream_id, self._needed_frames)
 
     async def _recompute(self, step: Recompute) -> FrameRows | None:
         """Return the next recomputed rows; None: the state has changed, or no frame is due."""

@@ -184,7 +184,7 @@ def _registered_node(server: Server, hello: Hello, claim: IdentityClaim) -> Iter
     finally:
         if server.links.get(name) is link:
             del server.links[name]
-            node.on_disconnect()
+            node.mark_disconnected()
             server.notify_node_changed(node)
             log.info("node %s has gone", name)
 

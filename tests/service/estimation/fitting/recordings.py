@@ -11,7 +11,7 @@ import numpy as np
 
 from service.estimation.effects import WALL_PER_KPA, Effects
 from service.estimation.fitting.dome_model import DomeModel, compute_dome_response
-from service.estimation.fitting.effects_fit import fit_effects
+from service.estimation.fitting.effects_fit import fit_determined_effects
 from service.estimation.fitting.rig.indentation import Indentation
 from service.estimation.fitting.static_fit import fit_static_curve
 from service.estimation.models.hysteresis import WIDTHS_N
@@ -106,4 +106,4 @@ def recorded(
 
 
 def found_in(recording: Indentation) -> Effects:
-    return fit_effects([recording], fit_static_curve(recording))
+    return fit_determined_effects([recording], fit_static_curve(recording))

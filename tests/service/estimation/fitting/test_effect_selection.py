@@ -15,7 +15,7 @@ from service.estimation.fitting.dome_model import DomeModel
 from service.estimation.fitting.effects_fit import (
     collect_loadings,
     convert_centred_cubic_to_unit,
-    fit_effects,
+    fit_determined_effects,
 )
 from service.estimation.fitting.output_error import OutputErrorProblem
 from service.estimation.fitting.static_fit import fit_static_curve
@@ -135,7 +135,7 @@ def test_the_same_recording_gives_the_same_calibration(known: list[Effects]) -> 
     recording = recorded(seed=0)
     tile = fit_static_curve(recording)
     one = tile.model_copy(update={"effects": known[0]})
-    two = tile.model_copy(update={"effects": fit_effects([recording], tile)})
+    two = tile.model_copy(update={"effects": fit_determined_effects([recording], tile)})
     assert make_calibration(one).id == make_calibration(two).id
 
 

@@ -10,7 +10,7 @@ import pytest
 from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from service.estimation.effects import WALL_PER_KPA
 from service.estimation.fitting.dome_model import compute_dome_response
-from service.estimation.fitting.effects_fit import fit_effects
+from service.estimation.fitting.effects_fit import fit_determined_effects
 from service.estimation.fitting.rig.indentation import Indentation
 from service.estimation.fitting.static_fit import fit_static_curve
 from service.estimation.models.hysteresis import WIDTHS_N
@@ -56,7 +56,7 @@ def soaked(seed: int) -> Indentation:
 def test_a_dome_that_creeps_back_in_its_soak_follows_warmth_as_much_as_any_other() -> None:
     for seed in range(2):
         recording = soaked(seed)
-        warmth = fit_effects([recording], fit_static_curve(recording)).temperature
+        warmth = fit_determined_effects([recording], fit_static_curve(recording)).temperature
         assert warmth is not None
         low, high = warmth.kpa_per_k.interval_95
         assert low < KPA_PER_K < high
