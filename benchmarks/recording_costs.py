@@ -112,7 +112,7 @@ def node_costs(recording: Recording, folder: Path) -> dict[str, Cost]:
     with ExitStack() as stack:
         raw = _raw_file(folder / "raw.arrows", stack)
         keeper = NodeJournal(folder, "bench")
-        keeper.retention_requests.set_own_session_numbers(
+        keeper.retention_requests.set_node_session_numbers(
             {recording.info.stream_id: Intervals([(0, 2**61)])}
         )
         before = set(threading.enumerate())

@@ -12,7 +12,7 @@ import hashlib
 import io
 import os
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 from devices.errors import DamagedFileError, FileFormatError
 
@@ -67,7 +67,14 @@ def fill_hash_placeholders(file: BinaryIO, *, where: str) -> None:
     file.write(digits.encode())
 
 
-def read_stated_and_actual_hash(path: Path) -> tuple[str, str] | None:
+class HashPair(NamedTuple):
+    """Hash that a file states of itself, and the one that it has."""
+
+    stated: str
+    actual: str
+
+
+def read_stated_and_actual_hash(path: Path) -> HashPair | None:
     """Return a Parquet file's stated and actual hash; None if it states none.
 
     Raises:
@@ -77,12 +84,12 @@ def read_stated_and_actual_hash(path: Path) -> tuple[str, str] | None:
         return _hashes(file)
 
 
-def compute_stated_and_actual_hash(content: bytes) -> tuple[str, str] | None:
+def compute_stated_and_actual_hash(content: bytes) -> HashPair | None:
     """Return the stated and actual hash of a Parquet file in memory; None if it states none."""
     return _hashes(io.BytesIO(content))
 
 
-def check_file_hash(hashes: tuple[str, str] | None, *, where: str) -> None:
+def check_file_hash(hashes: HashPair | None, *, where: str) -> None:
     """Refuse a Parquet file whose bytes have changed since it was written.
 
     Checksums of pages alone are not enough: a flip in the footer may give a column the name or the
@@ -119,7 +126,7 @@ def read_footer_or_empty_from(file: BinaryIO) -> bytes:
     return _footer(file)[1]
 
 
-def footer_stated_and_actual_hash(footer: bytes) -> tuple[str, str] | None:
+def footer_stated_and_actual_hash(footer: bytes) -> HashPair | None:
     """Return a footer's stated and actual hash of itself; None if it states none.
 
     The digits of both hashes, the footer's and the file's, count as zeros.
@@ -128,10 +135,10 @@ def footer_stated_and_actual_hash(footer: bytes) -> tuple[str, str] | None:
     if own is None or at is None:
         return None
     stated = footer[own : own + len(HASH_PLACEHOLDER)].decode("ascii", "replace")
-    return stated, _footer_hash(footer, own, at)
+    return HashPair(stated, _footer_hash(footer, own, at))
 
 
-def check_footer_hash(hashes: tuple[str, str] | None, *, where: str) -> None:
+def check_footer_hash(hashes: HashPair | None, *, where: str) -> None:
     """Refuse a footer whose bytes have changed since it was written.
 
     Args:
@@ -145,8 +152,8 @@ def check_footer_hash(hashes: tuple[str, str] | None, *, where: str) -> None:
     _check_hash(hashes, what, where)
 
 
-def _check_hash(hashes: tuple[str, str] | None, change: str, where: str) -> None:
-    if hashes is not None and hashes[0] == hashes[1]:
+def _check_hash(hashes: HashPair | None, change: str, where: str) -> None:
+    if hashes is not None and hashes.stated == hashes.actual:
         return
     remedy = _REMEDY
     if hashes is None:
@@ -156,13 +163,13 @@ def _check_hash(hashes: tuple[str, str] | None, change: str, where: str) -> None
     raise DamagedFileError(change, where=where, expected=expected, remedy=remedy)
 
 
-def _hashes(file: BinaryIO) -> tuple[str, str] | None:
+def _hashes(file: BinaryIO) -> HashPair | None:
     begin, footer = _footer(file)
     at = _find_digits(footer, FILE_HASH_KEY)
     if at is None:
         return None
     stated = footer[at : at + len(HASH_PLACEHOLDER)].decode("ascii", "replace")
-    return stated, _hash_without(file, begin + at)
+    return HashPair(stated, _hash_without(file, begin + at))
 
 
 def compute_sha256(path: Path) -> str:

@@ -125,7 +125,7 @@ class SaturationLoad:
     high_n: float
     source: RangeSource
 
-    def judge_load(self, load_n: float) -> LoadVerdict:
+    def judge_slow_load(self, load_n: float) -> LoadVerdict:
         """Return whether the dome covers a slow load without saturating."""
         if load_n <= self.low_n:
             return "covers"
@@ -163,6 +163,6 @@ def select_dome_for_load(load_n: float) -> SaturationLoad | None:
         raise ValueError(f"a load of {load_n} N is no load")
     for verdict in ("covers", "perhaps"):
         for found in list_saturation_loads():
-            if found.judge_load(load_n) == verdict:
+            if found.judge_slow_load(load_n) == verdict:
                 return found
     return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +32,14 @@ class _Candidate:
     independent_n2: float = math.nan
     common_n2: float = math.nan
     frames: int = 1
+
+
+class StancePeak(NamedTuple):
+    """Peak of a force: its node's UTC, and standard uncertainty."""
+
+    force_n: float
+    t_ns: int
+    sigma_n: float
 
 
 class PeakSearch:
@@ -71,15 +79,15 @@ class PeakSearch:
             self._search(slice(0, _CHUNK + 2 * MAX_HALF_WIDTH))
             self._t_ns, self._forces = self._t_ns[_CHUNK:], self._forces[:, _CHUNK:]
 
-    def estimate_peak(self) -> tuple[float, int, float] | None:
-        """Estimate the peak so far: force, UTC in ns, standard uncertainty; None without one."""
+    def estimate_peak(self) -> StancePeak | None:
+        """Estimate the peak so far; None without a force."""
         if not self._frames:
             return None
         self._search(slice(None))
         best = self._best
         selection = 1.0 + 2.0 * math.log(self._frames / best.frames)
         variance = best.common_n2 + best.independent_n2 * selection
-        return best.force_n, best.t_ns, math.sqrt(variance)
+        return StancePeak(best.force_n, best.t_ns, math.sqrt(variance))
 
     def _search(self, rows: slice) -> None:
         """Replace the best candidate if one of these frames has a better one."""

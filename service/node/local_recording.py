@@ -146,7 +146,7 @@ class LocalRecording:
     def _find_interrupted_session(self) -> Session | None:
         """Find the newest interrupted session of this name that no other one continues."""
         for session in self._unsealed:
-            is_its_own = self._name in (session.name, split_number(session.name)[0])
+            is_its_own = self._name in (session.name, split_number(session.name).given)
             if is_its_own and session.state != "pending":
                 return session
         return None
@@ -186,7 +186,7 @@ class LocalRecording:
             needed = {
                 stream.stream_id: Intervals([(0, NO_END)]) for stream in self._journal.streams
             }
-        self._journal.retention_requests.set_own_session_numbers(needed)
+        self._journal.retention_requests.set_node_session_numbers(needed)
 
 
 def _make_session_stream(stream: NodeStream) -> SessionStream:

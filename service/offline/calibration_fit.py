@@ -16,7 +16,7 @@ from devices.frames import NOT_READ, FrameBatch
 from devices.temperature_hold import hold_temperature
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.effects import Parameter
-from service.estimation.fitting.effects_fit import fit_effects
+from service.estimation.fitting.effects_fit import fit_determined_effects
 from service.estimation.fitting.rig.indentation import Indentation, select_loaded
 from service.estimation.fitting.rig.weight_holds import has_weights
 from service.estimation.fitting.sample_delay import DEFAULT_REFERENCE_DELAY, separate_delays
@@ -172,7 +172,7 @@ def _fit_tile(pressed: Sequence[TileRecording], delay: Parameter) -> TileCalibra
     return tile.model_copy(
         update={
             "coefficient_words": pressed[0].coefficient_words,
-            "effects": fit_effects(recordings, tile, delay),
+            "effects": fit_determined_effects(recordings, tile, delay),
         }
     )
 

@@ -28,7 +28,7 @@ from service.estimation.calibration import PRESETS, UNPROVEN_SUFFIX, Calibration
 from service.estimation.effects import Parameter
 from service.rig.emulated_foot import EmulatedFoot
 from service.sessions.calibration_file import (
-    make_calibration_error,
+    make_not_a_calibration_error,
     parse_calibration,
     write_calibration,
 )
@@ -108,7 +108,7 @@ def read_calibration(path: Path) -> Calibration:
         ) from error
     except (DamagedFileError, RuntimeError) as error:  # RuntimeError: a loop of links
         what = error.what if isinstance(error, DamagedFileError) else str(error)
-        raise make_calibration_error(what, str(path)) from error
+        raise make_not_a_calibration_error(what, str(path)) from error
     return parse_calibration(content, where=str(path))
 
 

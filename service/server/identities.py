@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from devices.errors import ChangedError, DamagedFileError, StateError, StorageError
 from service.node_identity import compute_fingerprint, generate_secret, is_proof_valid
@@ -57,6 +58,9 @@ class RefusedMachine:
         return compute_fingerprint(self.secret)
 
 
+VerifiedClaim = Literal["proven", "first_contact"]
+
+
 class NodeIdentities:
     """Secrets of all nodes of one server, in `nodes/NAME/secrets.json`.
 
@@ -103,8 +107,8 @@ class NodeIdentities:
             protocol=PROTOCOL, server_id=server_id, nonce=generate_secret(), is_known=is_known
         )
 
-    def verify_or_refuse_claim(self, claim: IdentityClaim, now_t_ns: int) -> bool:
-        """Refuse a false claim; return whether it is proven, False if the node has no secret here.
+    def verify_or_refuse_claim(self, claim: IdentityClaim, now_t_ns: int) -> VerifiedClaim:
+        """Refuse a false claim; a node without a secret here makes its first contact.
 
         Raises:
             CloseConnection: the name belongs to another machine.
@@ -113,9 +117,9 @@ class NodeIdentities:
         node, answer = claim.node, claim.proof
         secret = self.read_secret_or_set_aside(node)
         if secret is None:
-            return False
+            return "first_contact"
         if is_proof_valid(secret, claim.challenge, node, answer):
-            return True
+            return "proven"
         if answer.secret is not None:
             self.refused_machines[node] = RefusedMachine(answer.secret, claim.address, now_t_ns)
         # The remedy comes first: a close reason has 123 bytes.

@@ -10,6 +10,7 @@ import logging
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 from devices.errors import (
     DamagedFileError,
@@ -36,6 +37,15 @@ log = logging.getLogger("foottile.nodes")
 
 BOOT_ID_PATTERN = re.compile(STREAM_ID_PATTERN)
 HELLO_NAME = "hello.json"
+
+
+class ReceivedFrames(NamedTuple):
+    """Numbers of the frames of one message, and what follows from them."""
+
+    seq_first: int
+    seq_last: int
+    due: list[EstimatedBatch]
+    """Frames whose estimates are due now."""
 
 
 class ServerNode:
@@ -202,16 +212,18 @@ class ServerNode:
         self.estimator.restart_if_changed(hello)
         self.is_dirty = True
 
-    def frames_to_request(self, needed: Mapping[str, Intervals]) -> tuple[StreamNumbers, ...]:
+    def frames_to_request(self, needed_first: Mapping[str, Intervals]) -> tuple[StreamNumbers, ...]:
         """Return the frames to request: first those needed by sessions, then the others.
 
+        Of earlier streams only the needed ones.
+
         Args:
-            needed: frames that sessions need, by stream id.
+            needed_first: frames that sessions need, by stream id.
         """
         found = []
         for name in self.stream_order:
             stream, present = self.streams[name], name == self.stream_id
-            wanted = needed.get(name, Intervals())
+            wanted = needed_first.get(name, Intervals())
             requested = stream.frames_to_request(wanted, include_unneeded=present)
             first = (requested & wanted).restricted_to(
                 0, self.hello.next_seq - 1 if present else NO_END
@@ -221,23 +233,18 @@ class ServerNode:
                 found.append(StreamNumbers(stream_id=name, numbers=to_open_pairs(numbers)))
         return tuple(found)
 
-    def on_disconnect(self) -> None:
+    def mark_disconnected(self) -> None:
         """Mark the node as disconnected; its frames stay."""
         self.is_connected = False
         self._rate_meter.clear()
 
-    def receive_frames(
-        self, stream: ServerStream, payload: bytes, now_t_ns: int
-    ) -> tuple[int, int, list[EstimatedBatch]]:
+    def receive_frames(self, stream: ServerStream, payload: bytes, now_t_ns: int) -> ReceivedFrames:
         """Store one message of frames, and estimate the frames newer than all before.
 
         Args:
             stream: stream of the frames.
             payload: the message.
             now_t_ns: the server's UTC.
-
-        Returns:
-            First and last number of the message, and the frames whose estimates are due.
 
         Raises:
             LinkError: the message is not of this stream, or its frames break a rule.
@@ -246,7 +253,7 @@ class ServerNode:
             frames = stream.decoder.decode(payload)
             if ahead := stream.check_or_refuse_frames(frames, now_t_ns):
                 self._count_ahead_frames(frames, ahead)
-                return int(frames.seq[0]), int(frames.seq[-1]), []
+                return ReceivedFrames(int(frames.seq[0]), int(frames.seq[-1]), [])
             stream.append_frames(frames, payload, now_t_ns)
         except FileFormatError as error:
             raise LinkError(f"node {self.name!r}: {error}") from error
@@ -255,17 +262,17 @@ class ServerNode:
         first, last = int(frames.seq[0]), int(frames.seq[-1])
         self.last_seen_t_ns = now_t_ns
         if stream is not self.present_stream:
-            return first, last, []
+            return ReceivedFrames(first, last, [])
         if self.last_seq is not None and last <= self.last_seq:
             self._update_tare()  # resent for the journal; live is further
-            return first, last, []
+            return ReceivedFrames(first, last, [])
         if self.last_seq is not None and first <= self.last_seq:
             frames = frames.slice_rows(self.last_seq + 1 - first, len(frames))
         self.last_seq, self.last_t_ns = last, int(frames.t_ns[-1])
         self._rate_meter.add_frame(int(frames.t_mono_ns[-1]), last)
         due = self.estimator.feed_frames(frames)
         self._update_tare()
-        return first, last, due
+        return ReceivedFrames(first, last, due)
 
     def tare_now(self, reason: str = "") -> RecordedTare:
         """Tare from an unloaded interval of the last seconds, and put the tare in force.

@@ -70,7 +70,7 @@ class NodeRegistry:
                 self._add_problem(f"node {folder.name} is left out: {error}")
 
     @property
-    def problems(self) -> list[str]:
+    def file_problems(self) -> list[str]:
         """Damage found in the files of nodes, and the consequence, as text."""
         return self._problems + [text for node in self for text in node.problems]
 

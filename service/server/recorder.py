@@ -210,7 +210,7 @@ class Recorder:
             )
             return
         limit = node.present_stream.limit
-        if limit is not None and not limit.is_plausible_time(
+        if limit is not None and not limit.is_near_stated_clock(
             row.t_mono_ns, row.uncertainty_ns, now_t_ns
         ):
             log.warning(

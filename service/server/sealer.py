@@ -80,7 +80,7 @@ class SessionSealer:
                     self._invalidate(session, error)
 
     def collect_inputs(self, session: Session) -> SessionInputs:
-        """Collect the inputs from which a session can be sealed or exported."""
+        """Collect the present inputs of a session; missing ones are left out (`problem`)."""
         return current_inputs(session, self._nodes.get(session.node), exact=self._exact)
 
     def advance_unsealed_sessions(self) -> None:

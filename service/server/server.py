@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from devices.errors import FootTileError, StorageError
 from service.private_paths import register_private_folder
@@ -75,6 +75,13 @@ class NodeLink:
         """Request that the connection is closed."""
         self.close_reason = self.close_reason or (code, reason)
         self.close_requested.set()
+
+
+class DeletedSessions(NamedTuple):
+    """Sessions that were deleted from the trash."""
+
+    session_count: int
+    size_bytes: int
 
 
 class Server:
@@ -225,7 +232,7 @@ class Server:
         """Damage found in the data folder, and the consequence, as text."""
         return [
             *self.data_folder.problems,
-            *self.nodes.problems,
+            *self.nodes.file_problems,
             *self.identities.problems,
             *self.sessions.problems,
             *self.calibrations.problems,
@@ -255,14 +262,15 @@ class Server:
         if the_node is not None:
             self.notify_node_changed(the_node)
 
-    async def empty_trash(self) -> tuple[int, int]:
-        """Delete all sessions in the trash; return the number of sessions and of bytes.
+    async def empty_trash(self) -> DeletedSessions:
+        """Delete all sessions in the trash.
 
         Raises:
             StorageError: a file cannot be deleted.
         """
         doomed = self.sessions.trash.rename_all_for_deletion()
-        return len(doomed), await asyncio.to_thread(delete_and_count_bytes, doomed)
+        size_bytes = await asyncio.to_thread(delete_and_count_bytes, doomed)
+        return DeletedSessions(len(doomed), size_bytes)
 
     def make_node_view(self, node: ServerNode) -> NodeView:
         """Return a node's present state, for answers and subscribers."""

@@ -19,6 +19,7 @@ from storage.sessions.folder import (
     DELETED_PREFIX,
     FRAMES_NAME,
     IdempotencyRecord,
+    LoadedSessions,
     Marker,
     Session,
     SessionsFolder,
@@ -31,11 +32,11 @@ from storage.sessions.verified_file_cache import VerifiedFileCache
 log = logging.getLogger("foottile.book")
 
 
-def load_or_rebuild_sessions(folder: SessionsFolder) -> tuple[list[Session], dict[str, str]]:
-    """Load all sessions, and rebuild damaged ones on the disk; return them, and errors by id."""
-    found, unreadable = folder.load_all()
-    errors: dict[str, str] = {}
-    for session_id, error in unreadable.items():
+def load_or_rebuild_sessions(folder: SessionsFolder) -> LoadedSessions:
+    """Load all sessions, and rebuild damaged ones on the disk."""
+    found = folder.load_all()
+    for session_id, error in list(found.errors.items()):
+        del found.errors[session_id]
         if not any(folder.get_path(session_id).glob("[!.]*")):
             continue  # never saved
         try:
@@ -45,11 +46,11 @@ def load_or_rebuild_sessions(folder: SessionsFolder) -> tuple[list[Session], dic
             session = None
         if session is None:
             log.warning("session %s is left out, and no frames are dropped: %s", session_id, error)
-            errors[session_id] = str(error)
+            found.errors[session_id] = error
         else:
             log.warning("session %s: %s", session_id, session.problem)
-            found.append(session)
-    return found, errors
+            found.sessions.append(session)
+    return found
 
 
 def log_strays(strays: Iterable[StraySession]) -> dict[str, str]:
@@ -72,13 +73,13 @@ class Trash:
         self.folder = SessionsFolder(folder)
         for doomed in folder.glob(DELETED_PREFIX + "*"):
             shutil.rmtree(doomed, ignore_errors=True)
-        found, unreadable = load_or_rebuild_sessions(self.folder)
-        self.has_unreadable = bool(unreadable)
+        found = load_or_rebuild_sessions(self.folder)
+        self.has_unreadable = bool(found.errors)
         """True if a session cannot be read: the frames that it needs are unknown."""
-        unreadable |= log_strays(self.folder.find_strays())
+        unreadable = found.error_texts | log_strays(self.folder.find_strays())
         self.problems = [f"in the trash, {text}" for text in _format_unreadable(unreadable)]
         """Sessions that cannot be read, and the reasons, as text."""
-        self._sessions = SessionIndex(found)
+        self._sessions = SessionIndex(found.sessions)
 
     def __contains__(self, session_id: str) -> bool:
         return session_id in self._sessions
@@ -157,7 +158,8 @@ class SessionStore:
         self.folder = folder
         self.trash = trash
         self.on_change = on_change
-        found, self.unreadable = load_or_rebuild_sessions(folder)
+        found = load_or_rebuild_sessions(folder)
+        self.unreadable = found.error_texts
         """Errors of the sessions that cannot be read, by id; their files are unchanged."""
         strays = folder.find_strays()
         self.has_unreadable = bool(self.unreadable) or any(each.may_need_frames for each in strays)
@@ -166,7 +168,7 @@ class SessionStore:
         self.unreadable |= log_strays(strays)
         self.problems = _format_unreadable(self.unreadable) + trash.problems
         """Unreadable sessions and their errors as text, with those in the trash."""
-        self._sessions = SessionIndex(found)
+        self._sessions = SessionIndex(found.sessions)
         self._files = VerifiedFileCache()
 
     def open_frames(self, session_id: str, *, only_slices: bool = False) -> SealedFileReader:

@@ -45,7 +45,7 @@ class StreamLimit:
         rate_hz = hello.array_info.nominal_rate_hz
         return cls(now_t_ns, hello.t_mono_ns, hello.next_seq, rate_hz)
 
-    def find_violation(self, frames: FrameBatch, now_t_ns: int) -> str:
+    def describe_frames_ahead(self, frames: FrameBatch, now_t_ns: int) -> str:
         """Return why frames are ahead of time, as text; empty if they are plausible.
 
         Args:
@@ -63,8 +63,8 @@ class StreamLimit:
             return f"by now no frame can have a number above {possible}"
         return ""
 
-    def is_plausible_time(self, t_mono_ns: int, uncertainty_ns: int, now_t_ns: int) -> bool:
-        """Return whether a time that was just measured fits the node's clock.
+    def is_near_stated_clock(self, t_mono_ns: int, uncertainty_ns: int, now_t_ns: int) -> bool:
+        """Return whether a time just measured is near the clock that hello stated, to either side.
 
         Args:
             t_mono_ns: the time, by the node's clock.

@@ -15,7 +15,7 @@ from devices.errors import FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from service.protocol import ClockSample, EarlierStream, Hello, SeqIntervalsByReason
 from service.server.stream_limit import StreamLimit
-from service.sessions.part_end import SessionStream, find_seqs_around
+from service.sessions.part_end import SeqsAround, SessionStream, find_seqs_around
 from storage.clock.log import ClockLog, ClockOffset
 from storage.frame_rules import describe_first_broken_rule
 from storage.intervals import CORRUPT, NO_END, REFUSED, Intervals, Losses
@@ -67,7 +67,7 @@ class ServerStream:
         self._dropped = Intervals()
         self._are_gaps_assumed_dropped = False
         self._notes_on_disk: StreamNotes | None = None
-        self._seqs_around_cache: dict[tuple[int, int], tuple[int, int]] = {}
+        self._seqs_around_cache: dict[tuple[int, int], SeqsAround] = {}
         self._clock_log = ClockLog(folder)
         self._is_clock_unsynced = False
 
@@ -174,15 +174,15 @@ class ServerStream:
         )
 
     def find_seqs_around(
-        self, t_ns: int, *, min_seq: int, wait_for_missing: bool = False
-    ) -> tuple[int, int] | None:
-        """Return the stored frames next to a time: the last one until it, the first one after.
+        self, t_ns: int, *, min_seq: int, may_be_stale: bool = False
+    ) -> SeqsAround | None:
+        """Return the stored frames next to a time.
 
         The result is cached: callers repeat the query while frames are missing. The journal's index
         is read again only when frames between the two have come.
 
-        Args, result and errors as for the function `find_seqs_around`; with `wait_for_missing` the
-        cached result is kept until all frames between have come or are lost.
+        Args, result and errors as for the function `find_seqs_around`; one that `may_be_stale`
+        is the cached one until all frames between have come or are lost.
         """
         if self.journal is None:
             return None
@@ -194,7 +194,7 @@ class ServerStream:
             )
             missing = stored.missing_in(last + 1, after - 1) if after > last + 1 else Intervals()
             none_came = missing.number_count == after - last - 1
-            if ends and (none_came or (wait_for_missing and missing & self.obtainable)):
+            if ends and (none_came or (may_be_stale and missing & self.obtainable)):
                 return found
         found = find_seqs_around(self.journal, t_ns, min_seq=min_seq)
         if found is None:
@@ -278,7 +278,7 @@ class ServerStream:
         end = self.notes.next_seq
         wrong = describe_first_broken_rule(frames, self.info)
         if not wrong and self.limit is not None:
-            ahead = self.limit.find_violation(frames, now_t_ns)
+            ahead = self.limit.describe_frames_ahead(frames, now_t_ns)
             if ahead:
                 return ahead
         if not wrong and end is not None and last >= end:

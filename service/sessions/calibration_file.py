@@ -33,14 +33,14 @@ def parse_calibration(content: bytes, *, where: str) -> Calibration:
         else:  # by hand; a deleted line leaves the comma before it
             content = _LAST_COMMA.sub(b"\n}", content)
     except DamagedFileError as error:
-        raise make_calibration_error(error.what, where) from error
+        raise make_not_a_calibration_error(error.what, where) from error
     try:
         return Calibration.from_json(content.decode("utf-8", "replace"), where=where)
     except RecursionError as error:
-        raise make_calibration_error("it is nested too deeply", where) from error
+        raise make_not_a_calibration_error("it is nested too deeply", where) from error
 
 
-def make_calibration_error(what: str, where: str) -> CalibrationError:
+def make_not_a_calibration_error(what: str, where: str) -> CalibrationError:
     """Return the error for a file that is no calibration."""
     return CalibrationError(f"not a calibration: {what}", where=where, remedy=EDITED_REMEDY)
 

@@ -11,6 +11,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -58,6 +59,14 @@ class Checkpoint:
     """saved state of the estimator; None: initial state."""
     begin_ns: int = _EVER_NS
     end_ns: int = -_EVER_NS
+
+
+class ResumedStream(NamedTuple):
+    """Stream of estimates at a checkpoint."""
+
+    checkpoint_index: int
+    stream: EstimateStream | None
+    """None without estimates."""
 
 
 class Checkpoints:
@@ -109,16 +118,13 @@ class Checkpoints:
 
     def resume_stream_at_or_before(
         self, checkpoints: Sequence[Checkpoint], index: int, inputs: SessionInputs
-    ) -> tuple[int, EstimateStream | None]:
+    ) -> ResumedStream:
         """Resume estimates from a checkpoint, or from one before it if that cannot be read.
 
         Args:
             checkpoints: valid checkpoints.
             index: index of the checkpoint.
             inputs: inputs for which the checkpoints are valid.
-
-        Returns:
-            Index of the checkpoint used; and the stream, None without estimates.
         """
         stream = make_preview_stream(inputs)
         while stream is not None and (state := checkpoints[index].state) is not None:
@@ -129,7 +135,7 @@ class Checkpoints:
                 index, stream = index - 1, make_preview_stream(inputs)
             else:
                 break
-        return index, stream
+        return ResumedStream(index, stream)
 
 
 def make_preview_stream(inputs: SessionInputs) -> EstimateStream | None:

@@ -26,6 +26,7 @@ from storage.sessions.pyramid import (
     BINS_PER_COARSER_BIN,
     FRAMES_PER_FINEST_BIN,
     Bins,
+    MergedBins,
     build_levels,
     merge_bins,
 )
@@ -55,7 +56,7 @@ class ComparisonSeries:
         frames = _make_bins(table, self._gap_ns)
         self._levels = build_levels(merge_bins(frames, FRAMES_PER_FINEST_BIN)) if len(table) else []
 
-    def get_bins(self, begin_ns: int, time_slice: Slice, min_bins: int) -> tuple[Bins, int]:
+    def get_bins(self, begin_ns: int, time_slice: Slice, min_bins: int) -> MergedBins:
         """Return a slice as `min_bins` to four times as many bins.
 
         Fewer where there are fewer frames, and more where gaps split them: no bin spans a gap.
@@ -68,7 +69,7 @@ class ComparisonSeries:
         Returns:
             `t_first_ns`, `t_last_ns`, `frames`, `missing` (number of gaps in the bin or just before
             it), and `_min` and `_max` of the reference and of `error_n`, ours minus the reference,
-            NaN where unknown; and the greatest number of frames per bin.
+            NaN where unknown.
 
         Raises:
             DamagedFileError: a row group is damaged.
@@ -78,14 +79,14 @@ class ComparisonSeries:
         for above in reversed(range(len(self._levels))):
             found = _slice_bins(self._levels[above], *bounds_ns)
             if len(found["frames"]) >= min_bins:
-                return found, FRAMES_PER_FINEST_BIN * BINS_PER_COARSER_BIN**above
+                return MergedBins(found, FRAMES_PER_FINEST_BIN * BINS_PER_COARSER_BIN**above)
         bins = _make_bins(
             read_comparison_series_range(self._folder, self._footer, *bounds_ns), self._gap_ns
         )
         size = 1
         while len(bins["frames"]) // (size * BINS_PER_COARSER_BIN) >= min_bins:
             size *= BINS_PER_COARSER_BIN
-        return (bins if size == 1 else merge_bins(bins, size)), size
+        return MergedBins(bins if size == 1 else merge_bins(bins, size), size)
 
 
 class ComparisonSeriesCache:

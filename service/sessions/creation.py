@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration
@@ -46,6 +46,13 @@ def create_session(
     return Session(**facts | fields)
 
 
+class ContinuedSession(NamedTuple):
+    """Session whose tiles have changed, in two."""
+
+    closed: Session
+    continuation: Session
+
+
 def continue_session(
     session: Session,
     info: ArrayInfo,
@@ -54,7 +61,7 @@ def continue_session(
     scene_content: Mapping[str, Any],
     calibration: Calibration | None,
     calibration_source: Literal["node", "server"] = "node",
-) -> tuple[Session, Session]:
+) -> ContinuedSession:
     """Return a session whose tiles have changed, closed, and its continuation.
 
     A file describes one array, so the recording goes on in another session.
@@ -85,10 +92,17 @@ def continue_session(
         continues=session.id,
         **{field: getattr(session, field) for field in ("subject", "notes", "tags", "take")},
     )
-    return session.model_copy(update=update), continuation
+    return ContinuedSession(session.model_copy(update=update), continuation)
 
 
-def split_number(name: str) -> tuple[str, int]:
-    """Split a session's name into the given name and its number: 2 for `mud (2)`, else 1."""
+class NumberedName(NamedTuple):
+    """Name of a session as given, and its number: 2 for `mud (2)`, else 1."""
+
+    given: str
+    number: int
+
+
+def split_number(name: str) -> NumberedName:
+    """Split a session's name into the given name and its number."""
     match = re.fullmatch(r"(.*) \((\d+)\)", name)
-    return (match[1], int(match[2])) if match else (name, 1)
+    return NumberedName(match[1], int(match[2])) if match else NumberedName(name, 1)

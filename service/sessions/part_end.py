@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from devices.frames import ArrayInfo
 from storage.intervals import NO_END, Intervals
@@ -24,13 +24,24 @@ from storage.sessions.folder import Part, Session
 from storage.sessions.ledger import StreamState
 
 
+class SeqsAround(NamedTuple):
+    """Stored frames next to a time; `last` is one less than the first that counts if none is."""
+
+    last: int
+    after: int
+
+
 class SeqsAroundFinder(Protocol):
     """Lookup of the frames next to a time of a stream."""
 
-    def __call__(
-        self, t_ns: int, *, min_seq: int, wait_for_missing: bool = False
-    ) -> tuple[int, int] | None:
-        """Return the same as `find_seqs_around`, possibly from a cache with `wait_for_missing`."""
+    def __call__(self, t_ns: int, *, min_seq: int, may_be_stale: bool = False) -> SeqsAround | None:
+        """Return the same as `find_seqs_around`.
+
+        Args:
+            t_ns: the time, node's UTC.
+            min_seq: earlier numbers do not count.
+            may_be_stale: an earlier answer will do while frames between the two may still come.
+        """
 
 
 @dataclass(frozen=True)
@@ -62,16 +73,13 @@ class SessionStream(StreamState):
         )
 
 
-def find_seqs_around(
-    journal: Journal, t_ns: int, *, min_seq: int, wait_for_missing: bool = False
-) -> tuple[int, int] | None:
-    """Return the stored frames next to a time: the last one until it, the first one after.
+def find_seqs_around(journal: Journal, t_ns: int, *, min_seq: int) -> SeqsAround | None:
+    """Return the stored frames next to a time.
 
     Args:
         journal: journal of the stream.
         t_ns: the time, node's UTC.
         min_seq: earlier numbers do not count; the last is `min_seq` - 1 if there is none.
-        wait_for_missing: ignored, since nothing is cached here.
 
     Returns:
         Both numbers; None while the stream has not passed the time.
@@ -84,7 +92,7 @@ def find_seqs_around(
         return None
     # If the clock steps back, frames after that time may have lower numbers than earlier ones.
     after = journal.stored.restricted_to(last + 1, NO_END).first
-    return last, last + 1 if after is None else after
+    return SeqsAround(last, last + 1 if after is None else after)
 
 
 RATE_MAX_HZ = 1000.0
@@ -194,7 +202,7 @@ def _seq_at_stop(
     if session.stopped_t_ns is None or stream.find_seqs_around is None or stream.offset_ns is None:
         return None
     stop_t_ns = session.stopped_t_ns - stream.offset_ns
-    found = stream.find_seqs_around(stop_t_ns, min_seq=part.seq_first, wait_for_missing=waiting)
+    found = stream.find_seqs_around(stop_t_ns, min_seq=part.seq_first, may_be_stale=waiting)
     if found is None:
         return None
     last, after = found

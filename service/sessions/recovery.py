@@ -278,7 +278,7 @@ def _make_sessions(
     """Return new sessions for frames that belong to no session, one for each run of a stream."""
     # Frames of a deleted session must not come back as a new one. A session in the trash that
     # cannot be read has unknown frames.
-    known = [*known, *SessionsFolder(data / "trash").load_all()[0]]
+    known = [*known, *SessionsFolder(data / "trash").load_all().sessions]
     found = []
     for (node, stream_id), stream in streams.items():
         parts = (part for session in known if session.node == node for part in session.parts)

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from devices.errors import DamagedFramesError, FileFormatError
 from devices.text import escape_control_chars
-from service.sessions.part_end import SessionStream, find_seqs_around
+from service.sessions.part_end import SeqsAround, SessionStream, find_seqs_around
 from storage.checksummed_json import read_checksummed_json
 from storage.durable_files import ASIDE_SUFFIX, remove_dead_process_temporaries
 from storage.intervals import CORRUPT, NO_END, Intervals, Losses
@@ -62,9 +61,15 @@ class OpenedStream:
             missed_slots=notes.missed_slots,
             info=self.journal.info,
             journal=self.journal,
-            find_seqs_around=partial(find_seqs_around, self.journal),
+            find_seqs_around=self._find_seqs_around,
             offset_ns=0 if self.is_node_folder else measured_ns,  # a node stops by its own clock
         )
+
+    def _find_seqs_around(
+        self, t_ns: int, *, min_seq: int, may_be_stale: bool = False
+    ) -> SeqsAround | None:
+        del may_be_stale  # nothing is cached here
+        return find_seqs_around(self.journal, t_ns, min_seq=min_seq)
 
     def save_damage(self) -> None:
         """Save the damage found: once cut off, no other record exists.
@@ -108,9 +113,16 @@ class OpenedStream:
                 return
 
 
+class MendedStreams(NamedTuple):
+    """Streams by node and stream id, and failures as text."""
+
+    streams: dict[tuple[str, str], OpenedStream]
+    problems: list[str]
+
+
 def open_and_mend_streams(
     data: Path, report_step: Callable[[str], None], *, is_node_folder: bool
-) -> tuple[dict[tuple[str, str], OpenedStream], list[str]]:
+) -> MendedStreams:
     """Open and mend every journal of a data folder: cut off partial batches, sync the rest.
 
     Args:
@@ -118,14 +130,11 @@ def open_and_mend_streams(
         report_step: called with a description of each step.
         is_node_folder: True: a node's own folder.
 
-    Returns:
-        Streams by node and stream id, and failures as text.
-
     Raises:
         StorageError: the disk is full or not writable.
     """
-    streams: dict[tuple[str, str], OpenedStream] = {}
-    problems: list[str] = []
+    mended = MendedStreams({}, [])
+    problems = mended.problems
     for folder in sorted((data / "journal").glob("*/*")):
         if not folder.is_dir() or not (
             (folder / NOTES_FILE).exists() or any(folder.glob("*" + SUFFIX))
@@ -144,8 +153,8 @@ def open_and_mend_streams(
             continue
         stream = OpenedStream(journal, notes, journal.lost.numbers, is_node_folder)
         stream.save_damage()
-        streams[(folder.parent.name, folder.name)] = stream
-    return streams, problems
+        mended.streams[folder.parent.name, folder.name] = stream
+    return mended
 
 
 def read_hello_or_empty(data: Path, node: str) -> dict[str, Any]:

@@ -86,7 +86,7 @@ def chip_coefficients(info: ArrayInfo) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(tile.coefficient_words) for tile in info.tiles)
 
 
-def read_tares(path: Path) -> TareFileContent:
+def read_tares_marking_lost(path: Path) -> TareFileContent:
     """Read all intact tares of a file, with a `LostTares` in place of others.
 
     Raises:

@@ -22,7 +22,7 @@ from service.sessions.tare_file import (
     RecordedTare,
     chip_coefficients,
     merge_lost_runs,
-    read_tares,
+    read_tares_marking_lost,
     write_tares,
 )
 from storage.durable_files import make_synced_folder, set_aside_damaged, translate_storage_errors
@@ -50,7 +50,7 @@ class TareHistory:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        found = read_tares(path)
+        found = read_tares_marking_lost(path)
         self._entries: tuple[Entry, ...] = found.entries
         self.problem: str | None = None
         """Damage of the file when it was read, and the consequence."""

@@ -20,6 +20,7 @@ Rates are ns of offset per ns of the node's time: 1 ppm is 1e-6.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -179,6 +180,22 @@ class OffsetStretch:
         return not np.any(lowest > highest)
 
 
+class BoundedOffset(NamedTuple):
+    """Offset of a clock, within plus or minus a bound; (n,) each."""
+
+    offset_ns: Int64
+    bound_ns: Int64
+
+
+class OffsetRange(NamedTuple):
+    """Bounds of the offset over n time ranges, (n,) each."""
+
+    least_ns: Int64
+    greatest_ns: Int64
+    is_certain: npt.NDArray[np.bool_]
+    """(n,); False where a step may lie in the range, which has no bound."""
+
+
 class ClockOffsets:
     """Offset of one stream's clock to the server's, with its bound, at every instant.
 
@@ -195,8 +212,8 @@ class ClockOffsets:
         self._begins_ns = np.array([s.begin_t_mono_ns for s in self.stretches], dtype=np.int64)
         self._ends_ns = np.array([s.end_t_mono_ns for s in self.stretches], dtype=np.int64)
 
-    def offset_and_bound_at(self, t_mono_ns: Int64) -> tuple[Int64, Int64]:
-        """Compute the offset and its bound at each instant, in ns; every instant independently.
+    def offset_and_bound_at(self, t_mono_ns: Int64) -> BoundedOffset:
+        """Compute the offset and its bound at each instant; every instant independently.
 
         Between two stretches the instant of the step is unknown, and the bound covers both
         stretches. The truth is within plus or minus the bound, which is no standard deviation.
@@ -219,36 +236,30 @@ class ClockOffsets:
                 low[torn] = np.minimum(low[torn], later_low)
                 high[torn] = np.maximum(high[torn], later_high)
         offset = (low >> 1) + (high >> 1) + (low & high & 1)  # the sum might not fit
-        return offset, np.maximum(high - offset, offset - low)
+        return BoundedOffset(offset, np.maximum(high - offset, offset - low))
 
-    def bound_offset_in_ranges(
-        self, begins_t_mono_ns: Int64, ends_t_mono_ns: Int64
-    ) -> tuple[Int64, Int64, npt.NDArray[np.bool_]]:
-        """Compute bounds of the offset in ns over n time ranges, and where they are certain.
+    def bound_offset_in_ranges(self, begins_t_mono_ns: Int64, ends_t_mono_ns: Int64) -> OffsetRange:
+        """Compute bounds of the offset over n time ranges.
 
         Args:
             begins_t_mono_ns: int64[n], `t_mono_ns`, absolute values below `T_MONO_NS_END`.
             ends_t_mono_ns: int64[n], the same, not before them.
-
-        Returns:
-            Least and greatest offset, int64[n], and whether they are certain, bool[n]: a step that
-                may lie in the range has no bound.
         """
         sure = np.ones(len(begins_t_mono_ns), dtype=np.bool_)
         if len(self.stretches) > 1:
             for begun_ns, ended_ns in zip(self._begins_ns, self._ends_ns, strict=True):
                 sure &= (ends_t_mono_ns < begun_ns) | (begins_t_mono_ns >= begun_ns)
                 sure &= (ends_t_mono_ns <= ended_ns) | (begins_t_mono_ns > ended_ns)
-        one, other = (
-            self.offset_and_bound_at(begins_t_mono_ns)[0],
-            self.offset_and_bound_at(ends_t_mono_ns)[0],
-        )
+        one = self.offset_and_bound_at(begins_t_mono_ns).offset_ns
+        other = self.offset_and_bound_at(ends_t_mono_ns).offset_ns
         # Within a stretch the offset has no jumps, and no clock gains faster than this limit.
         slack_ns = (
             np.ceil(DISCIPLINE_RATE_LIMIT * (ends_t_mono_ns - begins_t_mono_ns)).astype(np.int64)
             + _ROUNDING_NS
         )
-        return np.minimum(one, other) - slack_ns, np.maximum(one, other) + slack_ns, sure
+        return OffsetRange(
+            np.minimum(one, other) - slack_ns, np.maximum(one, other) + slack_ns, sure
+        )
 
 
 def _offset_intervals(rows: OffsetRows) -> tuple[Float64, Float64]:

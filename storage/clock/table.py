@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from devices.errors import FileFormatError
 from devices.types import OFFSET_NS_END, T_MONO_NS_END, T_NS_END
-from storage.clock.bounds import ClockOffsets, Int64, OffsetRows, OffsetStretch
+from storage.clock.bounds import ClockOffsets, Int64, OffsetRange, OffsetRows, OffsetStretch
 from storage.clock.log import ClockOffset
 from storage.schema import UNKNOWN_T_NS, Array
 
@@ -101,16 +101,13 @@ class ClockTable:
 
     def bound_offset_in_ranges(
         self, begins_t_mono_ns: Int64, ends_t_mono_ns: Int64, part: int
-    ) -> tuple[Int64, Int64, npt.NDArray[np.bool_]] | None:
-        """Compute bounds of `t_server_ns - t_ns` over n time ranges of a part.
+    ) -> OffsetRange | None:
+        """Compute bounds of `t_server_ns - t_ns` over n time ranges; None: never measured.
 
         Args:
             begins_t_mono_ns: int64[n], `t_mono_ns` of each begin.
             ends_t_mono_ns: int64[n], `t_mono_ns` of each end, not before its begin.
             part: number of the part.
-
-        Returns:
-            As of `ClockOffsets.bound_offset_in_ranges`; None: this part's clock was never measured.
         """
         clock = self._maps.get(self._parts[part]) if part < len(self._parts) else None
         if clock is None:
@@ -118,12 +115,12 @@ class ClockTable:
         sane = _mask_within(begins_t_mono_ns, T_MONO_NS_END) & _mask_within(
             ends_t_mono_ns, T_MONO_NS_END
         )
-        least, greatest, sure = clock.bound_offset_in_ranges(
+        found = clock.bound_offset_in_ranges(
             np.where(sane, begins_t_mono_ns, 0), np.where(sane, ends_t_mono_ns, 0)
         )
-        return least, greatest, sure & sane
+        return found._replace(is_certain=found.is_certain & sane)
 
-    def summarize(self) -> ClockSummary:
+    def summarize_streams(self) -> ClockSummary:
         """Return stretches, drifts, steps and state of every stream, in the session's order."""
         return ClockSummary(
             streams=tuple(self._summarize_stream(stream) for stream in self._streams)

@@ -159,7 +159,7 @@ class Export:
         """Notes of the session as JSON, with the clock's summary and the markers if included."""
         notes = dict(self.notes)
         if self.clock is not None:
-            notes["clock"] = self.clock.summarize().model_dump(mode="json")
+            notes["clock"] = self.clock.summarize_streams().model_dump(mode="json")
         if self.markers is not None:
             notes["markers"] = [marker.to_json_dict() for marker in self.markers.markers]
         return notes

@@ -22,7 +22,7 @@ from storage.formats.readers.sample_times import respace_rounded_times_evenly
 from storage.formats.readers.session import read_time_axis_or_node_axis
 from storage.formats.readers.table import INSTANT_COLUMN, STANDARD_UNITS, Column, ForceTable
 from storage.formats.reference import ReferenceOptions, table_to_reference
-from storage.formats.session_load import SESSION_COLUMN_PATTERN, session_to_load_trace_columns
+from storage.formats.session_load import SESSION_COLUMN_PATTERN, extract_trimmed_load_trace
 
 VALUES_MAX = 20_000_000
 """Limit of rows times columns: an hour of eight cells at 500 Hz, 160 MB in memory."""
@@ -55,7 +55,7 @@ def read_load_trace(path: Path, options: ReferenceOptions | None = None) -> Load
     def numbers(name: str, *, may_be_empty: bool = False) -> Floats:
         return _require_column(columns, names, name, where, may_be_empty=may_be_empty)
 
-    time_s, _ = respace_rounded_times_evenly(numbers("time_s"))
+    time_s = respace_rounded_times_evenly(numbers("time_s")).time_s
     if len(time_s) < 2:
         raise LoadTraceError(f"{len(time_s)} rows", where=where, expected="at least two")
     steps = np.flatnonzero(np.diff(time_s) <= 0.0)
@@ -130,7 +130,7 @@ def _read_columns(path: Path, options: ReferenceOptions) -> tuple[dict[str, Colu
             return columns, list(dict.fromkeys([*names, *columns]))
         columns = _lowercase_names(table)
         if INSTANT_COLUMN in columns:
-            columns = session_to_load_trace_columns(
+            columns = extract_trimmed_load_trace(
                 columns, table.schema, where=table.where, axis=read_time_axis_or_node_axis(path)
             )
         elif "grf_n" in columns and "fz_n" not in columns and "cell1_n" not in columns:

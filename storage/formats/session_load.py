@@ -27,7 +27,7 @@ SESSION_COLUMN_PATTERN = re.compile(
 _TOTAL_FORCE_COLUMNS = ("grf_n", "cop_x_m", "cop_y_m")
 
 
-def session_to_load_trace_columns(
+def extract_trimmed_load_trace(
     columns: Mapping[str, Column],
     schema: pa.Schema | None,
     *,
@@ -35,6 +35,8 @@ def session_to_load_trace_columns(
     axis: TimeAxis = NODE_AXIS,
 ) -> dict[str, Column]:
     """Return `time_s` and `cell1_n, ...` or `fz_n, cop_x_m, cop_y_m`, and `angle_rad` if known.
+
+    Rows before the first load and after the last are left out.
 
     Args:
         columns: columns of a session that match `SESSION_COLUMN_PATTERN`.

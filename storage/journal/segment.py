@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import count, islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -170,10 +170,19 @@ def may_have_indexed_batches(path: Path, schema: pa.Schema) -> bool:
     return len(list(islice(read_messages_until_damage(path, begin, schema), 2))) > 1
 
 
-def recover_segment(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
-    """Open an existing segment; return it and the numbers of its damaged frames.
+class RecoveredSegment(NamedTuple):
+    """Segment of a journal after a restart."""
 
-    The segment is None, and deleted, if no batch in it is complete. Bytes without an index record
+    segment: Segment | None
+    """None: no batch in it was complete, and it is deleted."""
+    damaged: Intervals
+    """Numbers of its damaged frames."""
+
+
+def recover_segment(path: Path, schema: pa.Schema) -> RecoveredSegment:
+    """Open an existing segment; delete it if no batch in it is complete.
+
+    Bytes without an index record
     are moved to a file beside it, not discarded: most often they are a message that was cut. A
     segment that was closed in order is not read through: its batches are checked when they are
     read.
@@ -194,7 +203,7 @@ def recover_segment(path: Path, schema: pa.Schema) -> tuple[Segment | None, Inte
         if was_closed and len(batches) and find_end_offset(batches) == size:
             segment = Segment(path)
             segment.register_records(batches)
-            return segment, damaged
+            return RecoveredSegment(segment, damaged)
     good = []
     read: dict[int, EncodedBatch | None] = {}
     with path.open("rb") as file:
@@ -217,7 +226,7 @@ def recover_segment(path: Path, schema: pa.Schema) -> tuple[Segment | None, Inte
     segment = Segment(path)
     if not good:
         segment.delete_files()
-        return None, damaged
+        return RecoveredSegment(None, damaged)
     records = np.array(good, RECORD_DTYPE)
     segment.register_records(records)
     os.truncate(path, end)
@@ -225,7 +234,7 @@ def recover_segment(path: Path, schema: pa.Schema) -> tuple[Segment | None, Inte
     with path.open("rb") as file:
         os.fsync(file.fileno())
     _write_index(path, records)
-    return segment, damaged
+    return RecoveredSegment(segment, damaged)
 
 
 def _write_all_or_none(path: Path, content: bytes) -> None:

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -197,6 +197,19 @@ class StraySession:
     may_need_frames: bool
 
 
+class LoadedSessions(NamedTuple):
+    """Sessions of a folder."""
+
+    sessions: list[Session]
+    errors: dict[str, FootTileError]
+    """Errors of unreadable ones, by id."""
+
+    @property
+    def error_texts(self) -> dict[str, str]:
+        """Errors as text, by id."""
+        return {session_id: str(error) for session_id, error in self.errors.items()}
+
+
 class SessionsFolder:
     """Folder of all sessions, or of those in the trash."""
 
@@ -250,15 +263,15 @@ class SessionsFolder:
             raise self._make_stray_error(path.parent, session.id)
         return session
 
-    def load_all(self) -> tuple[list[Session], dict[str, FootTileError]]:
-        """Load all sessions, newest first, and errors by id of unreadable ones."""
-        found, unreadable = [], {}
-        for session_id in self.list_ids():
+    def load_all(self) -> LoadedSessions:
+        """Load all sessions, newest first."""
+        found = LoadedSessions([], {})
+        for session_id in self.list_ids_newest_first():
             try:
-                found.append(self.load(session_id))
+                found.sessions.append(self.load(session_id))
             except FootTileError as error:
-                unreadable[session_id] = error
-        return found, unreadable
+                found.errors[session_id] = error
+        return found
 
     def find_strays(self) -> list[StraySession]:
         """Find sessions in folders without a session's name; they are not moved."""
@@ -341,7 +354,7 @@ class SessionsFolder:
             sync_folder(self._folder)
         return doomed
 
-    def list_ids(self) -> Iterator[str]:
+    def list_ids_newest_first(self) -> Iterator[str]:
         """Yield the ids of all sessions, newest first."""
         if self._folder.is_dir():
             names = [

@@ -10,6 +10,7 @@ from storage.schema import Array
 from storage.sessions.pyramid import (
     BINS_PER_COARSER_BIN,
     Bins,
+    MergedBins,
     concatenate_bins,
     find_group_starts,
     make_single_frame_bins,
@@ -110,8 +111,8 @@ class PreviewBins:
 
 def select_and_downsample_bins(
     bins: Bins, begin_ns: int | None, end_ns: int | None, max_bins: int
-) -> tuple[Bins, int]:
-    """Return a time range's bins, merged to about `max_bins`, and how many make one."""
+) -> MergedBins:
+    """Return a time range's bins, merged to about `max_bins`."""
     rows = np.ones(_count_bins(bins), dtype=np.bool_)
     if begin_ns is not None:
         rows &= bins["t_last_ns"] >= begin_ns
@@ -122,7 +123,7 @@ def select_and_downsample_bins(
         found, count = merge_bins(found, BINS_PER_COARSER_BIN), count * BINS_PER_COARSER_BIN
         if count > len(rows):  # parts of a bin each
             break
-    return found, count
+    return MergedBins(found, count)
 
 
 def _copy_rows(bins: Bins, begin: int, end: int) -> Bins:

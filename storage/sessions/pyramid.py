@@ -8,7 +8,7 @@ merged bin are exactly those of its frames, in whatever order they were merged.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -158,6 +158,13 @@ def _interval_ends(name: str, values: Array, sigmas: Array) -> Bins:
     middle = values.astype(np.float32)
     half = np.float32(INTERVAL_95) * sigmas.astype(np.float32)
     return {f"{name.format('low')}_min": middle - half, f"{name.format('high')}_max": middle + half}
+
+
+class MergedBins(NamedTuple):
+    """Bins, and how many frames or finer bins one has at most."""
+
+    bins: Bins
+    group_size: int
 
 
 def merge_bins(bins: Bins, group_size: int) -> Bins:

@@ -15,6 +15,7 @@ from pydantic import TypeAdapter, ValidationError
 from devices.errors import FileFormatError
 from storage.intervals import Intervals, Losses, LossPairs, union
 from storage.parquet_hash import (
+    HashPair,
     footer_stated_and_actual_hash,
     read_footer_or_empty,
     read_stated_and_actual_hash,
@@ -69,7 +70,7 @@ def verify_sealed_file(path: Path) -> SealedFileReport:
     """
     report = SealedFileReport(path)
     hashes = _read_hashes(path)
-    if hashes is not None and hashes[0] != hashes[1]:
+    if hashes is not None and hashes.stated != hashes.actual:
         report.problems.append(
             "its bytes have changed since it was sealed, by the hash in its footer"
         )
@@ -175,7 +176,7 @@ def parse_lost_numbers(notes: dict[str, Any]) -> dict[str, Losses]:
         raise FileFormatError(f"the numbers that are lost are not readable: {error}") from error
 
 
-def _read_hashes(path: Path) -> tuple[str, str] | None:
+def _read_hashes(path: Path) -> HashPair | None:
     try:
         return read_stated_and_actual_hash(path)
     except OSError as error:

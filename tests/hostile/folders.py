@@ -175,7 +175,7 @@ def _clock(path: Path) -> bytes:
             for frames, extra in reader.read_batches("part")
         ]
     values = [values.tobytes() for each in columns for values in each.values()]
-    return b"".join([table.summarize().model_dump_json().encode(), *values])
+    return b"".join([table.summarize_streams().model_dump_json().encode(), *values])
 
 
 def _read(reader: Callable[[], bytes]) -> str:

@@ -249,7 +249,7 @@ def test_every_clock_row_that_is_taken_in_can_be_read_again(
         )
         rows.append(ClockOffset(stream_id="b", **taken_in.model_dump(exclude={"type"})))
     table = ClockTable(group_rows_by_stream(rows), [StreamClockFacts("b", 0)], ["b"])
-    table.summarize().model_dump_json()
+    table.summarize_streams().model_dump_json()
     for row in rows:
         columns = table.compute_server_time_columns(np.array([row.t_mono_ns]), np.array([0]), None)
         away_ns = abs(int(columns["t_server_ns"][0]) - row.server_minus_node_ns)

@@ -56,8 +56,9 @@ class RecentQuery(BaseModel):
     )
     before_seq: Annotated[int, Field(ge=0, lt=2**53)] | None = Field(
         default=None,
-        description="Only spans that end before this number: `seq_first` of a live message of the"
-        " last second continues them without a seam.",
+        description="Only spans that begin before this number; the last one may reach beyond it."
+        " `seq_first` of a live message of the last second continues those of the GRF without a"
+        " seam.",
     )
     tiles: Literal["force_n", "gauge_kpa"] | None = Field(
         default=None, description="Adds `tiles`: this quantity of each tile."
@@ -171,9 +172,12 @@ def _make_tiles_view(
     node: ServerNode, query: RecentQuery, unit: str, server: Server
 ) -> RecentTilesView:
     recent = server.broadcaster.get_present_tile_history(node)
-    rows, *extremes = recent.get_newest_spans(query.seconds, unit, query.before_seq)
-    least, greatest = ([_round_four_digits(row) for row in values.tolist()] for values in extremes)
-    numbers = {name: rows[name].tolist() for name in ("seq_first", "seq", "n", "t_ns")}
+    spans = recent.get_newest_spans(query.seconds, unit, query.before_seq)
+    least, greatest = (
+        [_round_four_digits(row) for row in values.tolist()]
+        for values in (spans.minimum, spans.maximum)
+    )
+    numbers = {name: spans.rows[name].tolist() for name in ("seq_first", "seq", "n", "t_ns")}
     return RecentTilesView(min=least, max=greatest, **numbers)
 
 

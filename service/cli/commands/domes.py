@@ -41,7 +41,7 @@ def domes_command(
                 "dome": None if selected is None else selected.dome.name,
                 "verdict": None
                 if selected is None or load_n is None
-                else selected.judge_load(load_n),
+                else selected.judge_slow_load(load_n),
                 "basis": None if selected is None else selected.source,
                 "fast_share": compute_fast_to_slow_load_ratio(),
                 "domes": [
@@ -53,7 +53,7 @@ def domes_command(
                         "range_n": [found.low_n, found.high_n],
                         "basis": found.source,
                         "external_share": compute_ambient_transmission(found.dome),
-                        "verdict": None if load_n is None else found.judge_load(load_n),
+                        "verdict": None if load_n is None else found.judge_slow_load(load_n),
                     }
                     for found in list_saturation_loads()
                 ],
@@ -79,7 +79,7 @@ def domes_command(
                 f"{found.low_n:.0f} to {found.high_n:.0f}",
                 found.source,
                 f"{100 * compute_ambient_transmission(found.dome):.0f} %",
-                *([] if load_n is None else [found.judge_load(load_n)]),
+                *([] if load_n is None else [found.judge_slow_load(load_n)]),
             )
         stdout.print(table)
         echo(_NOTES.format(fast=100 * compute_fast_to_slow_load_ratio()))
@@ -99,7 +99,7 @@ Outside: estimated part of a change of air or water pressure that a tile reads."
 def _format_choice(selected: SaturationLoad | None, load_n: float) -> str:
     if selected is None:
         return "none of them; share the load between tiles."
-    if selected.judge_load(load_n) == "covers":
+    if selected.judge_slow_load(load_n) == "covers":
         return f"{selected.dome.name} ({selected.source})."
     return (
         f"perhaps {selected.dome.name}: it saturates somewhere between {selected.low_n:.0f} and "

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -30,6 +31,14 @@ _FLATTEST = 0.05
 """Least slope of a trial cubic, as a part of the slope at zero."""
 
 
+class DomeResponse(NamedTuple):
+    """Absolute pressure, that without the gas' heat, and force less apparent force; (n,) each."""
+
+    kpa: Floats
+    isothermal_kpa: Floats
+    force_lag_n: Floats
+
+
 @dataclass(frozen=True)
 class DomeModel:
     """Parameters of one tile; the defaults are those of the static curve alone.
@@ -48,7 +57,7 @@ class DomeModel:
         flow_n: force on it during a slow stroke.
         flow_power: exponent of its flow over that force.
         late_s: delay of the tile's samples behind their instants. Forces passed to
-            `compute_pressures_and_force_lag` have to be those at the delayed instants, from
+            `compute_response` have to be those at the delayed instants, from
             `make_clamped_pchip_force`.
     """
 
@@ -66,9 +75,9 @@ class DomeModel:
     flow_power: float = 4.0
     late_s: float = 0.0
 
-    def compute_pressures_and_force_lag(self, t_s: Floats, force_n: Floats) -> Floats:
-        """Compute absolute pressures and force lag, (n, 3), as the function of this name."""
-        return compute_pressures_and_force_lag(
+    def compute_response(self, t_s: Floats, force_n: Floats) -> DomeResponse:
+        """Compute the response to forces, as `compute_dome_response`."""
+        return compute_dome_response(
             t_s,
             force_n,
             self.curve,
@@ -134,7 +143,7 @@ def _solve_heated_pressure(
 
 
 @jit_cached
-def compute_pressures_and_force_lag(
+def compute_dome_response(
     t_s: Floats,
     force_n: Floats,
     curve: Floats,
@@ -150,8 +159,8 @@ def compute_pressures_and_force_lag(
     flow_part: float,
     flow_n: float,
     flow_power: float,
-) -> Floats:
-    """Compute a tile's pressures and force lag under forces that are linear between instants.
+) -> DomeResponse:
+    """Compute a tile's response to forces that are linear between instants.
 
     Args:
         t_s: (n,) instants.
@@ -169,12 +178,9 @@ def compute_pressures_and_force_lag(
         flow_part: fraction of the viscous branch.
         flow_n: force on it during a slow stroke.
         flow_power: exponent of its flow.
-
-    Returns:
-        (n, 3): pressure, pressure without the gas' heat, and the force less the apparent force.
     """
     n = len(t_s)
-    out = np.empty((n, 3))
+    out = DomeResponse(np.empty(n), np.empty(n), np.empty(n))
     crept = np.zeros(len(creep_fraction))
     plays = np.zeros(len(play_weights))
     c1, c2, c3 = curve[0], curve[1], curve[2]
@@ -215,6 +221,6 @@ def compute_pressures_and_force_lag(
             p, warm = _solve_heated_pressure(
                 static, baseline_kpa, ln_p, warm, dt / (gamma * tau_s), k, wall_per_kpa
             )
-        out[i, 0], out[i, 1], out[i, 2] = p, static, force_n[i] - apparent
+        out.kpa[i], out.isothermal_kpa[i], out.force_lag_n[i] = p, static, force_n[i] - apparent
         ln_p, force, time = math.log(p), force_n[i], t_s[i]
     return out

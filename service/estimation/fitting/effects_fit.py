@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,12 +40,12 @@ _U_OF_X = np.array([[0.5, 0.5, 0.375], [0.0, 0.25, 0.375], [0.0, 0.0, 0.125]])
 """Transform of a cubic without constant term from x = gauge / range to u = 2 x - 1."""
 
 
-def fit_effects(
+def fit_determined_effects(
     recordings: Sequence[Indentation],
     tile: TileCalibration,
     reference_delay: Parameter = DEFAULT_REFERENCE_DELAY,
 ) -> Effects:
-    """Fit the effects that the recordings determine.
+    """Fit the effects that the recordings determine; others are None, with the reason.
 
     Args:
         recordings: of the tile in the rig, all of one chip.
@@ -52,7 +53,7 @@ def fit_effects(
         reference_delay: of the reference; `late_s` of the answer contains it (see
             `separate_delays`).
     """
-    points, baseline_kpa = collect_loadings_and_baseline_kpa(recordings)
+    points, baseline_kpa = collect_loadings(recordings)
     noise_kpa = float(
         np.mean([measure_initial_unloaded(each).noise_kpa for each in select_loaded(recordings)])
     )
@@ -99,10 +100,7 @@ def _subtract_recovery(
     since_s = (soak_ns - ends_ns[last]) * 1e-9
     t_s = np.concatenate([points.t_s, points.t_s[-1] + since_s])
     force_n = np.concatenate([points.force_n, np.zeros(len(since_s))])
-    left_kpa = (
-        model.compute_pressures_and_force_lag(t_s, force_n)[len(points.t_s) :, 0]
-        - model.baseline_kpa
-    )
+    left_kpa = model.compute_response(t_s, force_n).kpa[len(points.t_s) :] - model.baseline_kpa
     return replace(soaking, kpa=soaking.kpa - left_kpa)
 
 
@@ -176,10 +174,15 @@ def _center_curve(effects: Effects) -> Effects:
     return effects.model_copy(update={"rubber": in_u})
 
 
-def collect_loadings_and_baseline_kpa(
-    recordings: Sequence[Indentation],
-) -> tuple[LoadingPoints, float]:
-    """Collect every loading of a tile, shifted to one common baseline, and that baseline in kPa."""
+class TileLoadings(NamedTuple):
+    """All loadings of a tile, shifted to one common baseline."""
+
+    points: LoadingPoints
+    baseline_kpa: float
+
+
+def collect_loadings(recordings: Sequence[Indentation]) -> TileLoadings:
+    """Collect every loading of a tile, shifted to one common baseline."""
     recordings = select_loaded(recordings)
     zeros = [measure_initial_unloaded(recording) for recording in recordings]
     baseline_kpa = float(np.mean([zero.baseline_kpa for zero in zeros]))
@@ -187,7 +190,7 @@ def collect_loadings_and_baseline_kpa(
     for recording, zero in zip(recordings, zeros, strict=True):
         part = extract_loading_points(recording, zero)
         parts.append(replace(part, kpa=part.kpa - (zero.baseline_kpa - baseline_kpa)))
-    return join_loading_points(parts), baseline_kpa
+    return TileLoadings(join_loading_points(parts), baseline_kpa)
 
 
 def convert_centred_cubic_to_unit(coefficients: Sequence[float]) -> Floats:
@@ -231,7 +234,7 @@ def replay_release_and_tap(
     """
     if not any(np.isin(recording.phase, ("release", "tap")).any() for recording in recordings):
         return {}
-    points, baseline_kpa = collect_loadings_and_baseline_kpa(recordings)
+    points, baseline_kpa = collect_loadings(recordings)
     effects = tile.effects
     # The mean curve of slow strokes contains creep and loop.
     static = DomeModel(
@@ -245,8 +248,7 @@ def replay_release_and_tap(
     late_s += 0.0 if effects.late_s is None else effects.late_s.value
     force_n = make_clamped_pchip_force(points.t_s, points.force_n)(points.t_s + late_s)
     static_kpa, modelled_kpa = (
-        each.compute_pressures_and_force_lag(points.t_s, force_n)[:, 0] - baseline_kpa
-        for each in (static, model)
+        each.compute_response(points.t_s, force_n).kpa - baseline_kpa for each in (static, model)
     )
     measured_kpa = points.kpa - baseline_kpa
     found: dict[str, ReplaySection] = {}

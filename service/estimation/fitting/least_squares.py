@@ -45,7 +45,7 @@ def minimize_squares(
     low: Floats,
     high: Floats,
     scale: Floats,
-    cost_tolerance: float = COST_TOLERANCE,
+    min_cost_decrease: float = COST_TOLERANCE,
 ) -> LeastSquaresResult:
     """Minimize a sum of squares within bounds.
 
@@ -55,7 +55,7 @@ def minimize_squares(
         low: lower bounds.
         high: upper bounds.
         scale: typical changes of the unknowns.
-        cost_tolerance: decrease of the sum of squares at which the search ends.
+        min_cost_decrease: decrease of the sum of squares at which the search ends.
     """
     _, damping, most = _DAMPING
     off = residual(x)
@@ -74,7 +74,7 @@ def minimize_squares(
         if better is None:
             break
         gained, x, off, cost = cost - trial_cost, better, trial_off, trial_cost
-        if gained < cost_tolerance:
+        if gained < min_cost_decrease:
             break
     jacobian = _compute_jacobian(residual, x, off, high, scale)
     slope = jacobian.T @ off

@@ -15,7 +15,7 @@ from scipy.optimize import nnls
 
 from devices.arrays import Bools, Floats
 from service.estimation.fitting.confidence import compute_fit_covariance, compute_step_beyond_bound
-from service.estimation.fitting.dome_model import DomeModel, make_clamped_pchip_force
+from service.estimation.fitting.dome_model import DomeModel, DomeResponse, make_clamped_pchip_force
 from service.estimation.fitting.least_squares import (
     COST_TOLERANCE,
     LeastSquaresResult,
@@ -46,7 +46,7 @@ class DomeFit:
         model: fitted parameters.
         gains: (loadings,), gain of each loading.
         scatter: standard deviation of the gains.
-        modelled: (m, 3), answer of `compute_pressures_and_force_lag`.
+        response: of the tile to the forces, (m,).
         sigma: standard uncertainties by the name of the unknown: "late_s", "gamma", "ln_tau",
             "part", "ln_creep", "loop", "flow_part", "ln_flow_n", "flow_power", if fitted; and of
             sums over neighbouring terms, which are correlated: "part_sum", "loop_n".
@@ -61,7 +61,7 @@ class DomeFit:
     model: DomeModel
     gains: Floats
     scatter: float
-    modelled: Floats
+    response: DomeResponse
     sigma: dict[str, Floats]
     curve_covariance: Floats
     at_bound: tuple[str, ...]
@@ -132,7 +132,7 @@ class OutputErrorProblem:
             found = minimize_squares(residual, x, low, high, within, enough)
             x = found.x
             model = self._make_model(x, at)
-            gains, modelled = self._fit_gains(model, scatter)
+            gains, response = self._fit_gains(model, scatter)
             # About 1, not about their mean: the curve absorbs most of the mean, and they are few.
             if not known:
                 scatter = max(_SCATTER[0], float(np.sqrt(np.mean((gains - 1.0) ** 2))))
@@ -155,14 +155,14 @@ class OutputErrorProblem:
             model=model,
             gains=gains,
             scatter=scatter,
-            modelled=modelled,
+            response=response,
             sigma=sigma,
             curve_covariance=covariance[at["curve"], at["curve"]],
             at_bound=tuple(name for name, where in at.items() if found.at_bound[where].any()),
             n_unknowns=len(x),
             left_out_squares=self._compute_left_out_squares(found, within),
             correction_uncertainty=self._compute_correction_uncertainty(
-                jacobian, covariance, modelled, model, at
+                jacobian, covariance, response, model, at
             ),
         )
 
@@ -190,15 +190,15 @@ class OutputErrorProblem:
         self,
         jacobian: Floats,
         covariance: Floats,
-        modelled: Floats,
+        response: DomeResponse,
         model: DomeModel,
         at: dict[str, slice],
     ) -> dict[str, float]:
         """Compute `DomeFit.correction_uncertainty`."""
-        x = (modelled[:, 1] - model.baseline_kpa) / model.scale_kpa
+        x = (response.isothermal_kpa - model.baseline_kpa) / model.scale_kpa
         corrected = {
-            "gas": (("gamma", "ln_tau"), modelled[:, 0] - modelled[:, 1]),
-            "rubber": (_OF_RUBBER, modelled[:, 2] / _compute_slope_n_per_kpa(model, x)),
+            "gas": (("gamma", "ln_tau"), response.kpa - response.isothermal_kpa),
+            "rubber": (_OF_RUBBER, response.force_lag_n / _compute_slope_n_per_kpa(model, x)),
         }
         unsure = {}
         for name, (names, kpa) in corrected.items():
@@ -212,10 +212,10 @@ class OutputErrorProblem:
     def compute_misfits(self, fit: DomeFit) -> CorrectionMisfits:
         """Compute the fit's residual errors relative to the corrections."""
         rows, points, model = self._usable, self._points, fit.model
-        gauge_kpa = fit.modelled[:, 0] - model.baseline_kpa
+        gauge_kpa = fit.response.kpa - model.baseline_kpa
         residual_kpa = (fit.gains[points.loading] * gauge_kpa - self._gauge_kpa)[rows]
-        gas_kpa = (fit.modelled[:, 0] - fit.modelled[:, 1])[rows]
-        x = (fit.modelled[:, 1] - model.baseline_kpa)[rows] / model.scale_kpa
+        gas_kpa = (fit.response.kpa - fit.response.isothermal_kpa)[rows]
+        x = (fit.response.isothermal_kpa - model.baseline_kpa)[rows] / model.scale_kpa
         n_per_kpa = _compute_slope_n_per_kpa(model, x)
         residual_n = residual_kpa * n_per_kpa
         curve_n = _compute_systematic_error_n(
@@ -226,7 +226,7 @@ class OutputErrorProblem:
         weighted = residual_kpa * self._weight[rows]
         noise = float(np.mean(np.diff(weighted) ** 2)) / 2.0
         variance = noise / self._weight[rows] ** 2 + (curve_n / n_per_kpa) ** 2
-        rubber_kpa = fit.modelled[rows, 2] / n_per_kpa
+        rubber_kpa = fit.response.force_lag_n[rows] / n_per_kpa
         parts = np.stack([gas_kpa**2, rubber_kpa**2], axis=1) / variance[:, None]
         shares, _ = nnls(parts, residual_kpa**2 / variance - 1.0)
         gas, rubber = np.hypot(
@@ -250,21 +250,21 @@ class OutputErrorProblem:
             model = replace(model, flow_part=part, flow_n=flow_n, flow_power=power)
         return replace(model, loop=x[at["loop"]]) if "loop" in at else model
 
-    def _fit_gains(self, model: DomeModel, scatter: float) -> tuple[Floats, Floats]:
-        """Compute the gain of each loading, with a prior of one, and the modelled pressures."""
+    def _fit_gains(self, model: DomeModel, scatter: float) -> tuple[Floats, DomeResponse]:
+        """Compute the gain of each loading, with a prior of one, and the tile's response."""
         points = self._points
-        modelled = model.compute_pressures_and_force_lag(points.t_s, self._force_n(model.late_s))
-        gauge_kpa = modelled[:, 0] - model.baseline_kpa
+        response = model.compute_response(points.t_s, self._force_n(model.late_s))
+        gauge_kpa = response.kpa - model.baseline_kpa
         n = points.n_loadings
         prior = 1.0 / scatter**2
         square = np.bincount(points.loading, (self._weight * gauge_kpa) ** 2, n)
         product = np.bincount(points.loading, self._weight**2 * gauge_kpa * self._gauge_kpa, n)
-        return (product + prior) / (square + prior), modelled
+        return (product + prior) / (square + prior), response
 
     def compute_pressure_and_gain_residuals(self, model: DomeModel, scatter: float) -> Floats:
         """Compute the residuals of pressures and gains in their standard uncertainties."""
-        gains, modelled = self._fit_gains(model, scatter)
-        gauge_kpa = modelled[:, 0] - model.baseline_kpa
+        gains, response = self._fit_gains(model, scatter)
+        gauge_kpa = response.kpa - model.baseline_kpa
         off = (gains[self._points.loading] * gauge_kpa - self._gauge_kpa) * self._weight
         return np.concatenate([off, (gains - 1.0) / scatter])
 
@@ -276,7 +276,7 @@ class OutputErrorProblem:
     def compute_max_heat_effect_n(self, fit: DomeFit) -> float:
         """Return the largest effect of the gas' heat on a force."""
         model, rows = fit.model, self._usable
-        heated_kpa, settled_kpa = fit.modelled[rows, 0], fit.modelled[rows, 1]
+        heated_kpa, settled_kpa = fit.response.kpa[rows], fit.response.isothermal_kpa[rows]
         slope = _compute_slope_n_per_kpa(
             model, (settled_kpa - model.baseline_kpa) / model.scale_kpa
         )

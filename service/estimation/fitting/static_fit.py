@@ -31,9 +31,9 @@ from service.estimation.fitting.confidence import (
 from service.estimation.fitting.rig.checks import (
     check_baseline_drift_kpa,
     reject_contradictions,
-    reject_insufficient_strokes,
     reject_poor_fit,
     reject_saturated_reference,
+    reject_unusable_strokes,
     select_before_saturation,
 )
 from service.estimation.fitting.rig.indentation import (
@@ -80,7 +80,7 @@ def fit_static_curve(*recordings: Indentation) -> TileCalibration:
     blocks = average_stroke_blocks(*recordings)
     reject_saturated_reference(recordings, blocks)
     blocks, by_chip = select_before_saturation(recordings, blocks, noise_kpa)
-    reject_insufficient_strokes(blocks, where)
+    reject_unusable_strokes(blocks, where)
     drift_kpa = check_baseline_drift_kpa(recordings)
     # The mean end of the repeats: beyond it there is little data.
     high_kpa = float(np.mean(_repeat_maxima(blocks, blocks.gauge_kpa)))

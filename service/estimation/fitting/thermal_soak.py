@@ -18,7 +18,7 @@ from service.estimation.effects import Parameter, TemperatureEffect
 from service.estimation.fitting.confidence import compute_fit_covariance, compute_step_beyond_bound
 from service.estimation.fitting.least_squares import minimize_squares
 from service.estimation.fitting.rig.indentation import ThermalSoak
-from service.estimation.models.temperature import compute_gas_temperature_and_rise
+from service.estimation.models.temperature import compute_gas_temperatures
 
 STEP_MIN_K = 1.0
 LAG_RANGE_S = (-10.0, 30.0)
@@ -51,7 +51,7 @@ def fit_temperature_effect(soak: ThermalSoak) -> TemperatureEffect | str:
 
     def gas_k(lag_s: float) -> tuple[Floats, Floats]:
         """Return the gas' temperature above the chip's first one, and its rise in K/s."""
-        counts, rise = compute_gas_temperature_and_rise(
+        counts, rise = compute_gas_temperatures(
             soak.temperature_raw[:, None], t_ns, np.array([lag_s])
         )
         return (

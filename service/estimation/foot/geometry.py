@@ -7,6 +7,7 @@ A positive angle is a roll forward (right-handed about y).
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,15 +18,19 @@ from devices.jit import jit_cached
 _PARABOLA_POSITIONS_MIN = 3  # least positions along x that determine a parabola
 
 
-def compute_hull_half_planes(positions_m: Floats) -> tuple[Floats, Floats]:
-    """Compute half-planes `normals @ p <= offsets` whose intersection is the hull of (tiles, 2).
+class HalfPlanes(NamedTuple):
+    """Half-planes `normals @ p <= offsets_m`, (k, 2) of unit length and (k,)."""
+
+    normals: Floats
+    offsets_m: Floats
+
+
+def compute_hull_half_planes(positions_m: Floats) -> HalfPlanes:
+    """Compute the half-planes whose intersection is the hull of (tiles, 2).
 
     Tiles in a line, or a single one, have a hull without area: two half-planes across every
     direction in which they do not extend would forbid any noise, so only the ends of the line
     count; across it a force-weighted mean cannot leave the line anyway.
-
-    Returns:
-        Unit normals (k, 2) and offsets (k,).
     """
     centre_m = positions_m.mean(axis=0)
     _, spread_m, directions = np.linalg.svd(positions_m - centre_m)
@@ -35,9 +40,9 @@ def compute_hull_half_planes(positions_m: Floats) -> tuple[Floats, Floats]:
         from scipy.spatial import ConvexHull
 
         equations = ConvexHull(positions_m).equations
-        return equations[:, :2], -equations[:, 2]
+        return HalfPlanes(equations[:, :2], -equations[:, 2])
     normals = np.concatenate([directions[extends], -directions[extends]])
-    return normals, (positions_m @ normals.T).max(axis=0, initial=-np.inf)
+    return HalfPlanes(normals, (positions_m @ normals.T).max(axis=0, initial=-np.inf))
 
 
 def compute_grid_indices(

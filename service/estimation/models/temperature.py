@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -117,10 +118,17 @@ def compute_gas_temperature_noise_counts(gas_lag_s: Floats, step_s: float) -> Fl
     )
 
 
-def compute_gas_temperature_and_rise(
+class GasTemperatures(NamedTuple):
+    """Temperatures of the tiles' gas, (n, tiles) each."""
+
+    counts: Floats
+    rise_counts_per_s: Floats
+
+
+def compute_gas_temperatures(
     temperature_raw: Floats, t_ns: Times, gas_lag_s: Floats
-) -> tuple[Floats, Floats]:
-    """Compute every tile's gas temperature in counts, and its rise in counts a second, from rest.
+) -> GasTemperatures:
+    """Compute every tile's gas temperature, from rest.
 
     Args:
         temperature_raw: (n, tiles), raw temperatures of the chips, NaN where there are none.
@@ -134,7 +142,7 @@ def compute_gas_temperature_and_rise(
     _update_gas_temperatures(
         params, initial_state(len(gas_lag_s)), temperature_raw, t_ns, gas, rise
     )
-    return gas, rise
+    return GasTemperatures(gas, rise)
 
 
 @jit_cached

@@ -21,6 +21,7 @@ from service.estimation.effects import Parameter
 from service.estimation.fault_detection.fault_limits import FaultLimits, make_fault_limits
 from service.estimation.foot.contact import ContactThresholds
 from service.estimation.foot.geometry import (
+    HalfPlanes,
     compute_grid_indices,
     compute_hull_half_planes,
     compute_tilt_loss,
@@ -100,7 +101,7 @@ class EstimationPlan:
     """Part of a tile's force that is not along the segment, by the angle of its axis."""
     shear: Parameter | None
     """Direction of the ground's force on tiles that are not upright; None: unknown."""
-    hull: tuple[Floats, Floats]
+    hull: HalfPlanes
     grid: tuple[Floats, Floats] | None
     contact: ContactThresholds
     is_scale_assumed: bool

@@ -91,7 +91,7 @@ def compute_newest_unloaded_tare(
     if present is not None:
         _reject_above(tare, present, recent.serials, is_load_bearing)
     _reject_warming(frames, tare, recent.serials)
-    recent.reject_loaded(tare)
+    recent.reject_above_rig_baseline(tare)
     recent.reject_stuck(tare, low[0].rows)
     return tare
 

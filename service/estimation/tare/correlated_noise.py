@@ -11,6 +11,8 @@ Then the mean of n readings has the variance s^2/n times::
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
@@ -24,20 +26,24 @@ _CHANCE = 3.5
 _TIMES = np.geomspace(1.0, _LAGS, 25)
 
 
-def fit_correlated_fraction_and_decay(kpa: Floats) -> tuple[Floats, Floats]:
-    """Fit the correlated part of the variance of unloaded readings, and its time constant.
+class CorrelatedNoise(NamedTuple):
+    """Correlated part c of the variance, (tiles,), and its time constant; 0: not significant."""
+
+    fraction: Floats
+    decay_readings: Floats
+
+
+def fit_correlated_noise(kpa: Floats) -> CorrelatedNoise:
+    """Fit the correlated part of the variance of unloaded readings.
 
     Args:
         kpa: (n, tiles), evenly spaced, NaN where a tile gave none.
-
-    Returns:
-        Part c (tiles,), 0 where not significant, and time constant in readings (tiles,), 0 there.
     """
     n, tiles = kpa.shape
-    part, readings = np.zeros(tiles), np.zeros(tiles)
+    noise = CorrelatedNoise(np.zeros(tiles), np.zeros(tiles))
     lags = np.arange(1, min(_LAGS, n // 4) + 1)
     if len(lags) < _TESTED:
-        return part, readings
+        return noise
     for tile in range(tiles):
         known = np.isfinite(kpa[:, tile])
         if not known.any() or np.ptp(kpa[known, tile]) == 0.0:
@@ -46,8 +52,8 @@ def fit_correlated_fraction_and_decay(kpa: Floats) -> tuple[Floats, Floats]:
         # What is missing adds nothing to the sums, which makes them a little too small.
         rho = np.array([np.dot(off[:-k], off[k:]) for k in lags.tolist()]) / np.dot(off, off)
         if rho[:_TESTED].sum() >= _CHANCE * np.sqrt(_TESTED / known.sum()):
-            part[tile], readings[tile] = _fit_decay(rho, int(known.sum()))
-    return part, readings
+            noise.fraction[tile], noise.decay_readings[tile] = _fit_decay(rho, int(known.sum()))
+    return noise
 
 
 def _fit_decay(rho: Floats, n: int) -> tuple[float, float]:

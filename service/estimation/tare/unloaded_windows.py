@@ -24,7 +24,7 @@ from devices.temperature_hold import hold_temperature
 from service.estimation.calibration import Calibration
 from service.estimation.tare.correlated_noise import (
     compute_variance_inflation,
-    fit_correlated_fraction_and_decay,
+    fit_correlated_noise,
 )
 from service.estimation.tare.tare import Tare, TareSource
 
@@ -168,11 +168,11 @@ class TareFrames:
             np.nanstd(kpa, axis=0, ddof=1), self.compute_rounding_sigma_kpa(temperature_raw_counts)
         )
         t_s = self.since_ns[rows] * 1e-9
-        part, readings = fit_correlated_fraction_and_decay(kpa)
+        noise = fit_correlated_noise(kpa)
         return Tare(
             baseline_kpa=np.nanmean(kpa, axis=0),
             baseline_sigma_kpa=noise_kpa
-            * np.sqrt(compute_variance_inflation(part, readings, readable) / readable),
+            * np.sqrt(compute_variance_inflation(*noise, readable) / readable),
             noise_kpa=noise_kpa,
             temperature_raw_counts=temperature_raw_counts,
             t_ns=int(self.frames.t_ns[rows][-1]),
@@ -180,15 +180,15 @@ class TareFrames:
             end_s=float(t_s[-1]),
             frames=len(kpa),
             source=source,
-            noise_lasting=part,
-            noise_lasting_s=readings * float(np.median(np.diff(t_s))),
+            noise_lasting=noise.fraction,
+            noise_lasting_s=noise.decay_readings * float(np.median(np.diff(t_s))),
         )
 
     def compute_rounding_sigma_kpa(self, temperature_counts: Floats) -> Floats:
         """Return the standard uncertainty of rounding to a count, (tiles,)."""
         return self._compensation.compute_quantization_sigma_kpa(temperature_counts)
 
-    def reject_loaded(self, tare: Tare) -> None:
+    def reject_above_rig_baseline(self, tare: Tare) -> None:
         """Reject a tare under load, which would make every later force too small.
 
         A colder tile reads less than in the rig, and no load does that: only more is rejected.
@@ -295,14 +295,14 @@ def compute_recording_tare(
         t_s = seen.since_ns * 1e-9
         rows = (t_s >= begin_s) & (t_s <= end_s)
         tare = seen.compute_tare(rows, "interval")
-        seen.reject_loaded(tare)
+        seen.reject_above_rig_baseline(tare)
         seen.reject_stuck(tare, rows)
         return seen.remove_recovery(tare)
     lead = np.logical_and.accumulate((frames.frame_flags & FrameFlag.LEAD) != 0)
     if lead[0]:
         seen = TareFrames(frames, compensation, calibration, serials)
         tare = seen.compute_tare(lead, "lead")
-        seen.reject_loaded(tare)
+        seen.reject_above_rig_baseline(tare)
         seen.reject_stuck(tare, lead)
         return tare
     # The result must not depend on the number of frames passed.

@@ -191,9 +191,7 @@ class Broadcaster:
         for frames, columns in batches:
             node.published_t_ns = int(frames.t_ns[-1])
             span = summarize_force(frames, columns)
-            self._force_histories.setdefault(node.name, ForceHistory()).add_span(
-                node.stream_id, span
-            )
+            self.get_present_force_history(node).add_span(span)
             self._get_tile_history(node, frames.tile_count).add_frames(span, columns)
             if self._groups:
                 piece = summarize_frames(node.stream_id, span, frames, columns)
@@ -201,14 +199,14 @@ class Broadcaster:
                     summary.add_summary(node.name, piece)
 
     def get_present_force_history(self, node: ServerNode) -> ForceHistory:
-        """Return the force history of a node's present stream; an empty one if it has no frames."""
+        """Return the force history of a node's present stream, in place of another stream's."""
         recent = self._force_histories.get(node.name)
-        return (
-            recent if recent is not None and recent.stream_id == node.stream_id else ForceHistory()
-        )
+        if recent is None or recent.stream_id != node.stream_id:
+            recent = self._force_histories[node.name] = ForceHistory(node.stream_id)
+        return recent
 
     def get_present_tile_history(self, node: ServerNode) -> TileHistory:
-        """Return the tile history of a node's present stream; it replaces one of another stream."""
+        """Return the tile history of a node's present stream, in place of another stream's."""
         return self._get_tile_history(node, len(node.last_info.tiles))
 
     def _get_tile_history(self, node: ServerNode, tiles: int) -> TileHistory:

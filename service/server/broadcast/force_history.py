@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from service.server.broadcast.force_span import ForceSpan
+from storage.intervals import NO_END
 
 SECONDS_MAX = 60.0
 SPAN_PERIOD_NS = 1_000_000_000 // 30
@@ -28,11 +29,25 @@ _ROW = np.dtype(
 )
 
 
-class ForceHistory:
-    """GRF over the last minute of a node's present stream."""
+def select_newest_spans(
+    rows: npt.NDArray[np.void], seconds: float, before_seq: int | None
+) -> npt.NDArray[np.bool_]:
+    """Return a mask of the spans that begin before a number, and lie in the seconds before it."""
+    keep = np.asarray(rows["seq_first"] < (NO_END if before_seq is None else before_seq))
+    if keep.any():
+        keep &= rows["t_ns"] > rows["t_ns"][keep][-1] - int(seconds * 1e9)
+    return keep
 
-    def __init__(self) -> None:
-        self.stream_id = ""
+
+class ForceHistory:
+    """GRF over the last minute of a stream.
+
+    Args:
+        stream_id: stream of the frames.
+    """
+
+    def __init__(self, stream_id: str) -> None:
+        self.stream_id = stream_id
         self._as_published: deque[ForceSpan] = deque()
         self._last_merged: ForceSpan | None = None
         """Newest merged span, to which more may be added."""
@@ -40,16 +55,8 @@ class ForceHistory:
         self._count = 0
         """Number of spans ever written to the ring `_merged`."""
 
-    def add_span(self, stream_id: str, span: ForceSpan) -> None:
-        """Add frames that are published now.
-
-        Args:
-            stream_id: stream of the frames; another one clears the history.
-            span: newer than those before.
-        """
-        if stream_id != self.stream_id:
-            self.stream_id, self._last_merged, self._count = stream_id, None, 0
-            self._as_published.clear()
+    def add_span(self, span: ForceSpan) -> None:
+        """Add frames that are published now, newer than those before."""
         self._as_published.append(span)
         while (
             span.t_ns - self._as_published[0].t_ns > _AS_PUBLISHED_NS
@@ -58,23 +65,19 @@ class ForceHistory:
             self._merge(self._as_published.popleft())
 
     def get_newest_spans(
-        self, seconds: float, end_before_seq: int | None = None
+        self, seconds: float, before_seq: int | None = None
     ) -> npt.NDArray[np.void]:
         """Return the newest seconds, with the fields of `ForceSpan`, oldest first.
 
         Args:
             seconds: counted back from the newest frame.
-            end_before_seq: only spans that end before this number.
+            before_seq: only spans that begin before this number.
         """
         first = max(0, self._count - _MERGED_MAX)
         older = self._merged[np.arange(first, self._count) % _MERGED_MAX]
         newer = [*([] if self._last_merged is None else [self._last_merged]), *self._as_published]
         rows = np.concatenate([older, np.array(newer, _ROW)])
-        if end_before_seq is not None:
-            rows = rows[rows["seq"] < end_before_seq]
-        if len(rows):
-            rows = rows[rows["t_ns"] > rows["t_ns"][-1] - int(seconds * 1e9)]
-        return rows
+        return rows[select_newest_spans(rows, seconds, before_seq)]
 
     def _merge(self, span: ForceSpan) -> None:
         before = self._last_merged

@@ -7,12 +7,12 @@ shows. Memory: 5 kB per tile and 20 kB for the frames' numbers.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from service.server.broadcast.force_history import SECONDS_MAX
+from service.server.broadcast.force_history import SECONDS_MAX, select_newest_spans
 from service.server.broadcast.force_span import ForceSpan
 
 UNITS = ("force_n", "gauge_kpa")
@@ -21,6 +21,14 @@ _SPANS_MAX = int(SECONDS_MAX * 1e9) // SPAN_PERIOD_NS + 2
 _ROW = np.dtype([(name, np.int64) for name in ("seq_first", "seq", "n", "t_ns")])
 _HALF_MAX = float(np.finfo(np.float16).max)
 Halves = npt.NDArray[np.float16]
+
+
+class TileSpans(NamedTuple):
+    """Merged spans: fields of `ForceSpan` (n,), and extremes (n, tiles)."""
+
+    rows: npt.NDArray[np.void]
+    minimum: Halves
+    maximum: Halves
 
 
 class TileHistory:
@@ -61,24 +69,17 @@ class TileHistory:
         self._count += 1
 
     def get_newest_spans(
-        self, seconds: float, quantity: str, begin_before_seq: int | None = None
-    ) -> tuple[npt.NDArray[np.void], Halves, Halves]:
+        self, seconds: float, quantity: str, before_seq: int | None = None
+    ) -> TileSpans:
         """Return the newest seconds, oldest first.
 
         Args:
             seconds: counted back from the newest frame.
             quantity: one of `UNITS`.
-            begin_before_seq: only spans that begin before this number.
-
-        Returns:
-            Numbers (n,) with the fields of `ForceSpan`, minimum and maximum (n, tiles).
+            before_seq: only spans that begin before this number.
         """
         indices = np.arange(max(0, self._count - _SPANS_MAX), self._count) % _SPANS_MAX
         rows = self._rows[indices]
-        keep = rows["seq_first"] < (
-            np.iinfo(np.int64).max if begin_before_seq is None else begin_before_seq
-        )
-        if keep.any():
-            keep &= rows["t_ns"] > rows["t_ns"][keep][-1] - int(seconds * 1e9)
+        keep = select_newest_spans(rows, seconds, before_seq)
         least, greatest = self._extremes[indices[keep], :, UNITS.index(quantity)].swapaxes(0, 1)
-        return rows[keep], least, greatest
+        return TileSpans(rows[keep], least, greatest)

@@ -69,7 +69,7 @@ class CalibrationAssignment:
         self._store({"id": calibration.id, **calibration.model_dump(mode="json")}, t_ns)
         self.current, self.problem = AssignedCalibration(calibration, t_ns), None
 
-    def clear_stored_assignment(self, t_ns: int) -> None:
+    def remove_assignment(self, t_ns: int) -> None:
         """Remove the assignment, on the disk too: the node's own calibration is used again.
 
         Raises:

@@ -102,7 +102,7 @@ class NodeEstimator:
             StorageError: that cannot be stored; nothing has changed then.
         """
         if calibration is None:
-            self.assignment.clear_stored_assignment(t_ns)
+            self.assignment.remove_assignment(t_ns)
         else:
             self.assignment.store_assignment(calibration, t_ns)
         before = self.live

@@ -31,7 +31,7 @@ class TileRanges:
 
     @classmethod
     def from_calibration(cls, info: ArrayInfo, calibration: Calibration) -> Self:
-        """Compute the ranges from the calibration's curves and mount gains.
+        """Compute ends of ranges from curves and mount gains; NaN for reference tiles.
 
         Raises:
             CalibrationError: a tile that bears load is not in it.

@@ -7,7 +7,7 @@ readers of the same columns.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import pyarrow as pa
 
@@ -35,6 +35,13 @@ RECOMPUTED = pa.field(
 )
 _COLUMNS = {column.name: column for column in (*MEASURED_COLUMNS, *ESTIMATE_COLUMNS)}
 _FRAMES = {column.name for column in MEASURED_COLUMNS}
+
+
+class EncodedRows(NamedTuple):
+    """Message of frames, and the number of the frame behind them."""
+
+    message: bytes
+    next_seq: int
 
 
 class ArrowEncoder:
@@ -65,10 +72,8 @@ class ArrowEncoder:
         """Return the schema's message."""
         return self.schema.serialize().to_pybytes()
 
-    def encode_rows_with_next_seq(
-        self, rows: FrameRows, cache: EncodeCache
-    ) -> Iterator[tuple[bytes, int]]:
-        """Yield messages of at most `ROWS_MAX` frames, each with the number of the next frame.
+    def encode_rows(self, rows: FrameRows, cache: EncodeCache) -> Iterator[EncodedRows]:
+        """Yield messages of at most `ROWS_MAX` frames.
 
         Args:
             rows: the frames.
@@ -83,7 +88,7 @@ class ArrowEncoder:
                 message = self._encode(rows, begin, end)
                 if key is not None:
                     cache.put(key, message)
-            yield message, int(seq[end - 1]) + 1
+            yield EncodedRows(message, int(seq[end - 1]) + 1)
 
     def _encode(self, rows: FrameRows, begin: int, end: int) -> bytes:
         frames, columns = rows.batch

@@ -106,10 +106,6 @@ class LosslessCursor:
             return Recompute(position, stored.last or position.seq, stream.has_ended, until)
         return self._gap_event(position, stream, ahead)
 
-    def mark_sent(self, rows: FrameRows) -> None:
-        """Move the position behind recomputed frames."""
-        self.position = Position(rows.stream_id, rows.last_seq + 1)
-
     def _buffered_batch(self, position: Position) -> FeedBatch | None:
         """Return the buffered batch with this frame, if there is one."""
         memory, number = self._buffer, self._next_number

@@ -70,9 +70,6 @@ class LossyCursor:
                     return FrameRows(piece.stream_id, rows, piece.number if begin == 0 else None)
         return None
 
-    def mark_sent(self, rows: FrameRows) -> None:
-        """Ignore recomputed frames: this reader never gets any."""
-
     def _oldest_allowed(self) -> FeedBatch:
         """Return the oldest batch that is not to be dropped."""
         memory = self._buffer

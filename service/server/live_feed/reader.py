@@ -139,7 +139,7 @@ class FeedReader:
             raise CloseConnection(
                 LinkCloseCode.TRY_LATER, f"its journal cannot be read; {self._cursor.position}"
             )
-        return ServerStreamView.find(self._node, stream_id, self._needed_frames)
+        return ServerStreamView.find_known(self._node, stream_id, self._needed_frames)
 
     async def _recompute(self, step: Recompute) -> FrameRows | None:
         """Return the next recomputed rows; None: the state has changed, or no frame is due."""
@@ -177,7 +177,7 @@ class FeedReader:
         if step.until_seq is not None and last >= step.until_seq:  # the buffer has the rest
             found = slice_batch(found, 0, step.until_seq - first)
         rows = FrameRows(position.stream_id, found, is_recomputed=True)
-        self._cursor.mark_sent(rows)
+        self._cursor.position = Position(rows.stream_id, rows.last_seq + 1)
         return rows
 
     def _unreadable_error(self, at: Position, why: object) -> CloseConnection:

@@ -59,10 +59,10 @@ class ServerStreamView:
         self._needed_frames = needed_frames
 
     @classmethod
-    def find(
+    def find_known(
         cls, node: ServerNode, stream_id: str, needed_frames: Callable[[], Mapping[str, Intervals]]
     ) -> ServerStreamView | None:
-        """Return the view of a stream by its id; None: unknown, or no longer known."""
+        """Return the view of a stream, empty without stored frames; None: not known, or not now."""
         stream = node.streams.get(stream_id)
         # After a restart of the server a stream without stored frames has no folder.
         if stream is None and (node.has_connected or stream_id not in node.stream_order):

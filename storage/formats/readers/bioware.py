@@ -17,7 +17,7 @@ from storage.formats.readers.device_columns import (
     parse_device_columns,
 )
 from storage.formats.readers.plate_signals import make_plate_table
-from storage.formats.readers.table import ColumnFilter, ForceTable
+from storage.formats.readers.table import ForceTable
 from storage.formats.readers.text import is_number, split_cells_without_empty_end
 
 FORM = "lines of facts, a line of names that begins with a time, lines of numbers"
@@ -32,9 +32,7 @@ def is_bioware(head: str) -> bool:
     return re.match(r"\s*\"?bioware\b", head, re.IGNORECASE) is not None
 
 
-def parse_bioware_force_and_cop(
-    text: str, where: str, _is_needed: ColumnFilter, values_max: int
-) -> ForceTable:
+def parse_bioware_force_and_cop(text: str, where: str, values_max: int) -> ForceTable:
     """Parse the vertical force and centre of pressure of every plate, needed or not.
 
     Raises:

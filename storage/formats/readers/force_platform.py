@@ -30,7 +30,7 @@ from storage.formats.readers.plate_geometry import (
     transform_cop_to_laboratory,
 )
 from storage.formats.readers.plate_signals import PlateSignals, make_plate_table
-from storage.formats.readers.table import ColumnFilter, ForceTable, check_table_size
+from storage.formats.readers.table import ForceTable, check_table_size
 
 FORM = "force platforms of types 1 to 4"
 _CHANNEL_COUNTS = {1: 6, 2: 6, 3: 8, 4: 6}
@@ -55,7 +55,7 @@ _FORCE_UNITS = {"n": "N", "newton": "N", "newtons": "N", "kn": "kN"}
 _MOMENT = re.compile(r"(k?N)[ .*·-]?(mm|cm|m)", re.IGNORECASE)
 
 
-def read_c3d_force_platforms(path: Path, _is_needed: ColumnFilter, values_max: int) -> ForceTable:
+def read_c3d_force_platforms(path: Path, values_max: int) -> ForceTable:
     """Read force and centre of pressure of each readable plate of a C3D file, at the analog rate.
 
     Columns are `plate1_fz`, `plate1_cop_x`, `plate1_cop_y` and so on, in the file's units. A

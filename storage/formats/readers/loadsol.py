@@ -36,9 +36,9 @@ def is_loadsol(head: str) -> bool:
 
 
 def parse_loadsol_forces(
-    text: str, where: str, is_time_source: ColumnFilter, values_max: int
+    text: str, where: str, is_needed: ColumnFilter, values_max: int
 ) -> ForceTable:
-    """Parse the force of each sole as `left_fz`, `right_fz`, at times picked by `is_time_source`.
+    """Parse the force of each sole as `left_fz`, `right_fz`, at the times of the needed soles.
 
     Raises:
         FileFormatError: a cell is no number, or the needed soles differ in their times.
@@ -93,7 +93,7 @@ def parse_loadsol_forces(
         times_s.append(np.asarray(columns[names[stamp]] * scale, dtype=np.float64))
     if len({plate.name for plate in plates}) < len(plates):
         raise FileFormatError("two soles are of one side", where=where, expected="one of each")
-    time_s = _needed_times(plates, times_s, is_time_source, where)
+    time_s = _needed_times(plates, times_s, is_needed, where)
     return make_plate_table(where, time_s, plates)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from devices.arrays import Floats
 from devices.errors import FileFormatError
 from storage.formats.readers.plate_signals import PlateSignals, make_plate_table
-from storage.formats.readers.table import SOLE_FRACTION, Column, ColumnFilter, ForceTable
+from storage.formats.readers.table import SOLE_FRACTION, Column, ForceTable
 from storage.formats.readers.text import TextLayout, parse_columns
 
 FORM = "facts behind #, a line of names that begins with # time, lines of numbers"
@@ -37,9 +37,7 @@ def is_moticon(head: str) -> bool:
     return _find_names(head) is not None
 
 
-def parse_moticon_force_and_cop(
-    text: str, where: str, _is_needed: ColumnFilter, values_max: int
-) -> ForceTable:
+def parse_moticon_force_and_cop(text: str, where: str, values_max: int) -> ForceTable:
     """Parse force and centre of pressure of each sole: `left_fz`, `left_cop_x`, `left_cop_y`.
 
     Raises:

@@ -14,7 +14,7 @@ import numpy as np
 from devices.arrays import Floats
 from devices.errors import FileFormatError
 from storage.formats.readers.plate_signals import PlateSignals, make_plate_table
-from storage.formats.readers.table import ColumnFilter, ForceTable
+from storage.formats.readers.table import ForceTable
 from storage.formats.readers.text import (
     FORM,
     is_number,
@@ -45,9 +45,7 @@ def is_netforce(head: str) -> bool:
     return not all(a < b for a, b in pairwise(first))
 
 
-def parse_netforce_force_and_cop(
-    text: str, where: str, _is_needed: ColumnFilter, values_max: int
-) -> ForceTable:
+def parse_netforce_force_and_cop(text: str, where: str, values_max: int) -> ForceTable:
     """Parse the vertical force and centre of pressure of each plate, beside the numbered columns.
 
     Raises:

@@ -23,7 +23,7 @@ from storage.formats.readers.device_columns import (
     parse_device_columns,
 )
 from storage.formats.readers.plate_signals import PlateSignals, make_plate_table
-from storage.formats.readers.table import ColumnFilter, ForceTable
+from storage.formats.readers.table import ForceTable
 from storage.formats.readers.text import split_cells_without_empty_end
 
 FORM = "a section Devices: its rate, lines of devices, names and units, lines of numbers"
@@ -38,9 +38,7 @@ def is_nexus(head: str) -> bool:
     return _NAMES.search(head) is not None
 
 
-def parse_nexus_force_and_cop(
-    text: str, where: str, _is_needed: ColumnFilter, values_max: int
-) -> ForceTable:
+def parse_nexus_force_and_cop(text: str, where: str, values_max: int) -> ForceTable:
     """Parse the vertical force and centre of pressure of each plate, at the rate of the devices.
 
     Raises:

@@ -10,7 +10,6 @@ import re
 from typing import NoReturn
 
 from devices.errors import FileFormatError
-from storage.formats.readers.table import ColumnFilter
 
 _HEAD = re.compile(r"^sensor type:.*\n(?:.*\n){0,4}pressure values in\s+(\w+)", re.MULTILINE)
 _NAMES = re.compile(r"^time\[secs\][ \t]+1[ \t].*$", re.MULTILINE)
@@ -21,7 +20,7 @@ def is_pedar(head: str) -> bool:
     return _HEAD.search(head) is not None and _NAMES.search(head) is not None
 
 
-def refuse_pedar(text: str, where: str, _is_needed: ColumnFilter, values_max: int) -> NoReturn:
+def refuse_pedar(text: str, where: str, values_max: int) -> NoReturn:
     """Refuse pressures without areas.
 
     Raises:

@@ -6,6 +6,7 @@ Plate types: C3D user guide, FORCE_PLATFORM:TYPE.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,12 +47,19 @@ def compute_plate_pose(corners: Floats | None) -> PlatePose | None:
     return PlatePose(corners.mean(axis=1), np.stack([x, np.cross(z, x), z], axis=1), half)
 
 
+class PlateForce(NamedTuple):
+    """Force on a plate, in the file's units."""
+
+    fz: Floats
+    """(n,), along the plate's z."""
+    cop: Floats | None
+    """(2, n), from the middle; None: type 3 without the places of its sensors in the origin."""
+
+
 def compute_fz_and_local_cop(
     plate_type: int, channels: Floats, origin: Floats, length_factor: float = 1.0
-) -> tuple[Floats, Floats | None]:
-    """Return the force along z, (n,), and the centre of pressure from the middle, (2, n).
-
-    The centre of pressure is None for type 3 if the origin does not state where its sensors are.
+) -> PlateForce:
+    """Return the force along z and the centre of pressure from the middle.
 
     Args:
         plate_type: type of the plate.
@@ -61,13 +69,13 @@ def compute_fz_and_local_cop(
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         if plate_type == 1:
-            return channels[2], length_factor * channels[3:5]
+            return PlateForce(channels[2], length_factor * channels[3:5])
         if plate_type == 3:  # four sensors: Fx12 Fx34 Fy14 Fy23 Fz1 Fz2 Fz3 Fz4
             fx, fy = channels[0] + channels[1], channels[2] + channels[3]
             one, two, three, four = channels[4:8]
             fz = one + two + three + four
             if not (origin[0] > 0.0 and origin[1] > 0.0):
-                return fz, None
+                return PlateForce(fz, None)
             mx = origin[1] * (one + two - three - four)
             my = origin[0] * (-one + two + three - four)
             origin = np.array([0.0, 0.0, origin[2]])
@@ -79,7 +87,7 @@ def compute_fz_and_local_cop(
         my = my + fz * origin[0] - fx * origin[2]
         place = np.stack([-my, mx]) / fz
     place[:, ~np.isfinite(place).all(axis=0)] = np.nan
-    return fz, place
+    return PlateForce(fz, place)
 
 
 def correct_cop_for_bending(cop_mm: Floats, polynomial: Floats) -> Floats:
@@ -108,11 +116,17 @@ def compute_loaded_eccentricity(cop: Floats, fz: Floats, half_size: Floats) -> F
     return np.asarray(np.max(np.abs(cop[:, loaded]) / half_size[:, None], axis=0))
 
 
-def transform_cop_to_laboratory(cop: Floats, pose: PlatePose) -> tuple[Floats, str]:
-    """Return the centre of pressure (2, n) from the laboratory's origin, in the plate's plane.
+class PlacedCop(NamedTuple):
+    """Centre of pressure along axes of the laboratory."""
 
-    Also return a note about the axes used; empty if z is up and the plate lies flat.
-    """
+    cop: Floats
+    """(2, n), in the unit of the pose."""
+    note: str
+    """Remark about the axes; empty if z is up and the plate lies flat."""
+
+
+def transform_cop_to_laboratory(cop: Floats, pose: PlatePose) -> PlacedCop:
+    """Return a centre of pressure from the laboratory's origin, in the plate's plane."""
     normal, notes = -pose.axes[:, 2], []
     axis = int(np.argmax(np.abs(normal)))
     if axis == 2 and normal[2] < 0.0:
@@ -141,7 +155,7 @@ def transform_cop_to_laboratory(cop: Floats, pose: PlatePose) -> tuple[Floats, s
             f"it is tilted by {np.degrees(np.arccos(min(1.0, cos))):.1f} degrees: force is along "
             "its normal, and COP in its plane"
         )
-    return (to_z @ turn @ at)[:2], "; ".join(notes)
+    return PlacedCop((to_z @ turn @ at)[:2], "; ".join(notes))
 
 
 def _smallest_rotation(begin: Floats, end: Floats) -> Floats:

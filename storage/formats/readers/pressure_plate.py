@@ -9,19 +9,20 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from devices.arrays import Floats
 from devices.errors import FileFormatError
 from devices.input_files import check_regular_file
-from storage.formats.readers.table import ColumnFilter, ForceTable, make_table_with_standard_names
+from storage.formats.readers.table import ForceTable, make_table_with_standard_names
 
 _CELL_FACTORS = {"force_n": 1.0, "pressure_kpa": 1e3}
 """Factor of cells to newtons or to pascals, by name of the array."""
 
 
-def read_npz_pressure_plate(path: Path, is_needed: ColumnFilter, values_max: int) -> ForceTable:
+def read_npz_pressure_plate(path: Path, values_max: int) -> ForceTable:
     """Read a `.npz` file of cells as total force and centre of pressure; NaN if a cell is NaN.
 
     The centre of pressure is NaN without load.
@@ -60,12 +61,18 @@ def read_npz_pressure_plate(path: Path, is_needed: ColumnFilter, values_max: int
     grf_n, (cop_x_m, cop_y_m) = compute_total_force_and_cop(force_n, x_m, y_m)
     columns = {"time_s": time_s, "grf_n": grf_n, "cop_x_m": cop_x_m, "cop_y_m": cop_y_m}
     notes = (f"a plate of {cells.shape[1]} by {cells.shape[2]} cells, added up",)
-    needed = {name: column for name, column in columns.items() if is_needed(name)}
-    return make_table_with_standard_names(where, columns, needed, notes=notes)
+    return make_table_with_standard_names(where, columns, columns, notes=notes)
 
 
-def compute_total_force_and_cop(force_n: Floats, x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
-    """Return the total force (n,) and its centre of pressure (2, n) in m.
+class TotalForce(NamedTuple):
+    """Force of all cells (n,), and its centre of pressure (2, n), NaN without load."""
+
+    force_n: Floats
+    cop_m: Floats
+
+
+def compute_total_force_and_cop(force_n: Floats, x_m: Floats, y_m: Floats) -> TotalForce:
+    """Add up the cells of each of n frames.
 
     Args:
         force_n: (n, cells along x, cells along y), force of each cell.
@@ -74,7 +81,7 @@ def compute_total_force_and_cop(force_n: Floats, x_m: Floats, y_m: Floats) -> tu
     """
     total_n = force_n.sum(axis=(1, 2))
     moments = np.stack([force_n.sum(axis=2) @ x_m, force_n.sum(axis=1) @ y_m])
-    return total_n, moments / np.where(total_n > 0.0, total_n, np.nan)
+    return TotalForce(total_n, moments / np.where(total_n > 0.0, total_n, np.nan))
 
 
 def _read_arrays(path: Path, bytes_max: int) -> dict[str, Floats]:

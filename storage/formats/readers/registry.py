@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from devices.errors import FileFormatError, UsageError
@@ -30,17 +30,16 @@ class TextFormat:
 
     Attributes:
         matches_head: predicate of the first `HEAD_CHARACTERS` of a text.
-        read: function (text, path, column filter, limit of numbers) that returns the table.
+        read: function (text, path, limit of numbers) that returns the table, all its columns.
     """
 
     matches_head: Callable[[str], bool]
-    read: Callable[[str, str, ColumnFilter, int], ForceTable]
+    read: Callable[[str, str, int], ForceTable]
 
 
 TEXT_FORMATS: tuple[TextFormat, ...] = (
     TextFormat(is_bioware, parse_bioware_force_and_cop),
     TextFormat(is_nexus, parse_nexus_force_and_cop),
-    TextFormat(is_loadsol, parse_loadsol_forces),
     TextFormat(is_moticon, parse_moticon_force_and_cop),
     TextFormat(is_tekscan, parse_tekscan_force_and_cop),
     TextFormat(is_pedar, refuse_pedar),
@@ -54,7 +53,8 @@ class TableFormat:
 
     Attributes:
         endings: endings of its files, in lower case.
-        read: function (path, column filter, limit of numbers) that returns the table.
+        read: function (path, column filter, limit of numbers) that returns the table; it may
+            have columns that are not needed.
     """
 
     endings: tuple[str, ...]
@@ -67,10 +67,14 @@ def _read_text(
     options = options or TextOptions()
     text = read_decoded_text(path, options.encoding)
     head = text[:HEAD_CHARACTERS]
-    for one in () if options.has_layout_option else TEXT_FORMATS:
-        if one.matches_head(head):
-            return one.read(text, str(path), is_needed, values_max)
-    return parse_text_table(text, str(path), is_needed, values_max, options)
+    where = str(path)
+    if not options.has_layout_option:
+        if is_loadsol(head):  # each sole has times of its own, which must agree if both are needed
+            return parse_loadsol_forces(text, where, is_needed, values_max)
+        for one in TEXT_FORMATS:
+            if one.matches_head(head):
+                return one.read(text, where, values_max)
+    return parse_text_table(text, where, is_needed, values_max, options)
 
 
 TEXT = TableFormat((".csv", ".txt", ".tsv"), _read_text)
@@ -79,9 +83,9 @@ TABLE_FORMATS = (
     TEXT,
     BAG,
     TableFormat((".parquet",), read_parquet_table),
-    TableFormat((".c3d",), read_c3d_force_platforms),
+    TableFormat((".c3d",), lambda path, _, limit: read_c3d_force_platforms(path, limit)),
     TableFormat((".mot", ".sto"), read_opensim_table),
-    TableFormat((".npz",), read_npz_pressure_plate),
+    TableFormat((".npz",), lambda path, _, limit: read_npz_pressure_plate(path, limit)),
 )
 
 
@@ -103,15 +107,18 @@ def read_table(
         chosen = BAG
     try:
         if chosen is TEXT:
-            return _read_text(path, is_needed, values_max, text_options)
-        refuse_text_options(path, text_options)
-        return chosen.read(path, is_needed, values_max)
+            table = _read_text(path, is_needed, values_max, text_options)
+        else:
+            refuse_text_options(path, text_options)
+            table = chosen.read(path, is_needed, values_max)
     except MemoryError as error:
         raise FileFormatError(
             "there is not enough memory to read it",
             where=str(path),
             remedy="Lift the limit (ulimit -v), or cut out the part that is needed",
         ) from error
+    columns = {name: column for name, column in table.columns.items() if is_needed(name)}
+    return replace(table, columns=columns)
 
 
 def refuse_text_options(path: Path, text_options: TextOptions | None) -> None:

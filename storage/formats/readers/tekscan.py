@@ -16,7 +16,7 @@ from devices.arrays import Floats
 from devices.errors import FileFormatError
 from storage.formats.readers.plate_signals import PlateSignals, make_plate_table
 from storage.formats.readers.pressure_plate import compute_total_force_and_cop
-from storage.formats.readers.table import ColumnFilter, ForceTable, check_table_size
+from storage.formats.readers.table import ForceTable, check_table_size
 
 FORM = "facts above ASCII_DATA @@, then frames of ROWS lines with COLS cells"
 _BEGIN = re.compile(r"^ASCII_DATA @@[\s,]*^Frame \d+\b", re.MULTILINE)
@@ -32,9 +32,7 @@ def is_tekscan(head: str) -> bool:
     return _BEGIN.search(head) is not None
 
 
-def parse_tekscan_force_and_cop(
-    text: str, where: str, _is_needed: ColumnFilter, values_max: int
-) -> ForceTable:
+def parse_tekscan_force_and_cop(text: str, where: str, values_max: int) -> ForceTable:
     """Parse the frames of cells to total force and centre of pressure, from the sensor's middle.
 
     Raises:

@@ -17,7 +17,7 @@ import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from threading import Semaphore
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -105,7 +105,14 @@ def _encode_together(exports: Sequence[Export]) -> Iterator[bytes]:
         ) from error
 
 
-def _read_content(exports: Sequence[Export]) -> tuple[ParameterGroups, Floats]:
+class C3dContent(NamedTuple):
+    """Parameters by group and name, and analog samples (channels, n)."""
+
+    groups: ParameterGroups
+    samples: Floats
+
+
+def _read_content(exports: Sequence[Export]) -> C3dContent:
     tiles = sum(len(_load_bearing_tiles(export)) for export in exports)
     width = len(exports) * (len(_PLATFORM_CHANNELS) + len(OPTIONAL_COLUMNS) + 4) + tiles
     frames_max = min(FRAMES_MAX, NUMBERS_MAX // width)
@@ -114,10 +121,8 @@ def _read_content(exports: Sequence[Export]) -> tuple[ParameterGroups, Floats]:
     )
 
 
-def build_c3d_content(
-    reactions: Sequence[GroundReaction], exports: Sequence[Export]
-) -> tuple[dict[str, dict[str, Any]], Floats]:
-    """Return parameters by group and name, and analog samples, (channels, n).
+def build_c3d_content(reactions: Sequence[GroundReaction], exports: Sequence[Export]) -> C3dContent:
+    """Build the content of a C3D file.
 
     Values are arrays or lists of integers, floats or texts; the last dimension changes slowest in
     the file, as in the manual.
@@ -178,7 +183,7 @@ def build_c3d_content(
         )
         wrapped = {name: textwrap.wrap(text, _TEXT_MAX) or [" "] for name, text in texts.items()}
         groups["FOOTTILE" + (str(number) if len(reactions) > 1 else "")] = wrapped
-    return groups, analog
+    return C3dContent(groups, analog)
 
 
 def _metadata_texts(

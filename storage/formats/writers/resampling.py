@@ -50,7 +50,7 @@ class Resampling:
         return len(self.frame_before)
 
     @property
-    def time_s(self) -> Floats:
+    def elapsed_s(self) -> Floats:
         """Times of the samples (n,), in seconds since the first."""
         return np.arange(len(self)) / self.rate_hz
 

@@ -168,7 +168,7 @@ class _SessionEncoder:
         placed = make_resampling(axis, t_ns, flat["seq"], flat.get("part"))
         self._rate_hz = axis.rate_hz
         samples: dict[str, Array] = {
-            "t_ns": axis.begin_ns + np.rint(placed.time_s * 1e9).astype(np.int64)
+            "t_ns": axis.begin_ns + np.rint(placed.elapsed_s * 1e9).astype(np.int64)
         }
         for name, of in self._channel_quantities.items():
             values = _to_floats(flat[name], of)

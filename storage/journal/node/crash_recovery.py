@@ -41,7 +41,7 @@ def recover_ended_stream(folder: Path, problems: list[str]) -> NodeStream | None
         if left is None:
             return None
         # Frames in flight are read only in the boot in which they were written.
-        notes = StreamNotes(array_info=left[0], kernel_boot_id=read_kernel_boot_id())
+        notes = StreamNotes(array_info=left.array_info, kernel_boot_id=read_kernel_boot_id())
         stream = NodeStream(folder, notes, None)
     if stream.has_ended:
         return stream
@@ -49,7 +49,7 @@ def recover_ended_stream(folder: Path, problems: list[str]) -> NodeStream | None
         stream.mark_ended_in_memory()
         stream.set_max_lost_tail_in_memory()
         return stream
-    frames = left[1]
+    frames = left.frames
     if frames is not None:
         held, first = stream.stored, int(frames.seq[0])
         # Frames older than all stored ones were evicted, not lost in flight.

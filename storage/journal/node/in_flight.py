@@ -13,6 +13,7 @@ import struct
 import zlib
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -97,7 +98,15 @@ class InFlightWriter:
         self._map.close()
 
 
-def read_in_flight_of_this_boot(folder: Path) -> tuple[ArrayInfo, FrameBatch | None] | None:
+class InFlightFrames(NamedTuple):
+    """Frames that a killed process left."""
+
+    array_info: ArrayInfo
+    frames: FrameBatch | None
+    """None: no row is whole."""
+
+
+def read_in_flight_of_this_boot(folder: Path) -> InFlightFrames | None:
     """Read the newest gapless frames that a process killed in this boot left; or None.
 
     After a reboot it cannot: the file was never synced. Counted back from the newest frame, the
@@ -134,7 +143,7 @@ def read_in_flight_of_this_boot(folder: Path) -> tuple[ArrayInfo, FrameBatch | N
         and rows["t_mono_ns"][number] != 0
     ]
     if not good:
-        return info, None
+        return InFlightFrames(info, None)
     found = rows[np.array(good)]
     found = found[np.argsort(found["seq"])]
     steps = np.flatnonzero(np.diff(found["seq"]) != 1)
@@ -144,7 +153,7 @@ def read_in_flight_of_this_boot(folder: Path) -> tuple[ArrayInfo, FrameBatch | N
     }
     frames = FrameBatch(**columns)
     RangeDetector(info.tiles).flag_out_of_range(frames)  # as acquisition does when a batch is whole
-    return info, frames
+    return InFlightFrames(info, frames)
 
 
 def read_in_flight_frames_from(folder: Path, seq_first: int) -> FrameBatch | None:
@@ -155,7 +164,7 @@ def read_in_flight_frames_from(folder: Path, seq_first: int) -> FrameBatch | Non
         StorageError: it cannot be read now.
     """
     left = read_in_flight_of_this_boot(folder)
-    frames = None if left is None else left[1]
+    frames = None if left is None else left.frames
     if frames is None or int(frames.seq[-1]) < seq_first:
         return None
     return frames.slice_rows(max(0, seq_first - int(frames.seq[0])), len(frames))

@@ -99,7 +99,7 @@ class RetentionRequests:
     def required_numbers_of(self, stream_id: str) -> Intervals:
         """Return the numbers of a stream that servers or the node's own session need."""
         servers = list(self._servers.values())
-        return self.own_session_numbers_of(stream_id) | union(
+        return self.node_session_numbers_of(stream_id) | union(
             server.required_numbers_of(stream_id) for server in servers
         )
 
@@ -108,11 +108,11 @@ class RetentionRequests:
 
         Numbers of the node's own session stay included even if a server has them as well.
         """
-        return self.own_session_numbers_of(stream_id) | self.undelivered_numbers_of(
+        return self.node_session_numbers_of(stream_id) | self.undelivered_numbers_of(
             stream_id, acked_by
         )
 
-    def own_session_numbers_of(self, stream_id: str) -> Intervals:
+    def node_session_numbers_of(self, stream_id: str) -> Intervals:
         """Return the numbers of a stream that the node's own session needs."""
         return Intervals(self._local.get(stream_id, ()))
 
@@ -134,7 +134,7 @@ class RetentionRequests:
             del self._servers[server_id]
         return True
 
-    def set_own_session_numbers(self, numbers: Mapping[str, Intervals]) -> None:
+    def set_node_session_numbers(self, numbers: Mapping[str, Intervals]) -> None:
         """Set the numbers that the node's own session needs; that session stores them."""
         self._local = dict(numbers)
 

@@ -199,7 +199,7 @@ class NodeStream:
 
         Frames that a server has are not lost, except frames that the node's own session needs.
         """
-        needed_here = requests.own_session_numbers_of(self.stream_id)
+        needed_here = requests.node_session_numbers_of(self.stream_id)
         with self._lock:
             self._lost.add_if_new(numbers - (self._union_of_acked() - needed_here), reason)
 

@@ -86,12 +86,12 @@ def test_the_weakest_dome_that_covers_a_load_is_named() -> None:
 def test_a_load_within_the_papers_spread_is_only_perhaps_covered() -> None:
     found = select_dome_for_load(32.0)
     assert found is not None
-    assert (found.dome.name, found.judge_load(32.0)) == ("v60-11", "perhaps")
+    assert (found.dome.name, found.judge_slow_load(32.0)) == ("v60-11", "perhaps")
 
 
 def test_a_load_beyond_every_dome_has_none() -> None:
     assert select_dome_for_load(50.0) is None
-    assert all(found.judge_load(50.0) == "saturates" for found in list_saturation_loads())
+    assert all(found.judge_slow_load(50.0) == "saturates" for found in list_saturation_loads())
 
 
 def test_no_load_is_refused() -> None:

@@ -109,4 +109,4 @@ def test_while_a_session_cannot_be_read_every_stream_is_kept(
     with pytest.raises(FileFormatError):
         folder.load(begun.id)
     recording(None)
-    assert journal.retention_requests.own_session_numbers_of(stream_id).number_count > 10**9
+    assert journal.retention_requests.node_session_numbers_of(stream_id).number_count > 10**9

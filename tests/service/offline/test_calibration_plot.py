@@ -11,7 +11,7 @@ import pytest
 
 from devices.scene.scene_file import load_scene, validate_scene
 from service.estimation.calibration import Calibration
-from service.estimation.fitting.effects_fit import fit_effects, replay_release_and_tap
+from service.estimation.fitting.effects_fit import fit_determined_effects, replay_release_and_tap
 from service.estimation.fitting.rig.indentation import Indentation
 from service.offline.calibration_fit import fit_calibration, read_indentations
 from service.offline.calibration_lookup import replace_tiles
@@ -73,9 +73,9 @@ def test_a_soak_in_a_file_of_its_own_tells_the_same_of_warmth(bench: Bench) -> N
         )
 
     tile = calibration.get_tile("T01")
-    without = fit_effects([part(~soaks)], tile)
+    without = fit_determined_effects([part(~soaks)], tile)
     assert without.temperature is None
-    apart = fit_effects([part(~soaks), part(soaks)], tile)
+    apart = fit_determined_effects([part(~soaks), part(soaks)], tile)
     assert apart.temperature is not None
     assert tile.effects.temperature is not None
     assert apart.temperature.kpa_per_k.value == pytest.approx(

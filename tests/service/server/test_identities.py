@@ -47,11 +47,11 @@ class Machine:
             answer = Proof(secret=secret)
         claim = IdentityClaim(NODE, challenge, answer, ADDRESS)
         try:
-            is_proven = server.verify_or_refuse_claim(claim, NOW_T_NS)
+            verified = server.verify_or_refuse_claim(claim, NOW_T_NS)
         except CloseConnection as end:
             self.is_refused = end.code == LinkCloseCode.WRONG_IDENTITY
             return False
-        if not is_proven:
+        if verified == "first_contact":
             server.try_store_first_secret(claim)
         if dies_after == "keep":
             raise _Killed

@@ -354,7 +354,7 @@ def test_what_is_held_next_to_an_instant_is_the_same_whether_it_was_asked_before
             after = min((seq for seq in held if seq > at), default=None)
             assert found == (None if after is None else (until, after))
             # While frames in between may come, it may answer as before, but says that they lack.
-            lazy = stream.find_seqs_around(t_ns, min_seq=at_least, wait_for_missing=True)
+            lazy = stream.find_seqs_around(t_ns, min_seq=at_least, may_be_stale=True)
             assert (lazy is None) == (found is None)
             if lazy is not None and lazy != found:
                 assert stream.obtainable.restricted_to(lazy[0] + 1, lazy[1] - 1)

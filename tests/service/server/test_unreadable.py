@@ -170,7 +170,7 @@ def test_a_node_whose_files_cannot_be_read_is_left_out_until_it_connects(
         patched.setattr(durable_files, "_without_following", refuse)
         found = NodeRegistry(running.data)
     assert (list(found), contents(folder)) == ([], before)
-    assert name in found.problems[0]
+    assert name in found.file_problems[0]
     running.start()
     tared.connect()
     assert running.node()["tare"] is not None

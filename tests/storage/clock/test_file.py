@@ -129,7 +129,7 @@ def test_each_part_of_a_session_has_the_clock_of_its_stream(tmp_path: Path) -> N
     write_clock_file(tmp_path / "clock.parquet", measured("two", 3), facts)
     with SealedFileReader(path) as reader:
         table = load_clock_table(reader)
-    one, two = table.summarize().streams
+    one, two = table.summarize_streams().streams
     assert (one.stream_id, one.state, one.rows) == ("one", "unsynchronised", 0)
     assert (two.stream_id, two.state, two.rows) == ("two", "measured", 3)
     assert two.stretches[0].begin_t_ns == 9
@@ -140,7 +140,7 @@ def test_a_file_that_was_never_recorded_is_of_one_stream(tmp_path: Path) -> None
     facts = [StreamClockFacts("one", 7, False)]
     write_clock_file(tmp_path / "clock.parquet", measured("one", 3), facts)
     with SealedFileReader(path) as reader:
-        (stream,) = load_clock_table(reader).summarize().streams
+        (stream,) = load_clock_table(reader).summarize_streams().streams
     assert (stream.stream_id, stream.state) == ("one", "measured")
     assert stream.stretches[0].begin_t_ns == 7
 

@@ -90,7 +90,7 @@ def test_two_nodes_that_saw_the_same_event_agree_on_when_it_was(seed: int, since
 
 def test_a_summary_says_drift_and_offset_of_every_stream() -> None:
     node = NodeClock(booted_ns=300 * SECOND, wrong_ns=HOUR, drift_ppm=40.0)
-    (stream,) = node.table("b", 1).summarize().streams
+    (stream,) = node.table("b", 1).summarize_streams().streams
     assert (stream.stream_id, stream.state, stream.rows, stream.steps) == ("b", "measured", 30, ())
     (stretch,) = stream.stretches
     assert stretch.drift_ppm is not None
@@ -112,7 +112,7 @@ def test_the_servers_clock_set_by_an_hour_is_a_step_in_the_summary() -> None:
     table = ClockTable(
         group_rows_by_stream(rows), [StreamClockFacts("b", node.utc_offset_ns)], ["b"]
     )
-    (stream,) = table.summarize().streams
+    (stream,) = table.summarize_streams().streams
     assert [stretch.rows for stretch in stream.stretches] == [12, 18]
     (step,) = stream.steps
     assert abs(step.jump_ns - HOUR) <= step.jump_uncertainty_ns < 30_000_000
@@ -135,7 +135,7 @@ def test_a_node_that_was_started_anew_an_hour_off_has_two_streams_and_no_step() 
         ],
         ["one", "two"],
     )
-    assert [len(stream.steps) for stream in table.summarize().streams] == [0, 0]
+    assert [len(stream.steps) for stream in table.summarize_streams().streams] == [0, 0]
     t_mono_ns = np.array([first.t_mono_ns(SECOND), second.t_mono_ns(SECOND)])
     t_ns = t_mono_ns + np.array([first.utc_offset_ns, second.utc_offset_ns])
     columns = table.compute_server_time_columns(t_mono_ns, t_ns, np.array([0, 1], dtype=np.uint16))
@@ -155,7 +155,7 @@ def test_a_stream_that_nobody_measured_gets_no_time(clock_set: bool | None, stat
         [StreamClockFacts("other", node.utc_offset_ns), StreamClockFacts("mine", 0, clock_set)],
         ["other", "mine"],
     )
-    assert [stream.state for stream in table.summarize().streams] == ["measured", state]
+    assert [stream.state for stream in table.summarize_streams().streams] == ["measured", state]
     t_mono_ns = np.array([node.t_mono_ns(0)] * 3)
     part = np.array([0, 1, 7], dtype=np.uint16)
     columns = table.compute_server_time_columns(t_mono_ns, t_mono_ns, part)
@@ -166,7 +166,7 @@ def test_a_stream_that_nobody_measured_gets_no_time(clock_set: bool | None, stat
 def test_an_unsynchronised_node_that_was_measured_is_measured() -> None:
     node = NodeClock(booted_ns=300 * SECOND, wrong_ns=0, drift_ppm=0.0)
     table = node.table("b", 1, clock_set=False)
-    assert table.summarize().streams[0].state == "measured"
+    assert table.summarize_streams().streams[0].state == "measured"
 
 
 def test_instants_that_are_none_get_no_servers_time() -> None:

@@ -155,13 +155,13 @@ def test_ids_are_newest_first_and_other_names_are_none(tmp_path: Path) -> None:
         folder.save(session(one))
     for name in ("lost+found", ".20200131T235959Z-0a1b2c.tmp", "20200131"):
         (tmp_path / name).mkdir()
-    assert list(folder.list_ids()) == sorted(made, reverse=True)
+    assert list(folder.list_ids_newest_first()) == sorted(made, reverse=True)
 
 
 def test_a_folder_that_is_not_there_yet_has_no_sessions(tmp_path: Path) -> None:
-    assert list(SessionsFolder(tmp_path / "none").list_ids()) == []
+    assert list(SessionsFolder(tmp_path / "none").list_ids_newest_first()) == []
     (tmp_path / "file").write_bytes(b"")
-    assert list(SessionsFolder(tmp_path / "file").list_ids()) == []
+    assert list(SessionsFolder(tmp_path / "file").list_ids_newest_first()) == []
 
 
 # --- save and load --------------------------------------------------------------------------------

@@ -54,7 +54,7 @@ async def get_clock(
         )
     if session.sha256 is None:
         table = server.recorder.collect_inputs(session_id).make_clock_table()
-        return await run_in_threadpool(table.summarize)
+        return await run_in_threadpool(table.summarize_streams)
     return await run_in_threadpool(_read_sealed, session_id, server)
 
 
@@ -62,4 +62,4 @@ def _read_sealed(session_id: str, server: Server) -> ClockSummary:
     for name in (CLOCK_NAME, FRAMES_NAME):
         require_file(server.sessions.folder.get_path(session_id) / name)
     with server.sessions.open_frames(session_id) as reader:
-        return load_clock_table(reader).summarize()
+        return load_clock_table(reader).summarize_streams()

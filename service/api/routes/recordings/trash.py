@@ -44,5 +44,5 @@ async def restore_session(session_id: str, server: ServerState) -> SessionView:
 )
 async def empty_trash(server: ServerState) -> Emptied:
     """Delete all sessions in the trash for good."""
-    sessions, size_bytes = await server.empty_trash()
-    return Emptied(sessions=sessions, bytes=size_bytes)
+    deleted = await server.empty_trash()
+    return Emptied(sessions=deleted.session_count, bytes=deleted.size_bytes)

@@ -39,7 +39,7 @@ from service.protocol import (
     strip_binary_crc,
     strip_text_crc,
 )
-from service.server.identities import IdentityClaim
+from service.server.identities import IdentityClaim, VerifiedClaim
 from service.server.node import ServerNode
 from service.server.nodes import is_valid_node_name
 from service.server.server import NodeLink, Server
@@ -121,7 +121,7 @@ def _require_message(kind: type[_Message], message: str | bytes) -> _Message:
     return parsed
 
 
-def _verify_claim(server: Server, claim: IdentityClaim) -> bool:
+def _verify_claim(server: Server, claim: IdentityClaim) -> VerifiedClaim:
     before = server.identities.refused_machines.get(claim.node)
     try:
         with _close_on_storage_error():
@@ -150,13 +150,13 @@ def _close_on_storage_error() -> Iterator[None]:
 def _registered_node(server: Server, hello: Hello, claim: IdentityClaim) -> Iterator[NodeLink]:
     """Context manager: register a node's connection while the block runs."""
     name, stream_id = hello.array_info.node, hello.array_info.stream_id
-    is_proven = _verify_claim(server, claim)
+    verified = _verify_claim(server, claim)
     other = server.links.get(name)
     if other is not None:
         # A node that was restarted lists the stream it had before. The ids of streams are
         # public, so without a secret they prove nothing.
         known_ids = {stream_id, *(stream.array_info.stream_id for stream in hello.earlier)}
-        if not is_proven or other.node.stream_id not in known_ids:
+        if verified != "proven" or other.node.stream_id not in known_ids:
             raise CloseConnection(
                 LinkCloseCode.NAME_TAKEN,
                 f"a node {name!r} is connected already; give this one another name (--name)",
@@ -175,7 +175,7 @@ def _registered_node(server: Server, hello: Hello, claim: IdentityClaim) -> Iter
             raise
         code = LinkCloseCode.TRY_LATER if isinstance(error, StorageError) else LinkCloseCode.REFUSED
         raise CloseConnection(code, str(error)) from error
-    if not is_proven:
+    if verified == "first_contact":
         server.identities.try_store_first_secret(claim)
     link = server.links[name] = NodeLink(node)
     node.is_connected = True
@@ -184,7 +184,7 @@ def _registered_node(server: Server, hello: Hello, claim: IdentityClaim) -> Iter
     finally:
         if server.links.get(name) is link:
             del server.links[name]
-            node.on_disconnect()
+            node.mark_disconnected()
             server.notify_node_changed(node)
             log.info("node %s has gone", name)
 

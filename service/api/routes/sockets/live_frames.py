@@ -120,11 +120,9 @@ class LiveFeedSession:
                 self._position = Position(stream_id, last + 1)
             case _:
                 assert self._encoder is not None  # noqa: S101  # a stream has begun before
-                for message, following in self._encoder.encode_rows_with_next_seq(
-                    item, self._memory.encode_cache
-                ):
+                for message, next_seq in self._encoder.encode_rows(item, self._memory.encode_cache):
                     await self._send_message(message)
-                    self._position = Position(item.stream_id, following)
+                    self._position = Position(item.stream_id, next_seq)
 
     async def _send_message(self, message: str | bytes) -> None:
         """Send one message, once there is room for it.

@@ -7,6 +7,7 @@ tiles.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,7 +47,7 @@ _FLAT_NOISE = 0.6  # of the noise of a reading: block means scatter by less
 _RAIL_READINGS = 5  # fewer may be missing by chance
 
 
-def reject_insufficient_strokes(blocks: Strokes, where: str) -> None:
+def reject_unusable_strokes(blocks: Strokes, where: str) -> None:
     """Reject no load, a load of the wrong sign, too small a range, or a single repeat.
 
     Raises:
@@ -126,14 +127,22 @@ def reject_saturated_reference(recordings: Sequence[Indentation], blocks: Stroke
             )
 
 
+class UnsaturatedStrokes(NamedTuple):
+    """Blocks of strokes before the chip saturates."""
+
+    blocks: Strokes
+    does_saturate: bool
+    """True if the chip saturates behind them."""
+
+
 def select_before_saturation(
     recordings: Sequence[Indentation], blocks: Strokes, noise_kpa: float
-) -> tuple[Strokes, bool]:
-    """Return the blocks before the chip saturates, and whether it does."""
+) -> UnsaturatedStrokes:
+    """Return the blocks before the chip saturates, if it does."""
     wrapped = any(
-        bool(np.isinf(recording.kpa[begin:end]).any())
+        bool(np.isinf(recording.kpa[stroke.begin : stroke.end]).any())
         for recording in recordings
-        for begin, _, end in find_slow_stroke_rows(recording)
+        for stroke in find_slow_stroke_rows(recording)
     )
     limit_kpa = np.inf
     full_n = float(blocks.force_n.max())
@@ -146,8 +155,8 @@ def select_before_saturation(
         if np.ptp(rows.force_n[rows.gauge_kpa > flat_kpa]) > _MOVING_PART * full_n:
             limit_kpa = min(limit_kpa, flat_kpa)
     if np.isfinite(limit_kpa):
-        return blocks.select_rows(blocks.gauge_kpa <= limit_kpa), True
-    return blocks, wrapped
+        return UnsaturatedStrokes(blocks.select_rows(blocks.gauge_kpa <= limit_kpa), True)
+    return UnsaturatedStrokes(blocks, wrapped)
 
 
 def check_baseline_drift_kpa(recordings: Sequence[Indentation]) -> float:

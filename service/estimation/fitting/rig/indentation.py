@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -165,13 +166,23 @@ def average_stroke_blocks(*recordings: Indentation) -> Strokes:
 _Block = tuple[float, float, int, bool]
 
 
-def find_slow_stroke_rows(recording: Indentation) -> list[tuple[int, int, int]]:
-    """Return the rows of each slow stroke's first reading, turning point, and end (exclusive)."""
+class StrokeRows(NamedTuple):
+    """Rows of a slow stroke in its recording."""
+
+    begin: int
+    turn: int
+    """First row of the unloading."""
+    end: int
+    """Row behind the last."""
+
+
+def find_slow_stroke_rows(recording: Indentation) -> list[StrokeRows]:
+    """Return the rows of each slow stroke: phase load followed by phase unload."""
     label = np.where(recording.is_under_indenter, recording.phase, "")
     begins = np.flatnonzero(np.append(True, label[1:] != label[:-1]))
     ends = np.append(begins[1:], len(label))
     return [
-        (int(begins[i]), int(begins[i + 1]), int(ends[i + 1]))
+        StrokeRows(int(begins[i]), int(begins[i + 1]), int(ends[i + 1]))
         for i in range(len(begins) - 1)
         if (label[begins[i]], label[begins[i + 1]]) == ("load", "unload")
     ]
@@ -204,7 +215,8 @@ def _average_blocks(
 def compute_rest_before_strokes_kpa(recording: Indentation) -> Floats:
     """Compute the mean pressure in the last half second of rest before each slow stroke, or NaN."""
     found = []
-    for begin, _, _ in find_slow_stroke_rows(recording):
+    for stroke in find_slow_stroke_rows(recording):
+        begin = stroke.begin
         rest = np.arange(begin) >= _find_last_run(recording.phase[:begin] == "rest")
         rest &= recording.t_ns[:begin] >= recording.t_ns[begin] - REST_NS
         kpa = recording.kpa[:begin][rest]

@@ -48,7 +48,7 @@ def fit_unloaded_recovery(recording: Indentation) -> UnloadedRecovery | None:
     alone_s, alone_kpa = _extract_steady_soak(t_s, recording)
     if not len(alone_s) or np.ptp(alone_s) < _ALONE_S:
         return None
-    begins_s = t_s[[begin for begin, _, _ in find_slow_stroke_rows(recording)]]
+    begins_s = t_s[[stroke.begin for stroke in find_slow_stroke_rows(recording)]]
     at_s = np.append(begins_s, alone_s)
     kpa = np.append(compute_rest_before_strokes_kpa(recording), alone_kpa)
     known = np.isfinite(kpa)

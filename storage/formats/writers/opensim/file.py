@@ -93,7 +93,7 @@ def _encode_together(exports: Sequence[Export]) -> Iterator[bytes]:
     filled = [foot.loads.list_filled_stretches() for foot in feet]
     foot_notes = [_make_notes(foot, table) for foot, table in zip(feet, filled, strict=True)]
     events = [_make_event_table(foot.reaction) for foot in feet]
-    time_s = feet[0].reaction.resampling.time_s
+    time_s = feet[0].reaction.resampling.elapsed_s
     table = np.concatenate([time_s[:, None], *(foot.loads.table for foot in feet)], axis=1)
     sink = DrainedBuffer()
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:

@@ -132,7 +132,7 @@ def compute_gapless_foot_loads(
     known_n[unloaded] = 0.0
     known = np.isfinite(known_n)
     empty = ~reaction.resampling.has_frames
-    time_s = reaction.resampling.time_s
+    time_s = reaction.resampling.elapsed_s
     force_n, bridged = _fill_force_gaps(time_s, known_n, known)
     at = np.flatnonzero(stated)
     x_m, left_m = (np.interp(time_s, time_s[at], values[at]) for values in points)

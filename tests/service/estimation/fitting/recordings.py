@@ -10,8 +10,8 @@ from collections.abc import Callable
 import numpy as np
 
 from service.estimation.effects import WALL_PER_KPA, Effects
-from service.estimation.fitting.dome_model import DomeModel, compute_pressures_and_force_lag
-from service.estimation.fitting.effects_fit import fit_effects
+from service.estimation.fitting.dome_model import DomeModel, compute_dome_response
+from service.estimation.fitting.effects_fit import fit_determined_effects
 from service.estimation.fitting.rig.indentation import Indentation
 from service.estimation.fitting.static_fit import fit_static_curve
 from service.estimation.models.hysteresis import WIDTHS_N
@@ -49,11 +49,11 @@ def programme(
 def pressed_by_model(t_s: np.ndarray, force_n: np.ndarray) -> np.ndarray:
     """Pressures whose parameters are those above."""
     part, creep_s, loop = (np.array(values) for values in (PART, CREEP_S, LOOP))
-    kpa = compute_pressures_and_force_lag(
+    response = compute_dome_response(
         t_s, force_n, CURVE, SCALE_KPA, BASE_KPA, GAMMA, TAU_S, WALL_PER_KPA, part, creep_s, loop,
         WIDTHS_N, 0.0, 1.0, 4.0,
     )  # fmt: skip
-    return np.asarray(kpa[:, 0])
+    return response.kpa
 
 
 def flowing(t_s: np.ndarray, force_n: np.ndarray) -> np.ndarray:
@@ -63,7 +63,7 @@ def flowing(t_s: np.ndarray, force_n: np.ndarray) -> np.ndarray:
         CURVE, SCALE_KPA, BASE_KPA, WALL_PER_KPA, GAMMA, TAU_S, part, creep_s, loop, FLOW_PART,
         FLOW_N, FLOW_POWER,
     )  # fmt: skip
-    return np.asarray(model.compute_pressures_and_force_lag(t_s, force_n)[:, 0])
+    return np.asarray(model.compute_response(t_s, force_n).kpa)
 
 
 def recorded(
@@ -106,4 +106,4 @@ def recorded(
 
 
 def found_in(recording: Indentation) -> Effects:
-    return fit_effects([recording], fit_static_curve(recording))
+    return fit_determined_effects([recording], fit_static_curve(recording))

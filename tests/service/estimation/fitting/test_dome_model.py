@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.estimation.fitting.dome_model import compute_pressures_and_force_lag
+from service.estimation.fitting.dome_model import DomeResponse, compute_dome_response
 from service.estimation.models import flow, gas, hysteresis, rubber
 from service.estimation.models.hysteresis import WIDTHS_N
 from tests.builders.readings import through
@@ -27,23 +27,21 @@ def modelled(
     part: tuple[float, ...] = (),
     loop: tuple[float, ...] = (),
     flow: tuple[float, float, float] = (0.0, 1.0, 4.0),
-) -> np.ndarray:
-    return np.asarray(
-        compute_pressures_and_force_lag(
-            t_ns * 1e-9,
-            force_n,
-            CURVE,
-            SCALE_KPA,
-            BASE_KPA,
-            gamma,
-            0.011,
-            WALL,
-            np.array(part),
-            np.array(CREEP_S[: len(part)]),
-            np.array(loop),
-            WIDTHS_N[: len(loop)].copy(),
-            *flow,
-        )
+) -> DomeResponse:
+    return compute_dome_response(
+        t_ns * 1e-9,
+        force_n,
+        CURVE,
+        SCALE_KPA,
+        BASE_KPA,
+        gamma,
+        0.011,
+        WALL,
+        np.array(part),
+        np.array(CREEP_S[: len(part)]),
+        np.array(loop),
+        WIDTHS_N[: len(loop)].copy(),
+        *flow,
     )
 
 
@@ -74,7 +72,7 @@ def test_creep_and_loop_come_back_to_a_nanonewton(seed: int) -> None:
         hysteresis.HysteresisModel(np.array([LOOP])),
     )
     creep, nan = rubber.CreepModel(np.array([PART]), np.array([CREEP_S])), math.nan
-    felt_n = apparent_n(out[:, 0])
+    felt_n = apparent_n(out.kpa)
     felt_n = through(
         flow.compensate_flow, sprung.to_records(), flow.initial_state(1), felt_n, t_ns, nan, nan
     )
@@ -89,7 +87,7 @@ def test_creep_and_loop_come_back_to_a_nanonewton(seed: int) -> None:
         rubber.compensate_creep, creep.to_records(), rubber.initial_state(1), felt_n, t_ns, nan, nan
     )
     assert felt_n == pytest.approx(force_n, abs=1e-9)
-    assert out[:, 2] == pytest.approx(force_n - apparent_n(out[:, 0]), abs=1e-9)
+    assert out.force_lag_n == pytest.approx(force_n - apparent_n(out.kpa), abs=1e-9)
 
 
 @settings(max_examples=20)
@@ -105,14 +103,14 @@ def test_the_gas_comes_back_as_exactly_as_the_forward_model_is_solved(
         gas.compute_isothermal_pressure,
         model.to_records(),
         gas.initial_state(1),
-        out[:, 0],
+        out.kpa,
         t_ns,
         math.nan,
     )
     # After a long pause the inverse begins in equilibrium, where the rest of the heat is lost.
     long = np.diff(t_ns, prepend=t_ns[0]) > gas.RESTART_TIME_CONSTANTS * gamma * 0.011e9
-    off_kpa = np.abs(settled - out[:, 1])[1:]
-    jump_kpa = 0.5 * np.abs(np.diff(out[:, 1]))
+    off_kpa = np.abs(settled - out.isothermal_kpa)[1:]
+    jump_kpa = 0.5 * np.abs(np.diff(out.isothermal_kpa))
     assert (off_kpa[~long[1:]] <= ((gamma - 1) / gamma) ** 6 * 2.0 * jump_kpa.max() + 0.05).all()
     assert np.median(off_kpa) < 0.01
 
@@ -121,15 +119,15 @@ def test_without_effects_it_is_the_curve_turned_round() -> None:
     force_n = np.linspace(-2.0, 40.0, 100)
     out = modelled(np.arange(100) * 10**6, force_n)
     inside = (force_n >= 0.0) & (force_n <= CURVE.sum())
-    assert apparent_n(out[inside, 0]) == pytest.approx(force_n[inside], abs=1e-9)
-    assert out[:, 0].tolist() == out[:, 1].tolist()
-    assert (np.diff(out[:, 0]) > 0.0).all()
+    assert apparent_n(out.kpa[inside]) == pytest.approx(force_n[inside], abs=1e-9)
+    assert out.kpa.tolist() == out.isothermal_kpa.tolist()
+    assert (np.diff(out.kpa) > 0.0).all()
 
 
 def test_a_trial_curve_that_turns_over_still_has_pressures() -> None:
-    out = compute_pressures_and_force_lag(
+    out = compute_dome_response(
         np.linspace(0, 0.098, 50), np.linspace(0, 60, 50), np.array([20.0, -40.0, 5.0]), SCALE_KPA,
         BASE_KPA, 1.3, 0.011, WALL, np.array(PART), np.array(CREEP_S), np.array(LOOP), WIDTHS_N,
         0.08, 0.3, 4.0,
     )  # fmt: skip
-    assert np.isfinite(out).all()
+    assert np.isfinite(np.stack(out)).all()

@@ -13,9 +13,9 @@ import pytest
 from service.estimation.effects import WALL_PER_KPA, Effects
 from service.estimation.fitting.dome_model import DomeModel
 from service.estimation.fitting.effects_fit import (
-    collect_loadings_and_baseline_kpa,
+    collect_loadings,
     convert_centred_cubic_to_unit,
-    fit_effects,
+    fit_determined_effects,
 )
 from service.estimation.fitting.output_error import OutputErrorProblem
 from service.estimation.fitting.static_fit import fit_static_curve
@@ -135,7 +135,7 @@ def test_the_same_recording_gives_the_same_calibration(known: list[Effects]) -> 
     recording = recorded(seed=0)
     tile = fit_static_curve(recording)
     one = tile.model_copy(update={"effects": known[0]})
-    two = tile.model_copy(update={"effects": fit_effects([recording], tile)})
+    two = tile.model_copy(update={"effects": fit_determined_effects([recording], tile)})
     assert make_calibration(one).id == make_calibration(two).id
 
 
@@ -166,7 +166,7 @@ def test_without_a_soak_at_two_temperatures_there_is_neither_temperature_nor_amb
 def test_what_a_loading_is_off_by_if_it_is_held_out_is_what_a_fit_without_it_says() -> None:
     recording = recorded(strokes=3, holds=3, taps=6)
     tile = fit_static_curve(recording)
-    points, baseline_kpa = collect_loadings_and_baseline_kpa([recording])
+    points, baseline_kpa = collect_loadings([recording])
     static = DomeModel(
         convert_centred_cubic_to_unit(tile.coefficients),
         tile.range_kpa[1],

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from service.estimation.effects import WALL_PER_KPA
 from service.estimation.fitting.dome_model import DomeModel
 from service.estimation.fitting.effects_fit import (
-    collect_loadings_and_baseline_kpa,
+    collect_loadings,
     convert_centred_cubic_to_unit,
 )
 from service.estimation.fitting.least_squares import minimize_squares
@@ -72,7 +72,7 @@ def test_it_gets_out_of_a_bent_valley() -> None:
 def test_a_tiles_fit_is_that_of_a_long_search_within_a_small_part_of_its_sigma() -> None:
     recording = recorded(seed=0)
     tile = fit_static_curve(recording)
-    points, baseline_kpa = collect_loadings_and_baseline_kpa([recording])
+    points, baseline_kpa = collect_loadings([recording])
     static = DomeModel(
         convert_centred_cubic_to_unit(tile.coefficients),
         tile.range_kpa[1],

@@ -9,8 +9,8 @@ import pytest
 
 from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from service.estimation.effects import WALL_PER_KPA
-from service.estimation.fitting.dome_model import compute_pressures_and_force_lag
-from service.estimation.fitting.effects_fit import fit_effects
+from service.estimation.fitting.dome_model import compute_dome_response
+from service.estimation.fitting.effects_fit import fit_determined_effects
 from service.estimation.fitting.rig.indentation import Indentation
 from service.estimation.fitting.static_fit import fit_static_curve
 from service.estimation.models.hysteresis import WIDTHS_N
@@ -32,11 +32,11 @@ KPA_PER_K, STEP_K, CHIP_S, GAS_S, WARM_S = 0.297, 4.0, 1.2, 3.3, 25.0
 def slowly_crept(t_s: np.ndarray, force_n: np.ndarray) -> np.ndarray:
     """Pressures of a dome that creeps by 10 % within 3 s."""
     part, creep_s, loop = np.array([0.1]), np.array([3.0]), np.array(LOOP)
-    kpa = compute_pressures_and_force_lag(
+    response = compute_dome_response(
         t_s, force_n, CURVE, SCALE_KPA, BASE_KPA, GAMMA, TAU_S, WALL_PER_KPA, part, creep_s, loop,
         WIDTHS_N, 0.0, 1.0, 4.0,
     )  # fmt: skip
-    return np.asarray(kpa[:, 0])
+    return response.kpa
 
 
 def soaked(seed: int) -> Indentation:
@@ -56,7 +56,7 @@ def soaked(seed: int) -> Indentation:
 def test_a_dome_that_creeps_back_in_its_soak_follows_warmth_as_much_as_any_other() -> None:
     for seed in range(2):
         recording = soaked(seed)
-        warmth = fit_effects([recording], fit_static_curve(recording)).temperature
+        warmth = fit_determined_effects([recording], fit_static_curve(recording)).temperature
         assert warmth is not None
         low, high = warmth.kpa_per_k.interval_95
         assert low < KPA_PER_K < high

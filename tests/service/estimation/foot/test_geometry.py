@@ -80,7 +80,7 @@ def test_a_single_tile_has_no_edge_to_be_beyond() -> None:
 
 def test_tiles_a_micrometre_out_of_line_are_in_line() -> None:
     crooked = [(0.0, 0.0), (0.01, 4e-7), (0.02, -4e-7)]
-    assert len(compute_hull_half_planes(np.array(crooked))[0]) == 2
+    assert len(compute_hull_half_planes(np.array(crooked)).normals) == 2
 
 
 # --- grid -----------------------------------------------------------------------------------------

@@ -35,10 +35,8 @@ CURVE = np.array([22.0, 5.0, 5.0])  # newtons at the end of the range: 32
 def squeezed(force_n: Floats, gamma: float, tau_s: float, wall: float) -> tuple[Floats, Floats]:
     """Pressures that are read under a load every 2 ms, and those that the gas would settle at."""
     model = DomeModel(CURVE, SCALE_KPA, BASE_KPA, wall, gamma=gamma, tau_s=tau_s)
-    pressed = model.compute_pressures_and_force_lag(
-        STEP_S * np.arange(len(force_n), dtype=np.float64), force_n
-    )
-    return pressed[:, 0], pressed[:, 1]
+    pressed = model.compute_response(STEP_S * np.arange(len(force_n), dtype=np.float64), force_n)
+    return pressed.kpa, pressed.isothermal_kpa
 
 
 loads = st.lists(st.tuples(st.floats(0.0, 45.0), st.integers(1, 60)), min_size=1, max_size=12).map(
@@ -98,10 +96,10 @@ def read_n(force_n: Floats) -> Floats:
     curve = np.array([100.0, 0.0, 0.0])
     wall = GAS.wall_compliance_per_kpa
     model = DomeModel(curve, NEWTON_KPA, UNLOADED_KPA, wall, gamma=GAMMA, tau_s=TAU_S)
-    pressed = model.compute_pressures_and_force_lag(
+    pressed = model.compute_response(
         1e-9 * PERIOD_NS * np.arange(len(force_n), dtype=np.float64), force_n
     )
-    return np.asarray((pressed[:, 0] - UNLOADED_KPA) / COUNT_KPA)
+    return np.asarray((pressed.kpa - UNLOADED_KPA) / COUNT_KPA)
 
 
 def fast_load(peak_n: float) -> Floats:

@@ -135,9 +135,7 @@ def saturated_run(seed: int, *, lag_ms: float, stops_kpa: float = np.inf) -> Run
     rng = np.random.default_rng(seed)
     dome, plan = a_dome(rng, lag_ms)
     true_n = a_load(rng)
-    kpa = dome.compute_pressures_and_force_lag(
-        STEP_S * np.arange(len(true_n), dtype=np.float64), true_n
-    )[:, 0]
+    kpa = dome.compute_response(STEP_S * np.arange(len(true_n), dtype=np.float64), true_n).kpa
     e = estimate(plan, read(np.minimum(kpa, stops_kpa), rng))
     return Run(true_n, (e.estimate_flags & EstimateFlag.SATURATED) > 0, e)
 
@@ -147,9 +145,7 @@ def away_run(seed: int, *, lag_ms: float) -> Run:
     rng = np.random.default_rng(seed)
     dome, plan = a_dome(rng, lag_ms)
     true_n = np.minimum(a_load(rng), 25.0)
-    kpa = dome.compute_pressures_and_force_lag(
-        STEP_S * np.arange(len(true_n), dtype=np.float64), true_n
-    )[:, 0]
+    kpa = dome.compute_response(STEP_S * np.arange(len(true_n), dtype=np.float64), true_n).kpa
     away = np.zeros(len(true_n), dtype=bool)
     for _ in range(4):
         begin = rng.integers(200, len(true_n) - 800)
@@ -233,9 +229,7 @@ def test_any_batches_give_the_same_bits_through_what_is_unseen(
     rng = np.random.default_rng(seed)
     dome, plan = a_dome(rng, lag_ms)
     true_n = a_load(rng)[:1500]
-    kpa = dome.compute_pressures_and_force_lag(
-        STEP_S * np.arange(len(true_n), dtype=np.float64), true_n
-    )[:, 0]
+    kpa = dome.compute_response(STEP_S * np.arange(len(true_n), dtype=np.float64), true_n).kpa
     away = np.zeros(len(true_n), dtype=bool)
     begin = rng.integers(0, 1400)
     away[begin : begin + 60] = True

@@ -17,7 +17,7 @@ from service.server.broadcast.force_span import ForceSpan, nan_max, nan_min, sum
 from tests.builders.arrays import PERIOD_NS
 from tests.builders.frames import make_frames
 
-ONE, OTHER = "1" * 32, "2" * 32
+ONE = "1" * 32
 NAN = float("nan")
 
 
@@ -39,10 +39,10 @@ def span(first: int, n: int, *, period_ns: int = PERIOD_NS) -> ForceSpan:
 
 def filled(runs: Sequence[tuple[int, int]], period_ns: int = PERIOD_NS) -> ForceHistory:
     """Runs of missing frames and frames."""
-    recent, seq = ForceHistory(), 0
+    recent, seq = ForceHistory(ONE), 0
     for gap, n in runs:
         seq += gap
-        recent.add_span(ONE, span(seq, n, period_ns=period_ns))
+        recent.add_span(span(seq, n, period_ns=period_ns))
         seq += n
     return recent
 
@@ -111,7 +111,7 @@ def test_what_is_told_next_goes_on_where_it_ends(sizes: list[int], data: st.Data
     recent = filled([(0, n) for n in sizes])
     ends = np.cumsum([0, *sizes])
     told = data.draw(st.integers(max(0, len(sizes) - 30), len(sizes) - 1))  # of the last second
-    rows = recent.get_newest_spans(SECONDS_MAX, end_before_seq=int(ends[told]))
+    rows = recent.get_newest_spans(SECONDS_MAX, before_seq=int(ends[told]))
     if told:
         assert rows["seq"][-1] == ends[told] - 1
         assert rows["seq_first"][0] == 0
@@ -135,17 +135,18 @@ def test_so_many_seconds_are_given_as_were_asked_for(seconds: float) -> None:
     assert seconds - 0.1 < covered_s < seconds + 0.1
 
 
-def test_a_new_stream_begins_anew() -> None:
-    recent = filled([(0, 10)] * 300)
-    recent.add_span(OTHER, span(0, 10))
-    assert recent.stream_id == OTHER
-    assert recent.get_newest_spans(SECONDS_MAX)["seq"].tolist() == [9]
+def test_before_a_number_of_long_ago_no_frame_lacks() -> None:
+    recent = filled([(0, 1)] * 5000)
+    spans = recent.get_newest_spans(SECONDS_MAX)
+    joined = spans[spans["n"] > 1][-1]
+    older = recent.get_newest_spans(SECONDS_MAX, before_seq=int(joined["seq"]))
+    assert older["seq"][-1] == joined["seq"]
 
 
 def test_nothing_was_told_yet() -> None:
     assert (
-        len(ForceHistory().get_newest_spans(SECONDS_MAX))
-        == len(ForceHistory().get_newest_spans(1.0, end_before_seq=5))
+        len(ForceHistory(ONE).get_newest_spans(SECONDS_MAX))
+        == len(ForceHistory(ONE).get_newest_spans(1.0, before_seq=5))
         == 0
     )
 
@@ -153,12 +154,12 @@ def test_nothing_was_told_yet() -> None:
 @pytest.mark.parametrize(("frames", "gap"), [(10, 0), (1, 0), (1, 30)])
 def test_a_node_costs_180_kb_however_long_it_streams(frames: int, gap: int) -> None:
     base = span(0, frames)
-    recent, step = ForceHistory(), frames + gap
+    recent, step = ForceHistory(ONE), frames + gap
     for at in range(0, 32_000, step):
         t_ns = base.t_ns_first + at * PERIOD_NS
         times: dict[str, Any] = {"t_ns_first": t_ns, "t_ns": t_ns + (frames - 1) * PERIOD_NS}
         forces = dict.fromkeys(ForceSpan._fields[5:], float(at))
-        recent.add_span(ONE, base._replace(seq_first=at, seq=at + frames - 1, **(times | forces)))
+        recent.add_span(base._replace(seq_first=at, seq=at + frames - 1, **(times | forces)))
     kept = [recent._merged, *recent._as_published, *chain(*recent._as_published)]
     assert len(recent.get_newest_spans(SECONDS_MAX)) > 900
     assert 120_000 < sum(map(sys.getsizeof, kept)) < 180_000

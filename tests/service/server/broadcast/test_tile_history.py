@@ -68,7 +68,7 @@ def test_it_is_a_minute_in_tenths_of_a_second_and_no_more_of_it_than_is_asked_fo
     some, *_ = recent.get_newest_spans(10.0, "force_n")
     assert 98 <= len(some) <= 101
     before = int(rows["seq_first"][300])
-    older, *_ = recent.get_newest_spans(60.0, "force_n", begin_before_seq=before)
+    older, *_ = recent.get_newest_spans(60.0, "force_n", before_seq=before)
     assert older["seq"][-1] == before - 1
 
 

@@ -47,7 +47,7 @@ def test_a_straight_line_is_a_straight_line_however_frames_jitter(jitter: list[i
     found = at(t_ns)
     line = (t_ns - t_ns[0]) * 1e-6
     slack_ms = COINCIDENCE_PERIODS * PERIOD_NS * 1e-6 + 1e-9
-    np.testing.assert_allclose(found.interpolate(line), found.time_s * 1e3, atol=slack_ms)
+    np.testing.assert_allclose(found.interpolate(line), found.elapsed_s * 1e3, atol=slack_ms)
 
 
 @settings(max_examples=50, deadline=None)

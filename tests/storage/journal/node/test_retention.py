@@ -129,7 +129,9 @@ def test_what_the_nodes_own_session_needs_stays_whoever_has_it_besides(
 ) -> None:
     monkeypatch.setattr(retention, "RING_DURATION_NS", 100_000_000)
     monkeypatch.setattr("storage.journal.open_segments.SEGMENT_DURATION_NS", 20_000_000)
-    journal.retention_requests.set_own_session_numbers({stream.stream_id: Intervals([(0, NO_END)])})
+    journal.retention_requests.set_node_session_numbers(
+        {stream.stream_id: Intervals([(0, NO_END)])}
+    )
     fill(journal, stream, 0, 399)
     stream.record_acknowledgement("laptop", 0, 399)
     until(lambda: stream.stored.last == 399)

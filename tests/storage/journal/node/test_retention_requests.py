@@ -40,7 +40,7 @@ def test_one_server_does_not_give_up_what_another_needs(tmp_path: Path) -> None:
     wanted = RetentionRequests(tmp_path / "retention.json")
     wanted.update_request_in_memory("laptop", RetentionRequest(streams={"a": ((0, 9),)}))
     wanted.update_request_in_memory("other", RetentionRequest(streams={"a": ((5, 14),)}))
-    wanted.set_own_session_numbers({"a": Intervals([(100, 109)])})
+    wanted.set_node_session_numbers({"a": Intervals([(100, 109)])})
     assert wanted.required_numbers_of("a") == Intervals([(0, 14), (100, 109)])
     wanted.update_request_in_memory("laptop", RetentionRequest())
     assert wanted.required_numbers_of("a") == Intervals([(5, 14), (100, 109)])
