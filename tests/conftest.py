@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,6 +16,11 @@ from tests.tokens import SHARED_TOKEN
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # As of what a shell runs behind: processes of the tests would not hear Ctrl-C, either.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+TURN = os.environ.get("FOOTTILE_TURN")
+"""A number that every run of continuous integration has to itself."""
+PARTS = 4
+"""Into so many parts, by file, go tests that are `in_turn`: a run plays one of them."""
 
 # What a builder asserts is explained as in a test.
 pytest.register_assert_rewrite("tests.builders")
@@ -47,9 +53,20 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--soak", action="store_true", help="run what takes long, too")
 
 
+def is_of_this_run(item: pytest.Item) -> bool:
+    """Return whether this run plays a test marked `in_turn`. Without a turn it plays all."""
+    return TURN is None or zlib.crc32(item.path.name.encode()) % PARTS == int(TURN) % PARTS
+
+
+def pytest_report_header() -> str | None:
+    return f"in turn: part {int(TURN) % PARTS} of 0 to {PARTS - 1}" if TURN is not None else None
+
+
+@pytest.hookimpl(tryfirst=True)  # before -m chooses by these marks
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if config.getoption("--soak"):
-        return
+    plays_all = config.getoption("--soak")
     for item in items:
-        if item.get_closest_marker("soak"):
+        if item.get_closest_marker("in_turn") and (plays_all or not is_of_this_run(item)):
+            item.add_marker(pytest.mark.soak)
+        if not plays_all and item.get_closest_marker("soak"):
             item.add_marker(pytest.mark.skip(reason="takes long; run with --soak"))

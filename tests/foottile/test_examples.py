@@ -102,6 +102,7 @@ def test_every_line_for_the_shell_runs(
         assert not process.err
 
 
+@pytest.mark.in_turn
 def test_the_matlab_example_runs_in_octave(
     running: Running, left: FakeNode, tmp_path: Path
 ) -> None:

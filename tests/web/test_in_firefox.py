@@ -15,6 +15,7 @@ from tests.web.scripted import Scripted
 
 pytestmark = [
     pytest.mark.real_time,
+    pytest.mark.in_turn,
     pytest.mark.skipif(
         FIREFOX is None, reason="no Firefox; on Debian: sudo apt-get install firefox-esr"
     ),

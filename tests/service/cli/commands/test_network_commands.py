@@ -1,8 +1,10 @@
-"""`serve`, `node`, `demo`, `sessions`, `pull`, `export` as a user types them."""
+"""`serve`, `node`, `demo`, `sessions`, `pull`, `export` as a user types them.
+
+What serves is a process of its own; what asks it, or is refused, runs in that of the test.
+"""
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import socket
@@ -21,22 +23,12 @@ import pyarrow.parquet as pq
 import pytest
 
 import foottile
+from tests.service.cli.outcome import Run
 from tests.tokens import SHARED_BEARER
-from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.process
 
 COMMAND = [sys.executable, "-c", "from service.cli.main import main; main()"]
-
-
-def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [*COMMAND, *arguments],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        env={**os.environ, **environment},
-    )
 
 
 @dataclass
@@ -117,30 +109,30 @@ def session(demo: Demo) -> str:
 
 @pytest.mark.real_time
 def test_sessions_lists_what_the_server_has_and_what_the_folder_has(
-    demo: Demo, session: str
+    run: Run, demo: Demo, session: str
 ) -> None:
-    asked = json.loads(run("sessions", "--server", demo.url, "--json").stdout)["items"]
-    found = json.loads(run("sessions", "--data", str(demo.data), "--json").stdout)["items"]
+    asked = run("sessions", "--server", demo.url, "--json").printed()["items"]
+    found = run("sessions", "--data", str(demo.data), "--json").printed()["items"]
     assert [s["id"] for s in asked] == [s["id"] for s in found] == [session]
     assert asked[0]["complete"] is found[0]["complete"] is True
     for where in (("--server", demo.url), ("--data", str(demo.data))):
         wanted = ("--node", "demo", "--complete", "true", "--from", "2020-01-01", "--search", "1+1")
-        chosen = json.loads(run("sessions", *where, *wanted, "--json").stdout)["items"]
+        chosen = run("sessions", *where, *wanted, "--json").printed()["items"]
         assert [s["id"] for s in chosen] == [session]
         for other in (("--to", "2020-01-01"), ("--tag", "mud"), ("--take", "x")):
-            assert json.loads(run("sessions", *where, *other, "--json").stdout)["items"] == []
-    table = run("sessions", "--server", demo.url, COLUMNS="200")
-    assert session in table.stdout
-    assert "=1+1 [b]" in table.stdout
+            assert run("sessions", *where, *other, "--json").printed()["items"] == []
+    table = run("sessions", "--server", demo.url)
+    assert session in table.out
+    assert "=1+1 [b]" in table.out
 
 
 @pytest.mark.real_time
 def test_pull_brings_the_file_verified_and_at_once_the_second_time(
-    demo: Demo, session: str, tmp_path: Path
+    run: Run, demo: Demo, session: str, tmp_path: Path
 ) -> None:
     first = run("pull", session, "--server", demo.url, "--out", str(tmp_path), "--json")
-    assert first.returncode == 0, first.stderr
-    pulled = json.loads(first.stdout)
+    assert first.code == 0, first.err
+    pulled = first.printed()
     table = pq.read_table(pulled["path"])
     assert (np.diff(table["seq"].to_numpy()) == 1).all()
     assert len(table) == pulled["frames"]
@@ -150,22 +142,22 @@ def test_pull_brings_the_file_verified_and_at_once_the_second_time(
         "markers.parquet",
     }
     before = (folder / "frames.parquet").stat().st_mtime_ns
-    assert run("pull", session, "--server", demo.url, "--out", str(tmp_path)).returncode == 0
+    assert run("pull", session, "--server", demo.url, "--out", str(tmp_path)).code == 0
     assert (folder / "frames.parquet").stat().st_mtime_ns == before
 
 
 @pytest.mark.real_time
-def test_pull_of_what_is_not_there_says_so(demo: Demo, tmp_path: Path) -> None:
+def test_pull_of_what_is_not_there_says_so(run: Run, demo: Demo, tmp_path: Path) -> None:
     done = run("pull", "../../etc", "--server", demo.url, "--out", str(tmp_path))
-    assert done.returncode == 2
-    assert "foottile sessions" in done.stderr
+    done.fails(2, "foottile sessions")
     done = run("pull", "20200101T000000Z-000000", "--server", demo.url, "--out", str(tmp_path))
-    assert done.returncode == 1
-    assert "no session" in done.stderr
+    done.fails(1, "no session")
 
 
 @pytest.mark.real_time
-def test_exports_say_the_same_in_every_format(demo: Demo, session: str, tmp_path: Path) -> None:
+def test_exports_say_the_same_in_every_format(
+    run: Run, demo: Demo, session: str, tmp_path: Path
+) -> None:
     tables = {}
     for name in ("parquet", "arrow", "csv"):
         out = tmp_path / f"session.{name}"
@@ -173,7 +165,7 @@ def test_exports_say_the_same_in_every_format(demo: Demo, session: str, tmp_path
             *("export", session, "--data", str(demo.data), "--format", name, "--out", str(out)),
             *("--columns", "seq,t_ns,force_n,contact", "--start-s", "0.2", "--end-s", "0.9"),
         )
-        assert done.returncode == 0, done.stderr
+        assert done.code == 0, done.err
         tables[name] = {
             "parquet": pq.read_table,
             "arrow": lambda out: pa.ipc.open_file(out.read_bytes()).read_all(),
@@ -188,7 +180,7 @@ def test_exports_say_the_same_in_every_format(demo: Demo, session: str, tmp_path
     done = run(
         "export", session, "--data", str(demo.data), "--format", "parquet", "--out", str(whole)
     )
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.err
     t_ns = pq.read_table(whole)["t_ns"].to_numpy()
     since_s = (t_ns - t_ns[0]) * 1e-9
     within = t_ns[(since_s >= 0.2) & (since_s < 0.9)]
@@ -206,25 +198,23 @@ def test_exports_say_the_same_in_every_format(demo: Demo, session: str, tmp_path
     ],
 )
 def test_an_export_that_cannot_be_leaves_nothing(
-    demo: Demo, session: str, tmp_path: Path, options: tuple[str, ...], said: str
+    run: Run, demo: Demo, session: str, tmp_path: Path, options: tuple[str, ...], said: str
 ) -> None:
     out = tmp_path / "out.csv"
     done = run("export", session, "--data", str(demo.data), "--out", str(out), *options)
-    assert done.returncode == 2
-    assert said in done.stderr
+    done.fails(2, said)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.real_time
-def test_a_second_server_on_the_same_port_or_folder_is_refused(demo: Demo, tmp_path: Path) -> None:
+def test_a_second_server_on_the_same_port_or_folder_is_refused(
+    run: Run, demo: Demo, tmp_path: Path
+) -> None:
     port = demo.url.rsplit(":", 1)[1]
     done = run("serve", "--port", port, "--data", str(tmp_path / "other"))
-    assert done.returncode == 1
-    assert f"port {port}" in done.stderr
-    assert "--port" in done.stderr
+    done.fails(1, f"port {port}", "--port")
     done = run("serve", "--port", "0", "--data", str(demo.data))
-    assert done.returncode == 1
-    assert "another foottile server uses this data folder" in done.stderr
+    done.fails(1, "another foottile server uses this data folder")
 
 
 @pytest.mark.real_time
@@ -274,12 +264,12 @@ def test_a_demo_prints_one_link_that_logs_a_browser_in_and_commands_need_no_toke
 
 
 @pytest.mark.real_time
-def test_ctrl_c_seals_what_is_being_recorded(tmp_path: Path) -> None:
+def test_ctrl_c_seals_what_is_being_recorded(run: Run, tmp_path: Path) -> None:
     demo = start_demo(tmp_path)
     started = demo.post("/sessions", {"node": "demo", "name": "cut short"}).json()
     demo.process.send_signal(signal.SIGINT)
     assert ended(demo.process) == 0
-    (found,) = json.loads(run("sessions", "--data", str(demo.data), "--json").stdout)["items"]
+    (found,) = run("sessions", "--data", str(demo.data), "--json").printed()["items"]
     assert (found["id"], found["state"], found["complete"]) == (started["id"], "sealed", True)
     with pytest.raises(httpx.ConnectError):
         demo.get("/health")
@@ -314,15 +304,22 @@ def test_a_demo_ends_by_itself_after_its_seconds(tmp_path: Path) -> None:
     ],
 )
 def test_wrong_options_are_refused_with_the_reason(
-    arguments: tuple[str, ...], code: int, said: str, tmp_path: Path
+    run: Run,
+    arguments: tuple[str, ...],
+    code: int,
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    done = run(*arguments, XDG_DATA_HOME=str(tmp_path))
-    assert done.returncode == code, done.stderr
-    assert said in done.stderr
-    assert "Traceback" not in done.stderr
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    done = run(*arguments)
+    done.fails(code, said)
+    assert "Traceback" not in done.err
 
 
-def test_settings_come_from_option_environment_and_file_in_that_order(tmp_path: Path) -> None:
+def test_settings_come_from_option_environment_and_file_in_that_order(
+    run: Run, tmp_path: Path
+) -> None:
     config = tmp_path / "foottile.toml"
     config.write_text(f'port = 1\ndata = "{tmp_path / "from-file"}"\n')
     serve = subprocess.Popen(
@@ -339,13 +336,12 @@ def test_settings_come_from_option_environment_and_file_in_that_order(tmp_path: 
     assert not (tmp_path / "from-file").exists()
     config.write_text("prot = 1\n")
     done = run("serve", "--config", str(config))
-    assert done.returncode == 2
-    assert "prot" in done.stderr
+    done.fails(2, "prot")
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])  # noqa: S104  # of this test
 def test_a_token_is_made_kept_and_asked_for_and_commands_of_its_user_find_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, host: str
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, host: str
 ) -> None:
     monkeypatch.delenv("FOOTTILE_TOKEN")
     log = tmp_path.with_name("log")
@@ -376,7 +372,7 @@ def test_a_token_is_made_kept_and_asked_for_and_commands_of_its_user_find_it(
     by_name = httpx.get(f"{url}/api/v1/nodes", headers={"Host": "robot.example"}, trust_env=False)
     assert by_name.status_code == 200
     found = run("invite", "--server", url)
-    assert "/#ticket=" in found.stdout, found.stderr
+    assert "/#ticket=" in found.out, found.err
     serve.terminate()
     assert ended(serve) == 0
     said = log.read_text()
@@ -384,9 +380,8 @@ def test_a_token_is_made_kept_and_asked_for_and_commands_of_its_user_find_it(
     assert token not in said + line  # they may be a log
 
 
-def test_a_port_that_is_taken_by_somebody_else_is_named(tmp_path: Path) -> None:
+def test_a_port_that_is_taken_by_somebody_else_is_named(run: Run, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         done = run("demo", "--scene", str(tiny_scene(tmp_path)), "--port", str(port))
-    assert done.returncode == 1
-    assert f"port {port}" in done.stderr
+    done.fails(1, f"port {port}")

@@ -23,7 +23,7 @@ from tests.service.offline.archive.workers import counted, killed_at_two, raisin
 from tests.service.offline.archives import IDS, long_session
 from tests.service.sessions.pieces import calibration
 
-pytestmark = [pytest.mark.process, pytest.mark.slow]
+pytestmark = [pytest.mark.process, pytest.mark.slow, pytest.mark.in_turn]
 COPIES = 10
 STATIC = EstimateTask(calibration=None, models=("static",), lag_ms=100.0, scene=None, tare_s=None)
 

@@ -77,6 +77,7 @@ def _values(cell: ElementTree.Element) -> list[Any]:
     return [value] * times
 
 
+@pytest.mark.in_turn
 @pytest.mark.skipif(OFFICE is None, reason="LibreOffice is not installed: libreoffice-calc-nogui")
 @pytest.mark.parametrize(
     ("how", "options"),

@@ -133,6 +133,7 @@ def test_more_frames_than_its_limit_are_refused_with_the_slice_that_fits(
     assert loaded(written(sealed, Slice(0.0, 0.06)))["t_ns"].size == 30
 
 
+@pytest.mark.in_turn
 @pytest.mark.skipif(shutil.which("octave-cli") is None, reason="Octave is not installed")
 def test_octave_reads_it(sealed: Path, tmp_path: Path) -> None:
     path = tmp_path / "session.mat"
