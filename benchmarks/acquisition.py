@@ -5,7 +5,7 @@
 In virtual time: arrays of 1 to 64 tiles at 400 and 100 kHz, every part at 1.6 ms and drawn parts,
 the whole driver with self-test, audits and second looks, over emulated chips. The bound is the time
 that the transfers of a frame take on the wire with the true conversion times (hardware.md 4; the
-formulas are `devices.array.timing_budget`, tested against its tables). In real time: CPU of a frame
+formulas are `devices.array.schedules`, tested against its tables). In real time: CPU of a frame
 against as many bare ioctls.
 """
 
@@ -25,8 +25,8 @@ from typing import Any, get_args
 
 from smbus2 import SMBus, i2c_msg
 
+from devices.array.schedules import compute_frame_s
 from devices.array.startup import prepare_array
-from devices.array.timing_budget import compute_frame_s
 from devices.buses.i2c import I2cBus, open_bus
 from devices.clock import VirtualClock
 from devices.emulation.world import World

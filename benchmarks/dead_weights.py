@@ -16,7 +16,7 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.emulation.dome_physics import Domes
-from devices.emulation.part_families import draw_family_dome
+from devices.emulation.parts import draw_family_dome
 from devices.emulation.surroundings import Surroundings
 from devices.errors import CalibrationError
 from devices.scene.emulation_sections import PartFamily

@@ -38,8 +38,8 @@ from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, ArrayInfo, FrameBatch,
 from devices.scene.scene_file import Scene, load_scene
 from service.estimation.calibration import Calibration
 from service.estimation.estimate import Estimator
-from service.estimation.estimates import Estimates
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
+from service.estimation.records import Estimates
 from service.estimation.tare.unloaded_windows import compute_recording_tare
 from service.offline.calibration_lookup import find_calibration
 from service.offline.simulation import EmulatedRun, SimulationOptions

@@ -26,9 +26,11 @@ from storage.formats.load_trace import read_load_trace
 from studies.benchmark.draws import (
     BATCH_FRAMES,
     LAGS_MS,
+    ComparedModelSet,
     DrawRecording,
     DrawResult,
     compute_recording_accuracy,
+    list_model_sets,
     record_with_calibration,
     time_model_sets,
 )
@@ -37,7 +39,6 @@ from studies.benchmark.figures import (
     find_pareto_front,
     summarize_model_sets,
 )
-from studies.benchmark.model_sets import ComparedModelSet, list_model_sets
 
 MARK = "<!-- tables -->"
 FRAMES = {"live": 1000, "offline": 8 * BATCH_FRAMES["offline"]}

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from acquisition import scene_of
 
 from devices.acquisition import Acquisition
+from devices.array.schedules import compute_frame_s
 from devices.array.startup import prepare_array
-from devices.array.timing_budget import compute_frame_s
 from devices.arrays import Floats
 from devices.buses.i2c import i2c_msg, open_bus
 from devices.clock import Clock, SpinningClock, SystemClock, UtcAnchor

@@ -21,8 +21,7 @@ from recording_sealing import STATIC, sources_of
 from side_by_side import in_turns, note, spread, table
 
 from service.estimation.calibration import make_paper_shape_preset
-from service.offline.archive.query import run_query
-from service.offline.archive.session_search import find_sessions
+from service.offline.archive.query import find_sessions, run_query
 from service.sessions.sealing import seal_session
 from storage.journal.journal import Journal
 from storage.sessions.folder import FRAMES_NAME, Session, SessionsFolder

@@ -158,7 +158,7 @@ def _simulated(title: str, scene: Scene, seconds: float, load: LoadTrace | None)
 
 
 def _on_real_clock(tiles: int, seconds: float) -> Recording:
-    from service.rig.options import RigOptions
+    from service.rig.emulated_foot import RigOptions
     from service.rig.rig import Rig
 
     with ExitStack() as stack:

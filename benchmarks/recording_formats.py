@@ -20,7 +20,7 @@ from recording_data import Recording, batches
 from devices.frames import FrameBatch
 from storage.formats.sealed_export import make_sealed_export
 from storage.formats.slice import Slice
-from storage.formats.writers.arrow import ARROW
+from storage.formats.writers.tables import ARROW
 from storage.journal.journal import Journal
 from storage.schema import MEASURED_COLUMNS, to_flat_columns, wire_schema
 from storage.sessions.reader import SealedFileReader

@@ -93,8 +93,8 @@ def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
     from storage.journal.journal import Journal
     from storage.parquet_hash import fill_hash_placeholders_and_sync
     from storage.sessions import writer as session_file
-    from storage.sessions.content_hash import ContentDigest
     from storage.sessions.folder import Part, Session, SessionsFolder
+    from storage.sessions.footer import ContentDigest
     from storage.sessions.ledger import StreamState, compute_ledger
 
     hash_s = 0.0

@@ -15,10 +15,10 @@ from pathlib import Path
 
 from devices.buses.i2c import i2c_msg
 from devices.clock import VirtualClock
-from devices.emulation.buses.i2c import EmulatedI2cAdapter
 from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart, PartFaults
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.fault_timing import SceneFaults
+from devices.emulation.i2c_bus import EmulatedI2cAdapter
 from devices.scene.hardware_sections import ScheduleName
 from devices.scene.scene_file import load_scene
 from service.offline.calibration_lookup import find_calibration

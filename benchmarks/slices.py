@@ -39,12 +39,12 @@ from side_by_side import in_turns, note, spread, table
 from service.api.app import make_app
 from service.api.logins import Logins
 from service.estimation import OFFLINE_LAG_MS
-from service.offline.estimate.request import EstimateRequest
+from service.offline.estimate.preparation import EstimateRequest
 from service.offline.estimate.session import EstimateResult, estimate_session
 from service.server.server import Server
 from storage.formats.sealed_export import make_sealed_export
 from storage.formats.slice import Slice
-from storage.formats.writers.arrow import ARROW
+from storage.formats.writers.tables import ARROW
 from storage.parquet_hash import compute_sha256
 from storage.schema import ESTIMATE_COLUMNS, Array
 from storage.sessions.folder import (

@@ -45,7 +45,7 @@ class FrameBatch(ArrayRecord):
         temperature_raw: uint16[n, tiles], raw 10-bit temperature counts; `NOT_READ` where not read.
         sample_offset_us: int32[n, tiles], each tile's sample instant minus `t_ns`.
         servo_counts: int32[n], newest position, continued over whole turns (see
-            `devices.chips.dynamixel.turn_unwrapping`); `NO_SERVO_COUNTS` without servo.
+            `devices.chips.dynamixel.position_sources`); `NO_SERVO_COUNTS` without servo.
         servo_age_us: int32[n], its age at `t_ns`; `NO_SERVO_AGE` without servo.
         tile_flags: uint8[n, tiles], `TileFlag` bits.
         frame_flags: uint8[n], `FrameFlag` bits.

@@ -16,13 +16,12 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
 from foottile.closeable import AsyncCloseable
+from foottile.connection import AsyncWebsocket
 from foottile.data import Clock, SessionData
 from foottile.errors import FootTileError
-from foottile.live_protocol import FrameLoss, LiveRequest, Policy
-from foottile.live_state import LiveStreamState
+from foottile.live_protocol import FrameLoss, LiveRequest, LiveStreamState, Policy
 from foottile.server import Server
 from foottile.sessions import Marker, Session
-from foottile.websocket import AsyncWebsocket
 
 T = TypeVar("T")
 

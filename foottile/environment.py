@@ -1,4 +1,4 @@
-"""Environment variables from env files, service managers and Kubernetes."""
+"""Settings of a client: the server's address, and variables of the environment."""
 
 from __future__ import annotations
 
@@ -65,3 +65,11 @@ def check_token(token: str, where: str) -> str:
             "Copy the one that `foottile serve` shows or keeps in a file"
         )
     return token
+
+
+def decode_zone(url: str) -> str:
+    """Return an address with its IPv6 zone in the notation of sockets.
+
+    A URL has `%25` in front of the zone (RFC 6874): `http://[fe80::1%25eth0]:8000`; a socket, `%`.
+    """
+    return re.sub(r"(?<=\[)[^]]*(?=])", lambda host: host[0].replace("%25", "%"), url, count=1)

@@ -10,12 +10,10 @@ from contextlib import contextmanager
 from http import HTTPStatus
 from typing import Any
 
-from foottile.address import decode_zone
-from foottile.environment import check_token, read_token
+from foottile.connection import explain_foreign_response, explain_tls, make_context
+from foottile.environment import check_token, decode_zone, read_token
 from foottile.errors import FootTileError, ServerUnavailableError, UsageError, make_error
-from foottile.foreign_response import explain_foreign_response
 from foottile.local_server import find_local_server
-from foottile.tls import explain_tls, make_context
 
 try:
     import httpx

@@ -12,9 +12,9 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import ClientConnection, connect
 
 from foottile.closeable import Closeable
+from foottile.connection import Websocket
 from foottile.errors import FootTileError
-from foottile.live_state import LiveStreamState
-from foottile.websocket import Websocket
+from foottile.live_protocol import LiveStreamState
 
 
 class LiveStream(LiveStreamState, Closeable):

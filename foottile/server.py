@@ -11,7 +11,7 @@ from typing import Any
 from urllib.parse import quote
 
 from foottile.closeable import Closeable
-from foottile.files import download
+from foottile.data import download
 from foottile.http import HttpClient
 from foottile.live import LiveStream
 from foottile.live_protocol import FrameLoss, LiveRequest, Policy

@@ -12,9 +12,8 @@ from types import TracebackType
 from typing import Any, Self
 from urllib.parse import quote
 
-from foottile.data import Clock, SessionData
+from foottile.data import Clock, SessionData, download
 from foottile.errors import ConflictError, FootTileError
-from foottile.files import download
 from foottile.http import HttpClient
 
 _POLL_S = 0.2

@@ -1,6 +1,6 @@
 """Protocol between node and server, `foottile.v1`: messages, checksums, close codes.
 
-    node                                  server
+node                                  server
     identify (its name)              -->
                                      <--  challenge (a nonce)
     proof, hello (stored frames)     -->
@@ -23,14 +23,19 @@ Every message has a CRC-32 (zlib), because neither websockets nor Arrow detect a
 last four bytes of a binary message, little endian, over all before; the last field of a text
 message, `"crc32"` with eight hex digits, over the text before its comma. A message with a wrong
 CRC-32 ends the connection, and its content is sent again.
+
+Server and sessions only store it, for people and for `foottile node`; `devices.scene` interprets
+it.
 """
 
 from __future__ import annotations
 
+import json
+import math
 import re
 import zlib
 from enum import IntEnum
-from typing import Annotated, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -43,11 +48,56 @@ from pydantic import (
 
 from devices.errors import FileFormatError, LinkError
 from devices.frames import ArrayInfo
-from devices.types import Count, Identifier, OffsetNs, Seq, StrictModel, Text, TMonoNs, TNs
+from devices.types import (
+    Count,
+    Identifier,
+    OffsetNs,
+    Seq,
+    StrictModel,
+    Text,
+    TMonoNs,
+    TNs,
+    check_text,
+)
 from service.estimation.calibration import Calibration
-from service.private_paths import strip_private_folders
-from service.scene_content import SceneContent
+from service.user_folders import strip_private_folders
 from storage.intervals import NO_END
+
+SCENE_BYTES_MAX = 256 << 10
+_DEPTH_MAX = 16
+_KEY_LENGTH_MAX = 200
+_INTEGER_END = 2**63
+
+
+def _check_bounds(content: dict[str, Any]) -> dict[str, Any]:
+    _check_value(content, 0)
+    if len(json.dumps(content)) > SCENE_BYTES_MAX:
+        raise ValueError(f"is longer than {SCENE_BYTES_MAX} bytes")
+    return content
+
+
+def _check_value(value: Any, depth: int) -> None:
+    if depth > _DEPTH_MAX:
+        raise ValueError(f"is nested more than {_DEPTH_MAX} times")
+    if isinstance(value, dict):
+        for key, inside in value.items():
+            if len(key) > _KEY_LENGTH_MAX:
+                raise ValueError(f"has a key of {len(key)} letters")
+            check_text(key)
+            _check_value(inside, depth + 1)
+    elif isinstance(value, list | tuple):
+        for inside in value:
+            _check_value(inside, depth + 1)
+    elif isinstance(value, str):
+        check_text(value)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise ValueError("has a number that is not finite")
+    elif isinstance(value, int) and not -_INTEGER_END <= value < _INTEGER_END:
+        raise ValueError("has an integer of more than 64 bits")
+
+
+SceneContent = Annotated[dict[str, Any], AfterValidator(_check_bounds)]
+
 
 _T = TypeVar("_T")
 

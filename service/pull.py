@@ -25,11 +25,9 @@ from storage.durable_files import (
     write_atomically,
 )
 from storage.formats.export import ClockName
-from storage.formats.options import NO_OPTIONS, FormatOptions
-from storage.formats.slice import Slice
+from storage.formats.slice import NO_OPTIONS, FormatOptions, Slice
 from storage.formats.writers.format import ExportFormat
-from storage.hashed_table import parse_hashed_table
-from storage.parquet_hash import compute_sha256
+from storage.parquet_hash import compute_sha256, parse_hashed_table
 from storage.sessions.folder import FRAMES_NAME
 from storage.sessions.metadata import SESSION_NAME
 from storage.verify.export import RECOGNISED_FORMATS as PROVEN

@@ -1,16 +1,22 @@
-"""Folders of the user of the process: named by an option, else the system's default.
+"""Folders of the process's user, and the removal of private paths from messages to clients.
 
 A service may have no home: `docker run --user 12345`, `DynamicUser=` of systemd, an empty
 environment.
+
+A server registers its data folder. In its messages paths are relative to that folder; its log and
+local commands show whole paths.
 """
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator
 
 from devices.errors import UsageError
+from devices.text import escape_control_chars
 
 FolderKind = Literal["data", "state", "cache"]
 
@@ -69,3 +75,28 @@ def _is_writable(folder: Path) -> bool:
         return True
     above = next(each for each in folder.parents if each.exists())
     return os.access(above, os.W_OK | os.X_OK)
+
+
+_folders: list[str] = []
+"""Spellings of private folders, longest first."""
+
+
+def register_private_folder(folder: Path) -> None:
+    """Register a folder, to be removed by `strip_private_folders`."""
+    for path in (folder, folder.absolute(), folder.resolve()):
+        for text in (str(path), escape_control_chars(str(path))):
+            if len(text) > 1 and text not in _folders:  # "/" and "." are in every path
+                _folders.append(text)
+    _folders.sort(key=len, reverse=True)
+
+
+def strip_private_folders(text: str) -> str:
+    """Return a message with paths relative to the registered folders."""
+    for folder in _folders:
+        if folder in text:
+            text = text.replace(f"{folder}/", "").replace(folder, "the data folder")
+    return text
+
+
+PublicText = Annotated[str, AfterValidator(strip_private_folders)]
+"""Message of a server without private paths."""

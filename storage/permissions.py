@@ -1,14 +1,22 @@
-"""Permissions of the files that a process writes: for its user, and for a group if allowed."""
+"""Permissions of the files that a process writes, and files of secrets.
+
+A server keeps one in the folder of each node, a node one in its own folder. No other user may read
+it.
+"""
 
 from __future__ import annotations
 
 import errno
+import json
 import os
+import re
 import stat
+from collections.abc import Mapping
 from pathlib import Path
 
-from devices.errors import StorageError
+from devices.errors import DamagedFileError, StorageError
 from devices.text import is_utf8_encodable
+from storage.checksummed_json import read_checksummed_json, write_checksummed_json
 from storage.durable_files import (
     LOCK_NAME,
     make_synced_folder,
@@ -69,3 +77,42 @@ def set_umask_and_restrict_folder(folder: Path) -> None:
 def _has_only_our_files(folder: Path) -> bool:
     """Return whether the folder holds only files of ours; a home folder must stay as it is."""
     return {strip_damaged_or_temporary_marks(path.name) for path in folder.iterdir()} <= _OUR_NAMES
+
+
+SECRETS_NAME = "secrets.json"
+_SECRET = re.compile(r"[0-9a-f]{64}")
+_OWNER_ONLY = 0o600
+"""File permissions, also in a folder that its owner has opened to a group."""
+
+
+def read_secrets_or_empty(path: Path) -> dict[str, str]:
+    """Return the secrets by name, 64 hex digits each; empty if there is no file.
+
+    Raises:
+        DamagedFileError: its content has changed since it was written.
+        StorageError: it cannot be read now.
+    """
+    try:
+        content = json.loads(read_checksummed_json(path))
+    except FileNotFoundError:
+        return {}
+    found = content.get("secrets") if isinstance(content, dict) else None
+    if not isinstance(found, dict) or not all(
+        isinstance(secret, str) and _SECRET.fullmatch(secret) for secret in found.values()
+    ):
+        raise DamagedFileError(
+            "it holds no secrets", where=str(path), expected="64 hex digits by name"
+        )
+    return found
+
+
+def write_secrets(path: Path, secrets: Mapping[str, str]) -> None:
+    """Write the secrets atomically; they are on the disk when this returns.
+
+    Raises:
+        StorageError: the disk is full or not writable; the old file is unchanged.
+    """
+    with translate_storage_errors(path.parent):
+        make_synced_folder(path.parent)
+    text = json.dumps({"secrets": dict(secrets)}).encode()
+    write_checksummed_json(path, text, mode=_OWNER_ONLY)

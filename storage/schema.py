@@ -4,13 +4,21 @@ On the wire (and in a journal) a column with one value per tile is a fixed-size 
 message is read as numpy views without a copy. In a sealed file it is flat, `pressure_raw_0`,
 `pressure_raw_1`, ..., because that compresses best and any tool can read it. Units and meaning are
 in the field metadata of both, the array's description in the schema metadata.
+
+Where pandas is installed, pyarrow imports it when a process makes its first array, to recognise
+pandas types: 0.45 s of CPU and 35 MB. It tries only once. A later call of `to_pandas` still imports
+pandas.
 """
 
 from __future__ import annotations
 
 import hashlib
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -27,7 +35,30 @@ from devices.frames import (
     ArrayInfo,
     FrameBatch,
 )
-from storage.pyarrow_startup import skip_pyarrow_pandas_import
+
+
+class _PandasBlocker(MetaPathFinder):
+    """Import finder, before all others, that reports pandas as missing."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        if fullname == "pandas":
+            raise ModuleNotFoundError("not needed here", name=fullname)
+        return None
+
+
+def skip_pyarrow_pandas_import() -> None:
+    """Make pyarrow's one attempt to import pandas fail; no effect if pandas is loaded already."""
+    if "pandas" in sys.modules:
+        return
+    finder = _PandasBlocker()
+    sys.meta_path.insert(0, finder)
+    try:
+        pa.array([0])
+    finally:
+        sys.meta_path.remove(finder)
+
 
 skip_pyarrow_pandas_import()  # here: a schema is imported before any array is made
 
@@ -123,7 +154,7 @@ ESTIMATE_COLUMNS = (
         list_bits(EstimateFlag),
     ),
 )
-"""Columns that the estimator computes: `service.estimation.estimates.Estimates`."""
+"""Columns that the estimator computes: `service.estimation.records.Estimates`."""
 
 TRUTH_COLUMNS = (
     Column("true_force_n", pa.float64(), "N", "emulation: force on the dome along its axis", True),

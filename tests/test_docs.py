@@ -40,10 +40,10 @@ from devices.scene.scene_file import Scene, list_builtin_scenes, load_scene
 from service.api.app import make_app
 from service.api.logins import Logins
 from service.api.settings import Settings
-from service.cli.command_table import SUMMARIES, load_command
+from service.cli.main import SUMMARIES, load_command
 from service.estimation.calibration import TileCalibration
 from service.protocol import LinkCloseCode
-from service.server.broadcast.force_span import summarize_force
+from service.server.broadcast.history import summarize_force
 from service.server.broadcast.summary import PendingUpdate, summarize_frames
 from service.server.server import Server
 from storage.schema import COLUMNS_BY_NAME

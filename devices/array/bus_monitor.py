@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from devices.array.tile_io import Scan
+from devices.array.tile import Scan
 from devices.chips.tca9548a import MuxRouter
 from devices.clock import Clock
 from devices.errors import BusFaultError, BusSetupError
-from devices.recovery.bus_recovery import BusRecovery
+from devices.recovery import BusRecovery
 
 _RECOVERY_NS = (10_000_000, 1_000_000_000)
 """First and longest interval between recovery attempts."""

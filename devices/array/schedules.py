@@ -1,17 +1,23 @@
-"""Schedules: orders of one frame's transfers on the bus.
+"""Schedules of one frame's transfers on the bus, and the time each of them takes.
 
 Each schedule is a function that scans one frame of an array into a `Scan`. `TileArray` handles and
-flags faults; a schedule is only the order. `devices.array.timing_budget` predicts the durations. At
+flags faults; a schedule is only the order. `devices.array.schedules` predicts the durations. At
 400 kHz with four tiles of 1.6 ms: `sequential` 132 frames a second, `simultaneous` 395,
 `pipelined` 544 (hardware.md 4, strategies a, b, c; `per_mux` is d).
+
+Timing model of hardware.md 4: START, repeated START and STOP take one SCL period each, a byte nine;
+every transaction may have a fixed overhead, every sleep an overshoot. The schedules are in
+`devices.array.schedules`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol
+from dataclasses import dataclass
+from typing import Protocol, get_args
 
-from devices.array.tile_io import Scan
+from devices.array.tile import Scan
+from devices.errors import SceneError
 from devices.scene.hardware_sections import ScheduleName
 
 
@@ -83,3 +89,169 @@ SCHEDULES: Mapping[ScheduleName, Schedule] = {
     "pipelined": pipelined,
     "per_mux": per_mux,
 }
+
+
+SELECT_BITS = 20  # START, address, mask, STOP
+CONVERT_BITS = 29  # START, address, register, data, STOP
+_READ_BITS = 30  # START, address, register, repeated START, address, STOP
+_BYTE_BITS = 9  # eight bits and the acknowledge
+
+PREFERENCE: tuple[ScheduleName, ...] = ("simultaneous", "per_mux", "pipelined", "sequential")
+"""Order of preference among equally fast schedules: least skew first."""
+_AS_FAST = 0.995  # rates within half a percent count as equal
+
+
+def count_read_bits(n_bytes: float) -> float:
+    """Return the SCL periods of a read of `n_bytes` from a register."""
+    return _READ_BITS + _BYTE_BITS * n_bytes
+
+
+@dataclass(frozen=True)
+class BusTiming:
+    """Timing of a bus, its host and its parts.
+
+    Attributes:
+        scl_hz: real bus clock.
+        conversions_s: wait for each tile's conversion, in tile order.
+        muxes: mux address of each tile.
+        bytes_per_read: bytes of a sample, 4 with temperature and 2 without; a mean if decimated.
+        transaction_overhead_s: overhead of one transaction beyond its bits.
+        sleep_overshoot_s: overshoot of a sleep.
+    """
+
+    scl_hz: float
+    conversions_s: tuple[float, ...]
+    muxes: tuple[int, ...]
+    bytes_per_read: float = 4.0
+    transaction_overhead_s: float = 0.0
+    sleep_overshoot_s: float = 0.0
+
+    @property
+    def select_s(self) -> float:
+        """Duration of one write to a mux."""
+        return SELECT_BITS / self.scl_hz + self.transaction_overhead_s
+
+    @property
+    def convert_s(self) -> float:
+        """Duration of one CONVERT."""
+        return CONVERT_BITS / self.scl_hz + self.transaction_overhead_s
+
+    @property
+    def read_s(self) -> float:
+        """Duration of one read of a tile's sample."""
+        return count_read_bits(self.bytes_per_read) / self.scl_hz + self.transaction_overhead_s
+
+    @property
+    def tile_counts_by_mux(self) -> tuple[int, ...]:
+        """Number of tiles behind each mux."""
+        return tuple(self.muxes.count(mux) for mux in sorted(set(self.muxes)))
+
+
+def compute_frame_s(schedule: ScheduleName, timing: BusTiming) -> float:
+    """Compute the frame period of a schedule, in seconds."""
+    n, m = len(timing.muxes), len(timing.tile_counts_by_mux)
+    s, c, r = timing.select_s, timing.convert_s, timing.read_s
+    waits = [wait + timing.sleep_overshoot_s for wait in timing.conversions_s]
+    if n == 1:  # the mux stays selected, and nothing overlaps the wait
+        return c + waits[0] + r
+    if schedule == "sequential":
+        return n * (s + c + r) + sum(waits) + (m * s if m > 1 else 0.0)
+    if schedule == "simultaneous" or (schedule == "per_mux" and m == 1):
+        # The first select, and the closing of the other muxes, are hidden in the wait.
+        return m * s + c + max(*waits, m * s) + n * r + (n - 1) * s + (m - 1) * s
+    if schedule == "pipelined":
+        busy = n * (s + c + r) + (m * s if m > 1 else 0.0)
+        return max(busy, max(waits) + r + c)
+    start = 2 * s + c  # open a mux, convert, close it
+    reads = [count * (s + r) + s for count in timing.tile_counts_by_mux]
+    return max(m * start + sum(reads), max(waits) + start + max(reads))
+
+
+def compute_turns_s(timing: BusTiming) -> tuple[float, ...]:
+    """Compute the delay from the begin of a pipelined frame to each tile's read, without waits."""
+    turns = []
+    t_s, alone = 0.0, len(timing.muxes) == 1
+    for i, mux in enumerate(timing.muxes):
+        leaves = mux != timing.muxes[i - 1]  # the first tile comes after the last one
+        t_s += 0.0 if alone else (1 + leaves) * timing.select_s
+        turns.append(t_s)
+        t_s += timing.read_s + timing.convert_s
+    return tuple(turns)
+
+
+def compute_rates_hz(timing: BusTiming) -> dict[ScheduleName, float]:
+    """Compute the frame rate of every schedule."""
+    return {name: 1.0 / compute_frame_s(name, timing) for name in get_args(ScheduleName)}
+
+
+def count_broadcast_channels(schedule: ScheduleName, muxes: Sequence[int]) -> int:
+    """Return the largest number of channels that a schedule opens at once."""
+    if schedule == "simultaneous":
+        return len(muxes)
+    if schedule == "per_mux":
+        return max(muxes.count(mux) for mux in muxes)
+    return 1
+
+
+def check_broadcast_channels(
+    schedule: ScheduleName, muxes: Sequence[int], channels_max: int
+) -> None:
+    """Check that a schedule's broadcast does not exceed the drive strength of a part.
+
+    Every open channel adds its pull-ups, and in a read one part alone sinks their current: at most
+    3 mA at 0.4 V (TCA9548A data sheet 9.2.1, hardware.md 2).
+
+    Raises:
+        SceneError: more channels at once than `channels_max`.
+    """
+    width = count_broadcast_channels(schedule, muxes)
+    if width > channels_max:
+        raise SceneError(
+            f"schedule {schedule!r} opens {width} channels at once",
+            where="array.broadcast_channels",
+            expected=f"at most {channels_max}: one part has to sink the pull-ups of all of them",
+            remedy='Use schedule = "per_mux" or "pipelined"; raise the bound only if the pull-ups '
+            "of the channels are weak enough (10 kOhm for 8 channels)",
+        )
+
+
+@dataclass(frozen=True)
+class ScheduleChoice:
+    """Chosen schedule, and the reason in one sentence."""
+
+    schedule: ScheduleName
+    reason: str
+
+
+def choose_schedule(
+    timing: BusTiming, *, requested_rate_hz: float, channels_max: int
+) -> ScheduleChoice:
+    """Choose the schedule without skew if it is fast enough, else the fastest.
+
+    Args:
+        timing: measured timing of bus and parts.
+        requested_rate_hz: requested frame rate; 0: as fast as possible.
+        channels_max: largest number of channels open at once.
+    """
+    n, m = len(timing.muxes), len(timing.tile_counts_by_mux)
+    rates = {
+        name: rate
+        for name, rate in compute_rates_hz(timing).items()
+        if count_broadcast_channels(name, timing.muxes) <= channels_max
+    }
+    where = f"{n} tile{'s' * (n > 1)} on {m} mux{'es' * (m > 1)}"
+    if requested_rate_hz and rates.get("simultaneous", 0.0) >= requested_rate_hz:
+        return ScheduleChoice(
+            "simultaneous",
+            f"{where}: simultaneous has no skew and holds the {requested_rate_hz:g} frames/s "
+            "asked for",
+        )
+    best = max(rates.values())
+    name = next(name for name in PREFERENCE if rates.get(name, 0.0) >= _AS_FAST * best)
+    return ScheduleChoice(name, f"{where}: {format_rates(rates, name)}")
+
+
+def format_rates(rates: Mapping[ScheduleName, float], first: ScheduleName) -> str:
+    """Format rates as text, `first` first."""
+    others = [f"{other} {rate:.0f}" for other, rate in rates.items() if other != first]
+    return f"{first} gives {rates[first]:.0f} frames/s, {', '.join(others)}"

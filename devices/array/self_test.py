@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from devices.array.timing_budget import CONVERT_BITS, count_read_bits
+from devices.array.schedules import CONVERT_BITS, count_read_bits
 from devices.buses.i2c import I2cBus, i2c_msg
 from devices.chips.mpl115a2 import (
     ADDRESS,

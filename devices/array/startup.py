@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from devices.array.bus_monitor import RecoveryResult, recover_bus
+from devices.array.schedules import BusTiming, ScheduleChoice, choose_schedule, compute_frame_s
 from devices.array.self_test import (
     WireTiming,
     identify_tiles,
@@ -13,14 +14,13 @@ from devices.array.self_test import (
     measure_wire_timing,
 )
 from devices.array.tile_array import TileArray
-from devices.array.timing_budget import BusTiming, ScheduleChoice, choose_schedule, compute_frame_s
 from devices.buses.i2c import I2cBus, RetryingBus
 from devices.chips.mpl115a2 import CONVERSION_MAX_NS
 from devices.chips.tca9548a import MuxRouter
 from devices.clock import Clock
 from devices.errors import BusFaultError, SceneError
 from devices.frames import TileInfo
-from devices.recovery.bus_recovery import BusRecovery
+from devices.recovery import BusRecovery
 from devices.scene.hardware_sections import AnySchedule, ArraySection
 from devices.scene.scene_file import Scene
 

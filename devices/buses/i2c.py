@@ -17,7 +17,7 @@ from typing import Protocol
 from smbus2 import SMBus, i2c_msg
 from smbus2.smbus2 import I2C_RDWR, i2c_rdwr_ioctl_data
 
-from devices.buses.device_reopener import DeviceReopener
+from devices.buses.device_files import DeviceReopener
 from devices.errors import (
     BusFaultError,
     BusLostError,

@@ -12,7 +12,7 @@ import os
 import time
 from typing import Protocol
 
-from devices.buses.device_reopener import DeviceReopener
+from devices.buses.device_files import DeviceReopener
 from devices.errors import SpiSetupError, UsageError, require_extra
 
 MAX_SPEED_HZ = 1_000_000

@@ -18,10 +18,8 @@ import numpy as np
 from devices.arrays import Floats, Times
 from devices.chips.dynamixel.firmwares import COUNTS_PER_TURN
 from devices.clock import Clock
-from devices.emulation.buses.i2c import EmulatedI2cAdapter, FaultyWires
 from devices.emulation.chips.dynamixel import EmulatedServo
-from devices.emulation.chips.front_end import FrontEnd
-from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart, PartFaults
+from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart, FrontEnd, PartFaults
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.dome_physics import Domes
 from devices.emulation.fault_timing import SceneFaults
@@ -29,11 +27,10 @@ from devices.emulation.ground.grounds import get_tile_positions_m, make_ground
 from devices.emulation.ground.hopping import Hopping
 from devices.emulation.ground.indenter import IndentationProgramme, Indenter
 from devices.emulation.ground.load_trace import TileLoad
-from devices.emulation.part_families import draw_family_chip, draw_family_dome
-from devices.emulation.parts import make_rng
-from devices.emulation.plates.plate_load import PlateLoad
-from devices.emulation.puncture import Puncture
-from devices.emulation.surroundings import Surroundings
+from devices.emulation.i2c_bus import EmulatedI2cAdapter, FaultyWires
+from devices.emulation.parts import draw_family_chip, draw_family_dome, make_rng
+from devices.emulation.plates.plate import PlateLoad
+from devices.emulation.surroundings import Puncture, Surroundings
 from devices.scene.emulation_sections import (
     BUS_TARGET,
     DEFAULT_LEAK_S,

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self, get_args
 
 from pydantic import Field, model_validator
 
-from devices.scene.field_types import Kelvin, LoadN, NotNegative, Positive, SceneSection
+from devices.scene.hardware_sections import Kelvin, LoadN, NotNegative, Positive, SceneSection
 
 
 class NoGround(SceneSection):
@@ -112,7 +112,7 @@ GroundSection = Annotated[
 
 ReadDuringConversion = Literal["stale", "abort", "torn"]
 PartFamily = Literal["default", "broad", "table-1"]
-"""Family of emulated parts (`devices.emulation.part_families`)."""
+"""Family of emulated parts (`devices.emulation.parts`)."""
 
 
 class EmulationSection(SceneSection):

@@ -28,11 +28,13 @@ from devices.scene.emulation_sections import (
     NoGround,
     ServoFault,
 )
-from devices.scene.field_types import Name, NotNegative, SceneSection
 from devices.scene.hardware_sections import (
     ArraySection,
+    Name,
+    NotNegative,
     RecoverySection,
     ReferenceSection,
+    SceneSection,
     ServoSection,
     TileSection,
 )

@@ -17,25 +17,22 @@ from starlette.websockets import WebSocket
 from devices.errors import FootTileError
 from service.api import problems
 from service.api.guard import AccessGuard
-from service.api.head import HeadFromGet
 from service.api.logins import Logins
 from service.api.openapi import SWAGGER_FILES, add_security_scheme, find_swagger_folder
 from service.api.routes import calibrations, common, formats, health, index, login, nodes, weighings
 from service.api.routes.downloads import data, take_data, zips
 from service.api.routes.recordings import (
-    array,
-    clock,
     comparisons,
+    integrity,
     overview,
     sessions,
     stances,
     takes,
     trash,
-    verification,
 )
 from service.api.routes.sockets.ingest import serve_node
 from service.api.routes.sockets.live import serve_live
-from service.api.static_files import PageFiles
+from service.api.static_files import HeadFromGet, PageFiles
 from service.protocol import INGEST_PATH, LIVE_PATH
 from service.server.server import Server
 from service.version import SOFTWARE_VERSION
@@ -178,12 +175,10 @@ def _make_api_routes() -> tuple[BaseRoute, ...]:
         data,
         take_data,
         formats,
-        clock,
-        array,
+        integrity,
         stances,
         overview,
         comparisons,
-        verification,
     ):
         api.include_router(module.router)
     routes = APIRouter()

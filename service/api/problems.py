@@ -24,7 +24,7 @@ from devices.errors import (
     UnknownError,
     UsageError,
 )
-from service.private_paths import strip_private_folders
+from service.user_folders import strip_private_folders
 
 log = logging.getLogger("foottile.api")
 
@@ -123,7 +123,7 @@ def _allowed_methods(request: Request) -> list[str]:
     }
     found = found or {"GET"}  # a mount has files only
     if "GET" in found:
-        found.add("HEAD")  # see service.api.head
+        found.add("HEAD")  # see service.api.static_files
     return sorted(found | {"OPTIONS"})
 
 

@@ -11,9 +11,9 @@ from rich.table import Table
 from service.cli.report import ASSUMED_SCALE
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.effects import Effects, Parameter
-from service.estimation.estimates import SIGMAS_95
-from service.estimation.fitting.confidence import compute_student_t_95
+from service.estimation.fitting.least_squares import compute_student_t_95
 from service.estimation.models.hysteresis import WIDTHS_N
+from service.estimation.records import SIGMAS_95
 
 
 def make_calibration_tables(calibration: Calibration) -> list[Table]:

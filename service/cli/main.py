@@ -1,22 +1,113 @@
-"""Entry point of `foottile`."""
+"""Entry point of `foottile`.
+
+Importing all takes two thirds of a second, with numpy and pydantic's models of scenes.
+
+By default the allocators of Arrow and glibc retain each thread's peak: a server that had answered
+400 zooms into ten hours of 8 tiles held 80 MB.
+"""
 
 from __future__ import annotations
 
+import ctypes
 import io
 import os
 import signal
 import sys
+from collections.abc import Callable
 from contextlib import suppress
-from typing import Annotated
+from importlib import import_module
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from devices.errors import FootTileError, UsageError
 from devices.text import escape_control_chars, is_utf8_encodable
 from foottile.errors import FootTileError as ClientError
-from service.cli.command_table import LazyCommandGroup, add_summaries
-from service.memory import use_system_allocator
 from service.version import SOFTWARE_VERSION
+
+_M_ARENA_MAX = -8  # malloc.h of glibc
+
+
+def use_system_allocator() -> None:
+    """Use one heap of the system's allocator for all threads, and for Arrow.
+
+    Call it before pyarrow is imported, which then chooses its allocator, and before other threads
+    start. Child processes inherit the choice for Arrow.
+    """
+    os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:  # other C libraries lack it, and have one heap
+        mallopt(_M_ARENA_MAX, 1)
+
+
+_PACKAGE = "service.cli.commands"
+
+SUMMARIES = {
+    "demo": "Run a server and an emulated node, and print a link to the live page.",
+    "serve": "Run the server: live view, recording, REST API.",
+    "node": "Read an array, keep its frames on disk and send them to a server.",
+    "invite": "Create a one-time login link, and on a terminal its QR code.",
+    "accept-node": "Accept another machine under the name of a node.",
+    "sessions": "List recorded sessions, newest first.",
+    "pull": "Download a sealed session: data, description, markers.",
+    "stream": "Print live frames of a node with their estimates, one line each, until Ctrl-C.",
+    "export": "Write a sealed session, or a slice of it, in another format.",
+    "query": "Run SQL over all sealed sessions.",
+    "simulate": "Run a scene on emulated hardware in virtual time and write the session.",
+    "estimate": "Estimate a recorded session again and write it with the new estimates.",
+    "compare": "Compare a session with a reference: a force plate, an insole, another session.",
+    "calibrate": (
+        "Fit curve and effects of every tile in the recordings, with confidence intervals."
+    ),
+    "domes": "List the domes of the paper's Table I and their load ranges.",
+    "verify": "Verify sessions and journals from their files: checksums, hashes, order and ledger.",
+    "recover": "Repair journals and seal sessions after a crash, without a server.",
+    "doctor": "Find the tiles of a bus, measure it, and predict its frame rate.",
+    "reproduce": "Repeat the paper's experiments on emulated hardware.",
+    "benchmark": "Measure time and error of every model set.",
+}
+"""Summary of each command, the first sentence of its function, in the order of `--help`."""
+
+_MODULES = {"accept-node": "invite", "pull": "sessions", "export": "sessions"}
+"""Modules with more than one command."""
+
+
+def get_command_function(name: str) -> Callable[..., None]:
+    """Import and return the function of a command."""
+    function = name.replace("-", "_")
+    module = import_module(f"{_PACKAGE}.{_MODULES.get(name, function)}")
+    command: Callable[..., None] = getattr(module, f"{function}_command")
+    return command
+
+
+def load_command(name: str) -> Any:
+    """Return a command with its options, as typer runs it."""
+    from service.cli.options import require_finite_numbers
+
+    app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+    app.command(name)(require_finite_numbers(get_command_function(name)))
+    return typer.main.get_command(app)
+
+
+class LazyCommandGroup(TyperGroup):
+    """Command group with names and summaries that imports only the called command."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
+        """Return the called command, imported."""
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, command if name is None else load_command(name), rest
+
+
+def add_summaries(app: typer.Typer) -> None:
+    """Add names and summaries of the commands to a `LazyCommandGroup`."""
+    for name, summary in SUMMARIES.items():
+        app.command(name, help=summary)(_fail_unloaded)
+
+
+def _fail_unloaded() -> None:
+    raise AssertionError("a command is loaded before it runs")
+
 
 EXIT_INTERRUPTED = 130
 """Exit code after Ctrl-C, typer's and any shell's."""

@@ -19,8 +19,7 @@ from devices.text import escape_control_chars
 from service.cli.options import echo, remark, stderr
 
 if TYPE_CHECKING:
-    from service.offline.archive.job_runner import JobMapper, OutcomeCounts
-    from service.offline.archive.jobs import Job, Outcome
+    from service.offline.archive.jobs import Job, JobMapper, Outcome, OutcomeCounts
     from service.offline.archive.locations import SessionLocation
     from service.offline.archive.tasks import SessionTask
 
@@ -136,7 +135,7 @@ def run_jobs_with_report(
     Raises:
         UsageError: no job.
     """
-    from service.offline.archive.job_runner import OutcomeCounts, run_jobs
+    from service.offline.archive.jobs import OutcomeCounts, run_jobs
     from service.offline.archive.result_store import ResultStore
 
     jobs = iter(jobs)

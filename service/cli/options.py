@@ -279,7 +279,7 @@ class FootOptions:
         )
 
     def _make_plate_files(self, scene: Scene) -> PlateFiles:
-        from devices.emulation.plates.plate_load import check_plate_usable
+        from devices.emulation.plates.plate import check_plate_usable
         from service.rig.plate_files import PlateFiles
 
         for name, path, ending in (

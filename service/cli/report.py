@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from statistics import median
 
 from rich.table import Table
 
+from devices.errors import UsageError
 from service.cli.options import echo, remark, stdout
 from service.estimation.stances import Stance
 from service.offline.accuracy import MIN_COP_GRF_N, MIN_GRF_N, Accuracy
@@ -116,3 +120,30 @@ def format_stances(stances: Sequence[Stance]) -> str:
         f"{median(s.impulse_n_s for s in whole):.2f} N s, duration "
         f"{median(s.duration_s for s in whole):.2f} s"
     )
+
+
+@contextmanager
+def open_result_folder(out: Path) -> Iterator[Path]:
+    """Yield a folder, created if missing and removed again after an error if empty.
+
+    Raises:
+        UsageError: the folder cannot be created or written.
+    """
+    missing = [folder for folder in (out, *out.parents) if not folder.exists()]
+    try:
+        _make_folder(out)
+        yield out.resolve()
+    except BaseException:
+        for folder in missing:
+            with suppress(OSError):  # not empty, or not created yet
+                folder.rmdir()
+        raise
+
+
+def _make_folder(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"folder {str(out)!r} cannot be created: {error}") from error
+    if not os.access(out, os.W_OK):
+        raise UsageError(f"folder {str(out)!r} is not writable")

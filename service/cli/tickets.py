@@ -74,8 +74,7 @@ def remark_unreachable(urls: list[str], host: str) -> None:
         urls: addresses of the server.
         host: address on which it listens.
     """
-    from service.api.address import is_wildcard
-    from service.api.interfaces import list_addresses
+    from service.api.address import is_wildcard, list_addresses
 
     if is_wildcard(host) and not any(is_reachable(url) for url in urls):
         if list_addresses(include_ipv6=True):

@@ -18,32 +18,34 @@ from devices.arrays import Floats, Times
 from devices.flags import EstimateFlag
 from devices.frames import FrameBatch
 from devices.jit import jit_cached, jit_inlined
-from service.estimation.estimates import Estimates
 from service.estimation.foot import CONTACT_UNKNOWN
 from service.estimation.foot.contact import is_debounced
-from service.estimation.foot.geometry import transform_to_ground_x_m
-from service.estimation.foot.kinematics import interpolate_servo_counts
+from service.estimation.foot.geometry import interpolate_servo_counts, transform_to_ground_x_m
 from service.estimation.models import denoise
 from service.estimation.pipeline import grf_cop
-from service.estimation.pipeline.counts import append_frames_to_buffer
-from service.estimation.pipeline.frame_buffer import (
-    ROWS_MIN,
-    FrameBuffer,
-    TileSample,
-    compact_or_grow_buffer,
-    make_frame_buffer,
-)
 from service.estimation.pipeline.params import KernelParams, make_kernel_params
 from service.estimation.pipeline.plan import EstimationPlan
-from service.estimation.pipeline.sample_stage import compute_apparent_forces_and_contact
+from service.estimation.pipeline.sample_stage import (
+    append_frames_to_buffer,
+    compute_apparent_forces_and_contact,
+)
 from service.estimation.pipeline.smoothing_stage import (
     BOUND_SIGMAS,
     TILE_FORCE,
     TileForce,
     compute_forces_and_after_saturation,
 )
-from service.estimation.pipeline.state import FootState, TileState, initial_state
-from service.estimation.records import Columns, RecordArray, view_records_as_bytes
+from service.estimation.pipeline.state import (
+    ROWS_MIN,
+    FootState,
+    FrameBuffer,
+    TileSample,
+    TileState,
+    compact_or_grow_buffer,
+    initial_state,
+    make_frame_buffer,
+)
+from service.estimation.records import Columns, Estimates, RecordArray, view_records_as_bytes
 
 _COP_MASKED = int(EstimateFlag.COP_MASKED)
 _AFTER_SATURATION = int(EstimateFlag.AFTER_SATURATION)

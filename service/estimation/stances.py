@@ -17,9 +17,9 @@ import numpy.typing as npt
 
 from devices.arrays import Floats, Times
 from devices.flags import EstimateFlag
-from service.estimation.estimates import SIGMAS_95
 from service.estimation.foot import CONTACT_UNKNOWN, LONG_GAP_NS
-from service.estimation.stance_peak import PeakSearch
+from service.estimation.records import SIGMAS_95
+from service.estimation.stance_curves import PeakSearch
 
 STANCE_INPUT_COLUMNS = (
     "contact",
@@ -59,7 +59,7 @@ class Stance:
         end_t_ns: UTC of its last frame.
         duration_sigma_s: standard uncertainty of the duration (docs/method.md); NaN if the frame
             before or after the stance is missing, or if the GRF rises or falls too slowly there.
-        peak_grf_n: largest GRF without the bias by noise (`service.estimation.stance_peak`); NaN
+        peak_grf_n: largest GRF without the bias by noise (`service.estimation.stance_curves`); NaN
             without any, or if a tile was saturated, which hides the peak.
         peak_t_ns: UTC of the frame with that GRF; None without a peak.
         peak_sigma_n: standard uncertainty of the peak.

@@ -14,8 +14,14 @@ from pathlib import Path
 from devices.errors import FootTileError, StorageError
 from service.estimation.calibration import Calibration
 from service.server_clock import server_utc_ns
-from service.sessions.creation import continue_session, create_session, split_number
-from service.sessions.part_end import SessionStream, close_at_stream_end, close_unfinished
+from service.sessions.parts import (
+    SessionStream,
+    close_at_stream_end,
+    close_unfinished,
+    continue_session,
+    create_session,
+    split_number,
+)
 from storage.durable_files import remove_dead_process_temporaries
 from storage.intervals import NO_END, Intervals
 from storage.journal.node.journal import NodeJournal

@@ -16,16 +16,16 @@ from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.frames import CloseCode
 
 from devices.errors import LinkError
+from foottile.connection import AsyncWebsocket, make_context
 from foottile.local_server import find_local_server
-from foottile.tls import make_context
-from foottile.websocket import AsyncWebsocket
 from service.node.frame_sender import EstablishedLink, NodeCallbacks
-from service.node.server_connection import ServerConnection, parse_server_message
-from service.node.tcp_connect import (
+from service.node.server_connection import (
     ReconnectBackoff,
+    ServerConnection,
     connect_tcp,
     explain_connection_error,
     make_ingest_url,
+    parse_server_message,
 )
 from service.node_identity import compute_fingerprint, make_proof
 from service.protocol import (

@@ -22,9 +22,8 @@ from service.node.acquisition_process import (
 )
 from service.node.frame_sender import NodeCallbacks
 from service.node.local_recording import LocalRecording
-from service.node.options import NodeOptions
+from service.node.options import NodeOptions, ServerSecrets
 from service.node.publisher import Publisher
-from service.node.secrets import ServerSecrets
 from service.node.server_connection import make_hello
 from service.protocol import NodeStatus, RetentionMessage
 from storage.journal.node.journal import NodeJournal

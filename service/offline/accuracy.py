@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from devices.arrays import Bools, Floats
 from devices.flags import EstimateFlag
-from service.estimation.estimates import SIGMAS_95
+from service.estimation.records import SIGMAS_95
 
 ACCURACY_COLUMNS = (
     "t_ns",

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from service.estimation.calibration import Calibration, TileCalibration
-from service.estimation.fitting.confidence import (
+from service.estimation.fitting.effects_fit import ReplaySection, replay_release_and_tap
+from service.estimation.fitting.least_squares import (
     compute_curve_n,
     compute_mean_half_width_95_n,
     compute_new_loading_half_width_95_n,
 )
-from service.estimation.fitting.effects_fit import ReplaySection, replay_release_and_tap
 from service.estimation.fitting.rig.indentation import (
     Indentation,
     average_stroke_blocks,

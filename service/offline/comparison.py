@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,19 +10,27 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import pyarrow as pa
 
 from devices.arrays import Floats
 from devices.errors import ComparisonError, FileFormatError, UsageError
 from devices.flags import EstimateFlag
-from service.offline.compare.alignment import Alignment, align_signals
-from service.offline.compare.clock_lag import ClockLag, describe_clock_contradiction
+from service.json_output import to_json_text
+from service.offline.compare.alignment import (
+    Alignment,
+    ClockLag,
+    align_signals,
+    describe_clock_contradiction,
+)
 from service.offline.compare.error_figures import ComparisonErrors, compute_errors
 from service.offline.compare.paired_frames import (
     COMPARED_COLUMNS,
     Columns,
     PairedFrames,
     ReferenceSignals,
+    TrialMarker,
     pair_frames,
+    split_into_trials,
 )
 from service.offline.compare.plausibility import (
     advise_on_scale,
@@ -30,15 +39,25 @@ from service.offline.compare.plausibility import (
     check_time_unit,
     describe_implausible_alignment,
 )
+from service.offline.compare.plot import plot_comparison
+from service.offline.compare.report import FIGURES_WITH_LOWER_LIMIT, format_comparison_report
 from service.offline.compare.signals import ForceSignal
-from service.offline.compare.trials import TrialMarker, split_into_trials
-from storage.formats.readers.session import is_sealed_session_file
+from storage.checksummed_json import write_checksummed_json
+from storage.durable_files import write_atomically
+from storage.formats.readers.parquet import is_sealed_session_file
 from storage.formats.reference import ReferenceData, ReferenceOptions, read_reference
 from storage.formats.sealed_export import place_session_markers
 from storage.formats.slice import Slice
-from storage.schema import UNKNOWN_T_NS
+from storage.schema import UNKNOWN_T_NS, numpy_dtype_of
+from storage.sessions.comparisons import (
+    MAX_SERIES_ROWS,
+    REPORT_NAME,
+    SERIES_NAME,
+    SERIES_SCHEMA,
+    write_comparison_series,
+)
+from storage.sessions.metadata import MARKERS_NAME, load_clock_table, read_markers
 from storage.sessions.reader import SealedFileReader
-from storage.sessions.sidecars import MARKERS_NAME, load_clock_table, read_markers
 
 ROW_COLUMN = "row"
 """Column added to a session's columns: the frame's row in the file."""
@@ -332,3 +351,117 @@ def _give_advice(alignment: Alignment, options: CompareOptions) -> list[str]:
 def _has_any_flag(pairs: PairedFrames, bit: EstimateFlag) -> bool:
     status: npt.NDArray[np.uint16] = pairs.columns["estimate_flags"]
     return bool((status & np.uint16(bit)).any())
+
+
+_MISSING_FIGURE_HINTS = {
+    **dict.fromkeys(
+        ("grf_coverage_95",), ": give the reference's uncertainty with --reference-sigma-n"
+    ),
+    **dict.fromkeys(
+        ("cop_coverage_x_95", "cop_coverage_y_95"),
+        ": give the reference's COP uncertainty with --reference-cop-sigma-m",
+    ),
+    **dict.fromkeys(
+        ("cop_mean_m", "cop_p95_m", "cop_bias_x_m", "cop_bias_y_m", "cop_p95_about_mean_m"),
+        ": the reference has no centre of pressure under load",
+    ),
+}
+"""Requirement of each figure that may be missing, appended to error messages."""
+
+
+@dataclass(frozen=True)
+class WrittenComparison:
+    """Files of a comparison that were written.
+
+    Attributes:
+        content: content of `compare.json`.
+        report_text: content of `compare.md`.
+        missed_limits: descriptions of missed limits.
+    """
+
+    content: Mapping[str, Any]
+    report_text: str
+    missed_limits: tuple[str, ...]
+
+
+def write_comparison(
+    session_path: Path,
+    reference_path: Path,
+    options: CompareOptions,
+    limits: Mapping[str, float],
+    folder: Path,
+    title: str,
+) -> WrittenComparison:
+    """Compare a sealed session with a reference; write figures, report, plot and series.
+
+    `series.parquet` is not written if it would exceed `ROWS_MAX`.
+
+    Args:
+        session_path: the session's frames file.
+        reference_path: the reference file.
+        options: options of the comparison.
+        limits: limits of figures' means, by name.
+        folder: folder to write to.
+        title: title of report and plot.
+
+    Raises:
+        FootTileError: as for `compare_session`; or a file cannot be written.
+    """
+    found = compare_session(session_path, reference_path, options)
+    figures = found.errors.figures
+    missed = tuple(
+        missed_limit
+        for name, limit in limits.items()
+        if (missed_limit := _describe_missed_limit(name, figures[name].mean, limit)) is not None
+    )
+    text = format_comparison_report(
+        title,
+        found.alignment,
+        found.clock_lag,
+        found.pairs,
+        found.errors,
+        found.trial_definition,
+        (*found.notes, *found.advice),
+    )
+    png = plot_comparison(title, found.pairs, found.tile_force_n, found.serials, found.errors)
+    content = {**found.as_dict(), "limits": limits, "missed": missed}
+    write_checksummed_json(folder / REPORT_NAME, to_json_text(content).encode())
+    write_atomically(folder / "compare.md", text.encode())
+    write_atomically(folder / "compare.png", png)
+    if len(found.pairs.t_s) <= MAX_SERIES_ROWS:
+        write_comparison_series(folder / SERIES_NAME, _build_series(found.pairs))
+    else:  # of an earlier comparison
+        (folder / SERIES_NAME).unlink(missing_ok=True)
+    return WrittenComparison(content, text, missed)
+
+
+def _build_series(pairs: PairedFrames) -> pa.Table:
+    """Build the table of our frames at which the reference is known."""
+    cop_m = np.where(pairs.reference_contact[:, None], pairs.reference_cop_m, np.nan)
+    columns = {
+        "t_ns": pairs.columns["t_ns"],
+        "grf_n": pairs.columns["grf_n"],
+        "reference_grf_n": pairs.reference_n,
+        "reference_cop_x_m": cop_m[:, 0],
+        "reference_cop_y_m": cop_m[:, 1],
+    }
+    return pa.table(
+        [
+            # from_pandas: NaN is null
+            pa.array(columns[field.name].astype(numpy_dtype_of(field.type)), from_pandas=True)
+            for field in SERIES_SCHEMA
+        ],
+        schema=SERIES_SCHEMA,
+    )
+
+
+def _describe_missed_limit(name: str, mean: float, limit: float) -> str | None:
+    """Describe a missed limit; None if it is met."""
+    if math.isnan(mean):
+        hint = _MISSING_FIGURE_HINTS.get(name, "")
+        return f"{name} is not known here, and was limited to {limit:g}{hint}"
+    if name in FIGURES_WITH_LOWER_LIMIT:
+        kept, words = mean >= limit, "at least"
+    else:
+        kept, words = abs(mean) <= limit, "at most"
+    return None if kept else f"{name} is {mean:.4g}, and was to be {words} {limit:g}"

@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.acquisition import Acquisition
+from devices.array.schedules import ScheduleChoice
 from devices.array.startup import prepare_array
-from devices.array.timing_budget import ScheduleChoice
 from devices.buses.i2c import open_bus
 from devices.chips.dynamixel.driver import open_servo
 from devices.chips.dynamixel.position_sources import VirtualTimeServoSource
@@ -33,9 +33,8 @@ from devices.frames import FrameBatch
 from devices.scene.hardware_sections import AnySchedule, ServoSection
 from devices.scene.scene_file import Scene
 from service.offline.estimate_summary import EstimateSummarizer, EstimateSummary
-from service.rig.array_info import make_array_info
 from service.rig.emulated_foot import EmulatedFoot
-from service.rig.rig import open_reference_sensor, open_scene_recovery
+from service.rig.rig import make_array_info, open_reference_sensor, open_scene_recovery
 from service.sessions.pipeline import EstimateOptions, EstimateStream, Extra, make_estimate_metadata
 from storage.sessions.writer import SealedFileWriter
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from devices.clock import Clock
 from devices.emulation.ground.grounds import convert_load_for_scene
 from devices.emulation.ground.load_trace import CopTransform, LoadTrace, TileLoad
 from devices.errors import require_extra
+from devices.scene.hardware_sections import EMULATED
 from devices.scene.scene_file import Scene
 from service.rig.plate_files import PlateFiles, write_plate_files
 
@@ -81,3 +83,20 @@ class EmulatedFoot:
             StorageError: a file cannot be written.
         """
         write_plate_files(self.plates, world, end_ns, seed=self.seed, parts_seed=self.parts_seed)
+
+
+@dataclass(frozen=True)
+class RigOptions:
+    """Options of a rig; `foot` is for emulation only."""
+
+    scene: Scene
+    node_name: str
+    foot: EmulatedFoot = EmulatedFoot()  # frozen, so one for all is safe
+    journals_folder: Path | None = None
+    """Folder of the node's journals, for the files of frames in flight in a subfolder per stream.
+    """
+
+    @property
+    def is_emulated(self) -> bool:
+        """True if the tiles are emulated."""
+        return self.scene.array.bus == EMULATED

@@ -20,7 +20,7 @@ from devices.errors import require_extra
 from storage.durable_files import write_atomically
 
 if TYPE_CHECKING:
-    from devices.emulation.plates.plate_clock import PlateClock
+    from devices.emulation.plates.plate import PlateClock
     from devices.emulation.world import World
 
 RECORDED_MAX_S = 120.0
@@ -81,7 +81,7 @@ def _record_force_plate(
     with require_extra("emulation", "an emulated plate"):
         from devices.emulation.parts import make_rng
         from devices.emulation.plates.force_plate import CHANNELS, ForcePlate
-        from devices.emulation.plates.plate_load import VERTICAL
+        from devices.emulation.plates.plate import VERTICAL
 
     one = ForcePlate.draw(make_rng(f"force plate/{plate}"), make_rng(f"force plate on {trial}"))
     time_s, channels = one.simulate_recording(

@@ -1,40 +1,181 @@
 """Rig on a real clock: array, servo, reference force sensor and recovery lines, ready to stream.
 
 Each may be real or emulated.
+
+The rate of a trial is estimated from its fastest runs of frames; a stream that is faster than its
+nominal rate disproves that rate.
+
+A busy machine reads few frames in a second, so a load that begins after a fixed time alone could
+begin too early.
 """
 
 from __future__ import annotations
 
 import sys
 import uuid
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from devices.acquisition import Acquisition
 from devices.array.startup import ReadyArray, prepare_array, reidentify_replaced_tiles
 from devices.buses.i2c import open_bus
 from devices.buses.spi import open_spi
 from devices.chips.dynamixel.driver import open_servo
+from devices.chips.dynamixel.firmwares import COUNTS_PER_TURN
 from devices.chips.dynamixel.position_sources import ThreadedServoSource
 from devices.chips.mcp3208 import Mcp3208
 from devices.clock import Clock, SpinningClock, SystemClock, UtcAnchor
 from devices.errors import FootTileError, I2cError, TileSetupError, UsageError
-from devices.flags import FrameFlag
-from devices.frames import ArrayInfo, FrameBatch
+from devices.flags import FrameFlag, TileFlag
+from devices.frames import ArrayInfo, FrameBatch, ServoInfo, TileInfo
 from devices.realtime import is_clock_set, set_timer_slack, use_realtime_priority
-from devices.recovery.bus_recovery import BusRecovery, GpioRecovery, open_gpio_recovery
+from devices.recovery import BusRecovery, GpioRecovery, open_gpio_recovery
 from devices.reference_force import ReferenceForceSensor
-from devices.scene.hardware_sections import EMULATED, ServoSection
+from devices.scene.hardware_sections import EMULATED, ScheduleName, ServoSection
 from devices.scene.scene_file import Scene
-from service.rig.array_info import make_array_info
-from service.rig.frame_rate import FrameRateMonitor, estimate_undisturbed_rate_hz
-from service.rig.load_trigger import LoadTrigger
-from service.rig.options import RigOptions
+from service.rig.emulated_foot import RigOptions
+from service.version import SOFTWARE_VERSION
 from storage.journal.node.in_flight import InFlightWriter, try_create_in_flight_writer
 
 if TYPE_CHECKING:
     from devices.emulation.world import World
+
+
+def make_array_info(
+    scene: Scene,
+    tiles: tuple[TileInfo, ...],
+    anchor: UtcAnchor,
+    *,
+    node: str,
+    stream_id: str,
+    schedule: ScheduleName,
+    rate_hz: float,
+) -> ArrayInfo:
+    """Compose the array description of a stream.
+
+    Args:
+        scene: the scene file.
+        tiles: tiles as identified on the bus.
+        anchor: UTC anchor of the stream.
+        node: name of the node.
+        stream_id: id of the stream.
+        schedule: schedule of the bus.
+        rate_hz: expected frame rate.
+    """
+    servo = None
+    if scene.servo is not None:
+        servo = ServoInfo(
+            model=scene.servo.model,
+            counts_per_turn=COUNTS_PER_TURN,
+            zero_counts=scene.servo.zero_counts,
+            sign=scene.servo.sign,
+            ratio=scene.servo.ratio,
+            ankle_travel_m_per_rad=scene.servo.ankle_travel_m_per_rad,
+        )
+    return ArrayInfo(
+        node=node,
+        stream_id=stream_id,
+        tiles=tiles,
+        servo=servo,
+        schedule=schedule,
+        nominal_rate_hz=rate_hz,
+        utc_offset_ns=anchor.offset_ns,
+        clock_set=anchor.clock_set,
+        software=SOFTWARE_VERSION,
+        scene=scene.name,
+        models=scene.models,
+    )
+
+
+_RUN_FRAMES = 10
+"""Frames in a run, which averages out an early frame after a pause."""
+_FASTEST_PERCENTILE = 10  # percentile of the runs' durations: most runs may be disturbed
+_EXCESS_RATIO = 1.02
+"""Ratio to the nominal rate, over `_EXCESS_WINDOW_NS`, that exceeds jitter."""
+_EXCESS_WINDOW_NS = 2_000_000_000
+
+
+def estimate_undisturbed_rate_hz(t_ns: Sequence[int]) -> float:
+    """Estimate the frame rate from the fastest runs of frames.
+
+    Args:
+        t_ns: end of each frame of a trial, rising, more than ten frames.
+    """
+    instants_ns = np.asarray(t_ns, dtype=np.int64)
+    took_ns = instants_ns[_RUN_FRAMES:] - instants_ns[:-_RUN_FRAMES]
+    return float(1e9 * _RUN_FRAMES / np.percentile(took_ns, _FASTEST_PERCENTILE))
+
+
+class FrameRateMonitor:
+    """Monitor of a stream that detects frames faster than the nominal rate.
+
+    Args:
+        nominal_hz: nominal rate, the assumed maximum.
+    """
+
+    def __init__(self, nominal_hz: float) -> None:
+        self._nominal_hz = nominal_hz
+        self._passed: deque[tuple[int, int]] = deque()
+        self.exceeding_rate_hz: float | None = None
+        """Measured rate that exceeds the nominal one; None until then."""
+
+    def add_batch(self, batch: FrameBatch) -> None:
+        """Update with the next batch."""
+        passed = self._passed
+        passed.append((int(batch.t_mono_ns[-1]), int(batch.seq[-1])))
+        (begin_ns, first), (end_ns, last) = passed[0], passed[-1]
+        if end_ns - begin_ns < _EXCESS_WINDOW_NS:
+            return
+        rate_hz = 1e9 * (last - first) / (end_ns - begin_ns)
+        if rate_hz > _EXCESS_RATIO * self._nominal_hz:
+            self.exceeding_rate_hz = rate_hz
+        passed.popleft()
+
+
+USABLE_FRAMES_MIN = 25
+"""Usable readings of each tile before the scene's time begins: more than a tare needs."""
+LEAD_TIMEOUT_NS = 10_000_000_000
+"""Timeout after which the load begins without usable readings of all tiles."""
+_NOT_YET_NS = 2**62
+
+
+class LoadTrigger:
+    """Trigger of an emulated load; frames before `end_t_mono_ns` are its lead.
+
+    Args:
+        world: world whose time this begins; until then it stays at its first instant.
+        lead_s: seconds without load after that; 0: no lead, and no waiting.
+    """
+
+    def __init__(self, world: World, lead_s: float) -> None:
+        self._world = world
+        self._lead_ns = round(lead_s * 1e9)
+        self._usable_frames = 0
+        self._since_ns: int | None = None
+        self.end_ns = _NOT_YET_NS
+        """End of the lead on the node's clock; far in the future while unknown."""
+        if not self._lead_ns:
+            self._begin_world()
+
+    def add_batch(self, batch: FrameBatch) -> None:
+        """Count usable readings of the next batch; begin the world's time if there are enough."""
+        if self.end_ns != _NOT_YET_NS:
+            return
+        if self._since_ns is None:
+            self._since_ns = int(batch.t_mono_ns[0])
+        # Of all tiles at once: a tare needs frames in which all tiles are usable.
+        self._usable_frames += int(((batch.tile_flags & TileFlag.UNUSABLE) == 0).all(axis=1).sum())
+        waited_ns = int(batch.t_mono_ns[-1]) - self._since_ns
+        if self._usable_frames >= USABLE_FRAMES_MIN or waited_ns > LEAD_TIMEOUT_NS:
+            self._begin_world()
+
+    def _begin_world(self) -> None:
+        self._world.begin_scene_time()
+        self.end_ns = self._world.epoch_ns + self._lead_ns
 
 
 def open_reference_sensor(
@@ -71,7 +212,7 @@ def open_scene_recovery(scene: Scene, clock: Clock, world: World | None) -> BusR
     """
     if scene.recovery is None or world is None or scene.array.bus != EMULATED:
         return open_gpio_recovery(scene.recovery, clock)
-    from devices.emulation.buses.gpio import EmulatedGpioLines
+    from devices.emulation.i2c_bus import EmulatedGpioLines
 
     return GpioRecovery(EmulatedGpioLines(world.i2c_adapter, clock), clock)
 

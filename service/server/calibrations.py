@@ -1,14 +1,27 @@
-"""Store of a server's calibrations, uploaded or fitted here, by id.
+"""Calibrations of a server, uploaded or fitted here, and the jobs that fit them.
 
 An id is the hash of the content, so a calibration never changes: other content is another
 calibration. Nodes and sessions copy the one they use, so a calibration may be deleted at any time.
+
+A job runs in a separate process at low priority, one at a time, so that recording goes on. Its
+calibration is stored whole or not at all; the process ends with the server.
 """
 
 from __future__ import annotations
 
+import asyncio
+import logging
+import os
 import re
-from dataclasses import dataclass
+import secrets
+import sys
+import tempfile
+from collections import OrderedDict, deque
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from devices.errors import (
     CalibrationError,
@@ -16,8 +29,11 @@ from devices.errors import (
     FootTileError,
     StateError,
     UnknownError,
+    UsageError,
 )
 from service.estimation.calibration import Calibration
+from service.server.session_store import SessionStore
+from service.server_clock import server_utc_ns
 from service.sessions.calibration_file import encode_calibration, parse_calibration
 from storage.durable_files import (
     make_synced_folder,
@@ -27,6 +43,7 @@ from storage.durable_files import (
     translate_storage_errors,
     write_atomically,
 )
+from storage.sessions.folder import FRAMES_NAME
 
 CALIBRATIONS_MAX = 1000
 CONTENT_BYTES_MAX = 1 << 20
@@ -159,3 +176,221 @@ class CalibrationStore:
         if calibration.id != calibration_id:
             raise CalibrationError(f"it is {calibration.id}", where=str(path))
         return calibration
+
+
+log = logging.getLogger("foottile.fits")
+
+SESSIONS_MAX = 32
+FRAMES_MAX = 1_000_000
+"""Half an hour of the fastest array; all frames are in memory at once."""
+_JOBS_KEPT = 16
+"""Number of ended jobs that are listed, the newest."""
+_LOG_LINES_KEPT = 300
+"""Number of log lines: more than an array has tiles."""
+_LINE_BYTES = 4000
+_TIMEOUT_S = 1800.0
+"""Time limit, against a process that hangs."""
+_NICENESS = 15
+_COMMAND = (sys.executable, "-c", "from service.cli.main import main; main()", "calibrate")
+_EXIT_TILE_REFUSED = 3
+"""Exit code of `foottile calibrate`: file written, but a tile was refused."""
+
+JobState = Literal["running", "done", "failed", "cancelled"]
+
+
+@dataclass
+class CalibrationJob:
+    """State of a calibration job."""
+
+    id: str
+    name: str
+    sessions: tuple[str, ...]
+    started_t_ns: int
+    state: JobState = "running"
+    ended_t_ns: int | None = None
+    log_lines: deque[str] = field(default_factory=lambda: deque(maxlen=_LOG_LINES_KEPT))
+    """Log of the job up to now, a line per tile."""
+    calibration_id: str | None = None
+    problem: str | None = None
+    """Reason of a failure."""
+
+
+class CalibrationJobs:
+    """Calibration jobs of a server; at most one is running.
+
+    Args:
+        sessions: store of the sessions to fit.
+        calibrations: store of the results.
+    """
+
+    def __init__(self, sessions: SessionStore, calibrations: CalibrationStore) -> None:
+        self._sessions = sessions
+        self._calibrations = calibrations
+        self._jobs: OrderedDict[str, CalibrationJob] = OrderedDict()
+        self._task: asyncio.Task[None] | None = None
+        self._running: CalibrationJob | None = None
+
+    @property
+    def is_busy(self) -> bool:
+        """True if a job is running."""
+        return self._running is not None
+
+    def list_jobs(self) -> list[CalibrationJob]:
+        """Return the known jobs, newest first."""
+        return [*reversed(self._jobs.values())]
+
+    def get_job(self, job_id: str) -> CalibrationJob:
+        """Return a job.
+
+        Raises:
+            UnknownError: no known job has this id.
+        """
+        if job_id not in self._jobs:
+            raise UnknownError(
+                f"no fit {job_id[:80]!r}",
+                expected=f"one of the last {_JOBS_KEPT} since the server was started",
+            )
+        return self._jobs[job_id]
+
+    def start_job(
+        self, name: str, sessions: Sequence[str], options: Mapping[str, str]
+    ) -> CalibrationJob:
+        """Start to fit test-rig recordings; called on the event loop.
+
+        Args:
+            name: name of the calibration.
+            sessions: ids of sessions; repeats of a tile may be spread over several.
+            options: further options of `foottile calibrate`, by name.
+
+        Raises:
+            UnknownError: no session has this id.
+            StateError: a session is not sealed, or another job is running.
+            UsageError: a session is named twice, or the sessions are too long.
+        """
+        if self._running is not None:
+            raise StateError(
+                f"calibration {self._running.name!r} is being fitted",
+                remedy="Wait until it is done, or cancel it",
+            )
+        ids = tuple(dict.fromkeys(sessions))
+        if len(ids) < len(sessions):
+            raise UsageError("a session is named twice", remedy="Name each once")
+        found = [self._sessions.get_session(one) for one in ids]
+        for session in found:
+            if session.sha256 is None:
+                raise StateError(
+                    f"session {session.id} is {session.state} and has no sealed file",
+                    expected="sealed sessions",
+                )
+        frames = sum(session.frames for session in found)
+        if frames > FRAMES_MAX:
+            raise UsageError(
+                f"these sessions have {frames} frames",
+                expected=f"at most {FRAMES_MAX} in one fit",
+                remedy="Fit fewer, or pull them and run `foottile calibrate`",
+            )
+        fit = CalibrationJob(secrets.token_hex(6), name, ids, server_utc_ns())
+        self._jobs[fit.id] = fit
+        while len(self._jobs) > _JOBS_KEPT:
+            self._jobs.popitem(last=False)
+        folder = self._sessions.folder
+        paths = [folder.get_path(one) / FRAMES_NAME for one in ids]
+        self._running = fit
+        self._task = asyncio.get_running_loop().create_task(self._run(fit, paths, options))
+        return fit
+
+    async def cancel_job(self, job_id: str) -> CalibrationJob:
+        """Cancel a running job and drop its result; an ended job is unchanged.
+
+        Raises:
+            UnknownError: no known job has this id.
+        """
+        fit = self.get_job(job_id)
+        if fit is self._running:
+            await self.close()
+        return fit
+
+    async def close(self) -> None:
+        """Cancel the running job."""
+        if self._task is None or self._running is None:
+            return
+        fit, task = self._running, self._task
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        if fit.state == "running":  # the task had not started
+            self._finish_job(fit, "cancelled")
+
+    async def _run(
+        self, fit: CalibrationJob, paths: list[Path], options: Mapping[str, str]
+    ) -> None:
+        try:
+            with tempfile.TemporaryDirectory(prefix="foottile-fit-") as folder:
+                out = Path(folder) / "calibration.json"
+                await self._run_process(fit, paths, out, options)
+                found = await asyncio.to_thread(_read_result, out)
+                fit.calibration_id = self._calibrations.save(found).id
+            self._finish_job(fit, "done")
+        except asyncio.CancelledError:
+            self._finish_job(fit, "cancelled")
+        except (FootTileError, OSError) as error:
+            fit.problem = str(error)
+            self._finish_job(fit, "failed")
+        except Exception as error:
+            log.exception("fit %s: this is a bug", fit.id)
+            fit.problem = f"internal error: {error!r}"
+            self._finish_job(fit, "failed")
+
+    def _finish_job(self, fit: CalibrationJob, state: JobState) -> None:
+        fit.state, fit.ended_t_ns = state, server_utc_ns()
+        self._running = self._task = None
+
+    async def _run_process(
+        self, fit: CalibrationJob, paths: list[Path], out: Path, options: Mapping[str, str]
+    ) -> None:
+        """Run the process that writes the calibration to `out`.
+
+        Raises:
+            StateError: the process failed.
+        """
+        all_options = {"name": fit.name, **options}
+        process = await asyncio.create_subprocess_exec(
+            *(*_COMMAND, f"--out={out}"),
+            *(f"--{name.replace('_', '-')}={value}" for name, value in all_options.items()),
+            *("--", *map(str, paths)),
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.DEVNULL,
+            stderr=asyncio.subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C is for the server
+        )
+        try:
+            with suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, process.pid, _NICENESS)
+            async with asyncio.timeout(_TIMEOUT_S):
+                await self._read_log(fit, process)
+                code = await process.wait()
+        except TimeoutError as error:
+            raise StateError(f"not finished after {_TIMEOUT_S:.0f} s") from error
+        finally:
+            if process.returncode is None:
+                process.kill()
+                await process.wait()
+        if code not in (0, _EXIT_TILE_REFUSED):
+            last = fit.log_lines[-1] if fit.log_lines else f"the process ended with {code}"
+            raise StateError(last.removeprefix("foottile: "))
+
+    @staticmethod
+    async def _read_log(fit: CalibrationJob, process: asyncio.subprocess.Process) -> None:
+        assert process.stderr is not None  # noqa: S101  # it was asked for
+        rest = b""
+        while piece := await process.stderr.read(_LINE_BYTES):
+            *lines, rest = (rest + piece).split(b"\n")
+            rest = rest[-_LINE_BYTES:]
+            fit.log_lines.extend(
+                line.decode(errors="replace")[:1000] for line in lines if line.strip()
+            )
+        if rest.strip():
+            fit.log_lines.append(rest.decode(errors="replace")[:1000])
+
+
+def _read_result(out: Path) -> Calibration:
+    return parse_calibration(read_small_file(out), where=str(out))

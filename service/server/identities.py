@@ -15,7 +15,7 @@ from devices.errors import ChangedError, DamagedFileError, StateError, StorageEr
 from service.node_identity import compute_fingerprint, generate_secret, is_proof_valid
 from service.protocol import PROTOCOL, Challenge, CloseConnection, LinkCloseCode, Proof
 from storage.durable_files import set_aside_and_describe
-from storage.secret_file import SECRETS_NAME, read_secrets_or_empty, write_secrets
+from storage.permissions import SECRETS_NAME, read_secrets_or_empty, write_secrets
 
 log = logging.getLogger("foottile.nodes")
 

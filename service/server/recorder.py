@@ -21,8 +21,8 @@ from service.server.sealer import SessionSealer
 from service.server.session_parts import current_ledger
 from service.server.session_store import SessionStore, check_revision, user_fields_revision
 from service.server_clock import server_utc_ns
-from service.sessions.creation import create_session
 from service.sessions.inputs import SessionInputs
+from service.sessions.parts import create_session
 from storage.intervals import NO_END, Intervals, to_open_pairs
 from storage.sessions.folder import Completeness, IdempotencyRecord, Ledger, Session
 from storage.sessions.ledger import group_numbers_by_stream

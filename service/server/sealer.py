@@ -28,7 +28,7 @@ from service.sessions.inputs import SessionInputs
 from service.sessions.sealing import seal_session
 from storage.intervals import Intervals
 from storage.sessions.folder import Session
-from storage.sessions.sidecars import write_markers
+from storage.sessions.metadata import write_markers
 
 log = logging.getLogger("foottile.settling")
 

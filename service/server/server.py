@@ -11,12 +11,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from devices.errors import FootTileError, StorageError
-from service.private_paths import register_private_folder
 from service.protocol import LinkCloseCode, RetentionMessage
 from service.server.broadcast.broadcaster import Broadcaster
 from service.server.broadcast.views import NodeView, SessionProgress, SessionView
-from service.server.calibration_jobs import CalibrationJobs
-from service.server.calibrations import CalibrationStore
+from service.server.calibrations import CalibrationJobs, CalibrationStore
 from service.server.data_folder import DataFolder
 from service.server.identities import NodeIdentities
 from service.server.live_feed.buffer import FeedBuffers
@@ -31,6 +29,7 @@ from service.server.weighings import Weighings
 from service.server_clock import server_utc_ns
 from service.sessions.comparison_series import ComparisonSeriesCache
 from service.sessions.preview import SessionPreviews
+from service.user_folders import register_private_folder
 from storage.durable_files import remove_dead_process_temporaries
 from storage.intervals import Intervals
 from storage.sessions.folder import Session, SessionsFolder

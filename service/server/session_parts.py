@@ -2,7 +2,7 @@
 
 A session is a list of intervals of streams. A node that restarts adds a part, and so does every
 stream that it recorded offline and sends later. Where a part ends is decided in
-`service.sessions.part_end`.
+`service.sessions.parts`.
 
 The present ledger and inputs of a session follow from its parts.
 """
@@ -15,14 +15,14 @@ from contextlib import suppress
 from devices.errors import FootTileError
 from service.server.node import ServerNode
 from service.server_clock import server_utc_ns
-from service.sessions.creation import continue_session
 from service.sessions.inputs import SessionInputs, make_inputs
-from service.sessions.part_end import (
+from service.sessions.parts import (
     SessionStream,
     close_at_stop,
     close_at_stream_end,
     close_part,
     close_unfinished,
+    continue_session,
 )
 from storage.clock.log import ClockOffset
 from storage.intervals import NO_END, Intervals

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from devices.errors import ChangedError, StateError, StorageError, UnknownError, UsageError
 from devices.text import escape_control_chars
-from service.server.index import SessionIndex, StartKey
+from service.server.data_folder import SessionIndex, StartKey
 from service.server_clock import server_utc_ns
-from service.sessions.session_rebuild import rebuild_session
+from service.sessions.sealing import rebuild_session
 from storage.durable_files import translate_storage_errors
 from storage.sessions.folder import (
     DELETED_PREFIX,
@@ -25,9 +25,8 @@ from storage.sessions.folder import (
     SessionsFolder,
     StraySession,
 )
-from storage.sessions.reader import SealedFileReader
-from storage.sessions.sidecars import write_markers
-from storage.sessions.verified_file_cache import VerifiedFileCache
+from storage.sessions.metadata import write_markers
+from storage.sessions.reader import SealedFileReader, VerifiedFileCache
 
 log = logging.getLogger("foottile.book")
 

@@ -19,8 +19,12 @@ from devices.chips.compensation import Compensation
 from devices.errors import CalibrationError, FootTileError, StateError, UnknownError, UsageError
 from devices.frames import FrameBatch
 from service.estimation.calibration import Calibration
-from service.server.calibration_jobs import FRAMES_MAX, CalibrationJob, CalibrationJobs
-from service.server.calibrations import CalibrationStore
+from service.server.calibrations import (
+    FRAMES_MAX,
+    CalibrationJob,
+    CalibrationJobs,
+    CalibrationStore,
+)
 from service.server.estimates.node_estimator import EstimatedBatch
 from service.server.node import ServerNode
 from service.server.recorder import Recorder

@@ -19,8 +19,8 @@ from devices.errors import FootTileError, StorageError
 from service.estimation import LIVE_LAG_MS
 from service.sessions.inputs import SessionInputs
 from service.sessions.pipeline import Columns, EstimateOptions, EstimateStream
+from storage.durable_files import ScratchBlock, ScratchFile
 from storage.schema import Array
-from storage.scratch import ScratchBlock, ScratchFile
 
 CHECKPOINT_FRAMES = 6144
 """Least distance between two checkpoints, in frames. Estimating so many frames of eight tiles takes

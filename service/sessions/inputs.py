@@ -12,7 +12,7 @@ from devices.errors import FootTileError
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
 from service.estimation.tare.tare import Tare
-from service.sessions.part_end import RATE_MAX_HZ, SessionStream
+from service.sessions.parts import RATE_MAX_HZ, SessionStream
 from service.sessions.tares import TareHistory
 from storage.clock.table import ClockTable, StreamClockFacts, group_rows_by_stream
 from storage.intervals import NO_END

@@ -23,9 +23,9 @@ from devices.flags import FrameFlag
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
 from service.estimation.estimate import Estimator
-from service.estimation.estimates import Estimates
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from service.estimation.quantization import Quantization
+from service.estimation.records import Estimates
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded_windows import RECOGNITION_SPAN_NS, compute_recording_tare
 from service.estimation.tare_recovery import remove_recovery

@@ -21,8 +21,12 @@ from service.sessions.frames import Columns, iterate_raw_frames
 from service.sessions.inputs import SessionInputs
 from service.sessions.overview import BinnedSlice
 from storage.formats.slice import Slice
-from storage.sessions.preview import PreviewBins, select_and_downsample_bins
-from storage.sessions.pyramid import required_frame_columns, shift_bins_to_axis
+from storage.sessions.pyramid import (
+    PreviewBins,
+    required_frame_columns,
+    select_and_downsample_bins,
+    shift_bins_to_axis,
+)
 
 UPDATE_BUDGET_S = 0.5
 """Time budget of one update; a long session is complete after several."""

@@ -16,10 +16,14 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.errors import FileFormatError, UsageError
+from storage.formats.readers.parquet import read_sealed_session_table
 from storage.formats.readers.registry import read_table, refuse_text_options
-from storage.formats.readers.sample_times import respace_rounded_times_evenly
-from storage.formats.readers.session import read_sealed_session_table
-from storage.formats.readers.table import SOLE_UNITS, STANDARD_UNITS, ForceTable
+from storage.formats.readers.table import (
+    SOLE_UNITS,
+    STANDARD_UNITS,
+    ForceTable,
+    respace_rounded_times_evenly,
+)
 from storage.formats.readers.text_options import TextOptions
 
 QUANTITIES = ("time_s", "grf_n", "cop_x_m", "cop_y_m")

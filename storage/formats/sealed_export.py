@@ -17,12 +17,11 @@ from storage.formats.markers import (
     PlacedMarkers,
     place_markers,
 )
-from storage.formats.options import NO_OPTIONS, FormatOptions
-from storage.formats.slice import Slice
+from storage.formats.slice import NO_OPTIONS, FormatOptions, Slice
 from storage.schema import COLUMNS_BY_NAME, MEASURED_COLUMNS
 from storage.sessions.folder import Marker
+from storage.sessions.metadata import load_clock_table
 from storage.sessions.reader import SealedFileReader
-from storage.sessions.sidecars import load_clock_table
 
 _SEARCH_DISTANCE_NS = DISTANCE_MAX_NS + 1_000_000
 """Search distance with a margin: float64 sums of instants do not wrap, but are off by 2 us."""

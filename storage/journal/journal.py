@@ -23,23 +23,22 @@ from devices.text import escape_control_chars
 from storage.durable_files import make_synced_folder, translate_storage_errors
 from storage.intervals import CORRUPT, NO_END, Intervals, Losses, union
 from storage.journal import time_index
-from storage.journal.batch_reader import BatchIndex, BatchReader
-from storage.journal.open_segments import OpenSegments
 from storage.journal.segment import (
+    INDEX_SUFFIX,
     SUFFIX,
     Segment,
     make_free_unread_path,
     may_have_indexed_batches,
+    read_schema_and_first_offset,
     recover_segment,
     set_aside_unopenable_segments,
 )
-from storage.journal.segment_format import INDEX_SUFFIX, read_schema_and_first_offset
+from storage.journal.segment_writer import OpenSegments
 from storage.journal.stream_notes import StreamNotes
-from storage.journal.time_index import TimeIndex
-from storage.message_batch import MessageBatchDecoder
+from storage.journal.time_index import BatchIndex, BatchReader, TimeIndex
 from storage.message_layout import MAX_MESSAGE_FRAMES
 from storage.schema import read_array_info, wire_schema
-from storage.wire import EncodedBatch, decode_message, encode_frames
+from storage.wire import EncodedBatch, MessageBatchDecoder, decode_message, encode_frames
 
 RING_DURATION_NS = 600_000_000_000
 """Retention time of frames that no session needs, for pre-roll and for late starts."""

@@ -4,16 +4,25 @@ from __future__ import annotations
 
 import json
 import os
+import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from pydantic import ValidationError
+import pyarrow as pa
+from pydantic import TypeAdapter, ValidationError
 
-from devices.errors import DamagedFileError, StorageError
+from devices.errors import DamagedFileError, FileFormatError, StorageError, UsageError
 from storage.checksummed_json import read_checksummed_json, verify_and_strip_json_checksum
+from storage.clock.table import CLOCK_NAME, ClockTable, StreamClockFacts, read_clock_file
 from storage.durable_files import read_small_file
-from storage.sessions.folder import Ledger, Part, Session
+from storage.parquet_hash import read_hashed_table, write_hashed_table
+from storage.sessions.folder import Completeness, Ledger, Marker, Part, Session
+
+if TYPE_CHECKING:
+    from storage.sessions.reader import SealedFileReader
 
 SESSION_NAME = "session.json"
 LEDGER_NAME = "ledger.json"
@@ -100,3 +109,176 @@ def read_bytes_or_none(path: Path) -> bytes | None:
 def shorten_error(error: Exception) -> str:
     """Return an error's text in one line of up to 300 characters."""
     return " ".join(str(error).split())[:300]
+
+
+MARKERS_NAME = "markers.parquet"
+
+
+def write_markers(session: Session, folder: Path) -> None:
+    """Write `markers.parquet` into the session's folder; an existing one is replaced.
+
+    Raises:
+        StorageError: the disk is full or not writable.
+    """
+    events = session.markers
+    columns = {
+        "id": pa.array([event.id for event in events], pa.string()),
+        "label": pa.array([event.label for event in events], pa.string()),
+        "t_ns": pa.array([event.t_ns for event in events], pa.int64()),
+    }
+    write_hashed_table(folder / MARKERS_NAME, pa.table(columns))
+
+
+def read_markers(path: Path) -> tuple[Marker, ...]:
+    """Read `markers.parquet` and verify its hash.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        DamagedFileError: its hash is wrong, or it is no table of markers.
+        StorageError: it cannot be read now.
+    """
+    table = read_hashed_table(path)
+    try:
+        return TypeAdapter(tuple[Marker, ...]).validate_python(table.to_pylist())
+    except Exception as error:  # other content may cause any error
+        raise DamagedFileError(
+            f"cannot be read as a table of markers: {' '.join(str(error).split())[:300]}",
+            where=str(path),
+            expected="columns id, label, t_ns without empty values",
+        ) from error
+
+
+def load_clock_table(reader: SealedFileReader) -> ClockTable:
+    """Load the clock table in the folder of a sealed session's frames.
+
+    Raises:
+        UsageError: there is none.
+        FileFormatError: it is damaged, or the session's notes are.
+    """
+    path = reader.path.with_name(CLOCK_NAME)
+    if not path.is_file():
+        raise UsageError(
+            f"there is no {CLOCK_NAME} beside {reader.path.name}, so the server's time is unknown",
+            where=str(reader.path.parent),
+            expected="a session's folder as a server sealed it",
+            remedy="Leave the clock at `node`, or fetch the session's folder whole",
+        )
+    stored, parts = read_clock_file(path), read_stream_ids(reader)
+    streams = [
+        stored.facts.get(stream_id, StreamClockFacts(stream_id))
+        for stream_id in dict.fromkeys(parts)
+    ]
+    return ClockTable(stored.rows_by_stream, streams, parts, where=str(path))
+
+
+def read_stream_ids(reader: SealedFileReader) -> list[str]:
+    """Return the stream ids by number of part; a file that was never recorded has one part.
+
+    Raises:
+        FileFormatError: the session's notes are damaged.
+    """
+    session = reader.notes.get("session")
+    if session is None:
+        return [reader.info.stream_id]
+    try:
+        return [str(part["stream_id"]) for part in session["parts"]]
+    except (TypeError, KeyError) as error:
+        raise FileFormatError(
+            "its notes do not say which streams it is of", where=str(reader.path)
+        ) from error
+
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_T_NS_END = 2**63
+
+
+@dataclass(frozen=True)
+class SessionFilter:
+    """Filter of sessions; an empty field accepts every session.
+
+    Attributes:
+        nodes: names of nodes, one of which recorded the session.
+        tags: tags that the session has, case-insensitive.
+        take: id of its take.
+        q: text in id, name, subject, notes, node, scene or a tag, case-insensitive.
+        from_t_ns: earliest start, UTC.
+        to_t_ns: end of the range of starts, exclusive, UTC.
+        complete: completeness of the session.
+    """
+
+    nodes: tuple[str, ...] = ()
+    tags: tuple[str, ...] = ()
+    take: str | None = None
+    q: str | None = None
+    from_t_ns: int | None = None
+    to_t_ns: int | None = None
+    complete: Completeness | None = None
+
+    def accepts(
+        self, session: Session, get_completeness: Callable[[Session], Completeness]
+    ) -> bool:
+        """Return whether a session passes the filter.
+
+        Args:
+            session: the session now.
+            get_completeness: returns a session's completeness; called last, since it may have to
+                count.
+        """
+        tags = {tag.casefold() for tag in session.tags}
+        return (
+            (not self.nodes or session.node in self.nodes)
+            and all(tag.strip().casefold() in tags for tag in self.tags)
+            and (self.take is None or session.take == self.take)
+            and (self.from_t_ns is None or session.started_t_ns >= self.from_t_ns)
+            and (self.to_t_ns is None or session.started_t_ns < self.to_t_ns)
+            and (self.q is None or _contains_text(session, self.q.casefold()))
+            and (self.complete is None or get_completeness(session) == self.complete)
+        )
+
+
+def parse_iso_or_t_ns(text: str, *, where: str) -> int:
+    """Parse an instant in ns since 1970, UTC: such a number, or an ISO 8601 date or time.
+
+    Args:
+        text: without an offset it is UTC; a date alone is its midnight.
+        where: the option or parameter, for the message.
+
+    Raises:
+        UsageError: it is neither, or before 1970 or after 2261.
+    """
+    stripped = text.strip()
+    is_number = re.fullmatch(r"[0-9]{9,}", stripped, re.ASCII)
+    try:
+        t_ns = int(stripped[:20]) if is_number else _parse_iso_t_ns(stripped)
+    except (ValueError, OverflowError):
+        t_ns = -1
+    if not 0 <= t_ns < _T_NS_END:
+        raise UsageError(
+            f"{where} {text[:40]!r} is no instant",
+            expected="2026-11-24, 2026-11-24T08:00, 2026-11-24T08:00:00Z, or nanoseconds "
+            "since 1970; without an offset it is UTC",
+        )
+    return t_ns
+
+
+def _parse_iso_t_ns(text: str) -> int:
+    at = datetime.fromisoformat(text)
+    at = at if at.tzinfo is not None else at.replace(tzinfo=UTC)
+    return (at - _EPOCH) // timedelta(microseconds=1) * 1000
+
+
+def parse_completeness(text: str, *, where: str) -> Completeness:
+    """Parse `true`, `false` or `lossy`.
+
+    Raises:
+        UsageError: it is none of these.
+    """
+    values: dict[str, Completeness] = {"true": True, "false": False, "lossy": "lossy"}
+    if text not in values:
+        raise UsageError(f"{where} {text[:40]!r}", expected="true, false or lossy")
+    return values[text]
+
+
+def _contains_text(session: Session, q: str) -> bool:
+    texts = (session.id, session.name, session.subject, session.notes, session.node, session.scene)
+    return any(q in text.casefold() for text in (*texts, *session.tags))

@@ -14,7 +14,7 @@ from typing import Any
 import pyarrow as pa
 
 from devices.errors import DamagedFileError, OtherVersionError
-from storage.hashed_table import read_hashed_table, write_hashed_table
+from storage.parquet_hash import read_hashed_table, write_hashed_table
 from storage.schema import Column
 
 STANCES_NAME = "stances.parquet"

@@ -6,7 +6,7 @@ byte-stream-split: DuckDB before 2.0 and pyarrow before 16 do not read that. A r
 minute, in sessions of more than an hour up to five: each row group costs a reader of the footer
 some time. The file appears completely or not at all: it is written under a temporary name, synced,
 and renamed. Its footer has hashes of its content, of its bytes and of itself
-(`storage.sessions.content_hash`, `storage.parquet_hash`).
+(`storage.sessions.footer`, `storage.parquet_hash`).
 """
 
 from __future__ import annotations
@@ -38,8 +38,7 @@ from storage.schema import (
     Array,
     to_flat_columns,
 )
-from storage.sessions.content_hash import ContentDigest
-from storage.sessions.footer import NOTES_KEY
+from storage.sessions.footer import NOTES_KEY, ContentDigest
 
 EXPORT_KEY = b"foottile.export"
 """Key of an export's source: the session, and the selection of its frames."""

@@ -14,8 +14,7 @@ from storage.clock.log import CLOCK_LOG_NAME as CLOCK_LOG
 from storage.clock.log import ClockLog
 from storage.frame_rules import find_time_reversals
 from storage.intervals import CORRUPT, Intervals, Losses
-from storage.journal.segment import SUFFIX, UNREAD_SUFFIX
-from storage.journal.segment_format import INDEX_SUFFIX, RECORD_DTYPE
+from storage.journal.segment import INDEX_SUFFIX, RECORD_DTYPE, SUFFIX, UNREAD_SUFFIX
 from storage.journal.stream_notes import NOTES_FILE, StreamNotes
 from storage.sessions.ledger import StreamState
 from storage.sessions.metadata import read_bytes_or_none

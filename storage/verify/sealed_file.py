@@ -20,9 +20,9 @@ from storage.parquet_hash import (
     read_footer_or_empty,
     read_stated_and_actual_hash,
 )
-from storage.sessions.content_hash import ContentDigest
 from storage.sessions.folder import Ledger, Part, PartLedger
-from storage.sessions.frame_order import PartFrameSummary
+from storage.sessions.footer import ContentDigest
+from storage.sessions.ledger import PartFrameSummary
 from storage.sessions.reader import SealedFileReader
 
 _LOST = TypeAdapter(dict[str, LossPairs])

@@ -19,7 +19,7 @@ from devices.errors import DamagedFileError, FileFormatError
 from devices.frames import ArrayInfo
 from storage.frame_rules import describe_first_broken_rule
 from storage.intervals import Intervals
-from storage.journal.segment_format import (
+from storage.journal.segment import (
     INDEX_SUFFIX,
     RECORD_DTYPE,
     Records,
@@ -35,9 +35,8 @@ from storage.journal.segment_format import (
     select_valid_batch_records,
     seq_range_of,
 )
-from storage.message_batch import MessageBatchDecoder
 from storage.schema import read_array_info, wire_schema
-from storage.wire import decode_message
+from storage.wire import MessageBatchDecoder, decode_message
 
 _BATCHES_PER_CHECK = 256
 """Batches that are checked together: some thousand frames."""

@@ -12,20 +12,21 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from devices.errors import FileFormatError, OtherVersionError, StorageError
-from storage.clock.file import CLOCK_NAME, read_clock_file
+from storage.clock.table import CLOCK_NAME, read_clock_file
 from storage.intervals import NO_END, Intervals
 from storage.parquet_hash import compute_sha256
 from storage.sessions.folder import FRAMES_NAME, Ledger, Marker, Session
 from storage.sessions.ledger import compute_ledger, settle_losses
 from storage.sessions.metadata import (
+    MARKERS_NAME,
     SESSION_NAME,
     StoredMetadata,
     make_session_metadata,
     parse_session_metadata,
     read_bytes_or_none,
+    read_markers,
 )
 from storage.sessions.overview import OVERVIEW_NAME, open_overview
-from storage.sessions.sidecars import MARKERS_NAME, read_markers
 from storage.sessions.stances import STANCES_NAME, read_stances
 from storage.verify.journal import StreamReport, verify_journal
 from storage.verify.sealed_file import (

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from service.offline.accuracy import PHASES, Accuracy, CoverageCount
-from studies.benchmark.draws import LAGS_MS, DrawResult, MeasurementFailure
-from studies.benchmark.model_sets import ComparedModelSet
+from studies.benchmark.draws import LAGS_MS, ComparedModelSet, DrawResult, MeasurementFailure
 
 GRF_MAE_GOALS_N = {
     "rolling": {"live": 0.25, "offline": 0.18},

@@ -11,14 +11,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from service.offline.figure_output import DPI, create_figure, render_png
-from studies.benchmark.draws import LAGS_MS
+from studies.benchmark.draws import LAGS_MS, ComparedModelSet
 from studies.benchmark.figures import (
     GRF_MAE_GOALS_N,
     Quantiles,
     SceneFigures,
     find_pareto_front,
 )
-from studies.benchmark.model_sets import ComparedModelSet
 from studies.benchmark.report import format_draw_count
 
 if TYPE_CHECKING:

@@ -21,11 +21,14 @@ from service.offline.process_pool import map_in_processes
 from service.version import SOFTWARE_VERSION
 from studies.benchmark.draws import (
     BATCH_FRAMES,
+    ComparedModelSet,
     DrawRecording,
     DrawResult,
     DrawTask,
     MeasurementFailure,
     describe_error,
+    list_missing_models,
+    list_model_sets,
     record_draw,
     run_draw,
     time_model_sets,
@@ -36,11 +39,6 @@ from studies.benchmark.figures import (
     SceneFigures,
     compare_with_goals,
     summarize_model_sets,
-)
-from studies.benchmark.model_sets import (
-    ComparedModelSet,
-    list_missing_models,
-    list_model_sets,
 )
 
 

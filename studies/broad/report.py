@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from service.offline.accuracy import PHASES
 from studies.benchmark.figures import COVERAGE_TITLES, Goal, Quantiles
 from studies.benchmark.report import EMULATED, format_table
-from studies.broad.arrays import CONDITIONS, HEAVY
+from studies.broad.arrays import CONDITIONS, HEAVY, BroadBenchmarkResult
 from studies.broad.figures import (
     ANY_PHASE,
     MIN_EFFECT_N,
@@ -20,7 +20,6 @@ from studies.broad.figures import (
     needs_model,
     summarize_cases,
 )
-from studies.broad.run import BroadBenchmarkResult
 
 _HEAVY = "a leg of 3.3 kg on firmer poppy seeds, up to 28 N a tile: for saturation, without a goal"
 

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from devices.arrays import Bools, Floats
-from service.estimation.estimates import SIGMAS_95
-from service.estimation.fitting.confidence import compute_curve_n, compute_mean_half_width_95_n
+from service.estimation.fitting.least_squares import compute_curve_n, compute_mean_half_width_95_n
+from service.estimation.records import SIGMAS_95
 from service.offline.compare.plot import OUR_COLOUR, REFERENCE_COLOUR, TILE_COLOURS
 from service.offline.figure_output import create_figure, render_png
 from studies.reproduce import paper
-from studies.reproduce.evaluation import TrialResult
 from studies.reproduce.indentation import DomeResult
-from studies.reproduce.result import ExperimentResult, Reproduction
+from studies.reproduce.result import ExperimentResult, Reproduction, TrialResult
 from studies.reproduce.trials import MUD, PRESSURE_PLATE
 
 if TYPE_CHECKING:

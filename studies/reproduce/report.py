@@ -6,12 +6,13 @@ import math
 from collections.abc import Iterator, Sequence
 
 from studies.reproduce import paper
-from studies.reproduce.evaluation import (
+from studies.reproduce.result import (
     REPORTED_FIGURES,
+    ExperimentResult,
     InjectedValueCheck,
+    Reproduction,
     TrialResult,
 )
-from studies.reproduce.result import ExperimentResult, Reproduction
 from studies.reproduce.trials import MUD, POPPY, POPPY_RIM, ROLLING
 
 ONE_FOOT = (

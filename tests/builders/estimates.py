@@ -10,8 +10,8 @@ import numpy as np
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import TileCalibration
 from service.estimation.estimate import Estimator
-from service.estimation.estimates import Estimates
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
+from service.estimation.records import Estimates
 from tests.builders.arrays import COUNT_KPA
 from tests.builders.calibrations import make_calibration, make_tare
 

@@ -7,8 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from devices.chips.dynamixel.protocol import Packet
-from devices.chips.dynamixel.protocol1 import ErrorFlag
+from devices.chips.dynamixel.protocol import ErrorFlag, Packet
 from devices.clock import Clock
 from devices.emulation.chips.dynamixel import EmulatedServo
 

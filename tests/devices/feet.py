@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from devices.acquisition import Acquisition
+from devices.array.schedules import BusTiming
 from devices.array.self_test import identify_tiles
 from devices.array.tile_array import TileArray
-from devices.array.timing_budget import BusTiming
 from devices.buses.i2c import I2cAdapter, I2cBus, open_bus
 from devices.clock import UtcAnchor, VirtualClock
-from devices.emulation.buses.i2c import EmulatedI2cAdapter
 from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
+from devices.emulation.i2c_bus import EmulatedI2cAdapter
 from devices.emulation.world import World
 from devices.frames import FrameBatch
 from devices.scene.hardware_sections import ScheduleName, TileSection

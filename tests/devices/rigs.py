@@ -8,12 +8,11 @@ from typing import Any, get_args
 
 from smbus2 import i2c_msg
 
+from devices.array.schedules import BusTiming
+from devices.array.tile import Scan
 from devices.array.tile_array import TileArray
-from devices.array.tile_io import Scan
-from devices.array.timing_budget import BusTiming
 from devices.buses.i2c import I2cBus
 from devices.clock import VirtualClock
-from devices.emulation.buses.i2c import EmulatedI2cAdapter, FaultyWires
 from devices.emulation.chips.mpl115a2 import (
     EmulatedMpl115a2,
     EmulatedPart,
@@ -22,9 +21,10 @@ from devices.emulation.chips.mpl115a2 import (
 )
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.fault_timing import SceneFaults
+from devices.emulation.i2c_bus import EmulatedI2cAdapter, FaultyWires
 from devices.emulation.parts import make_rng
 from devices.frames import TileInfo
-from devices.recovery.bus_recovery import BusRecovery
+from devices.recovery import BusRecovery
 from devices.scene.emulation_sections import BUS_TARGET, FaultKind, PartFault, ReadDuringConversion
 from devices.scene.hardware_sections import ScheduleName
 from tests.builders.arrays import DATA_SHEET_CHIP, make_tile

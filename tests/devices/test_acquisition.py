@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from devices.acquisition import Acquisition
+from devices.array.schedules import BusTiming
 from devices.array.tile_array import TileArray
-from devices.array.timing_budget import BusTiming
 from devices.buses.i2c import I2cBus
 from devices.flags import FrameFlag
 from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, FrameBatch

@@ -102,7 +102,7 @@ def test_an_array_with_noise_is_not_called_stale() -> None:
     same = (np.diff(batch.pressure_raw[:, 0].astype(int)) == 0) & (
         np.diff(batch.temperature_raw[:, 0].astype(int)) == 0
     )
-    assert 0.05 < same.mean() < 0.2, "about one in nine, as devices.array.tile_health says"
+    assert 0.05 < same.mean() < 0.2, "about one in nine, as devices.array.tile says"
 
 
 class Failing:

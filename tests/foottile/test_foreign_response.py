@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import foottile
-from foottile.foreign_response import explain_foreign_response
+from foottile.connection import explain_foreign_response
 from foottile.live_protocol import LiveProtocol, LiveRequest
 from tests.service.fake_node import FakeNode
 from tests.service.node.publishing import Publishing

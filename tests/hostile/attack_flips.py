@@ -8,8 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from storage.journal.segment import SUFFIX
-from storage.journal.segment_format import INDEX_SUFFIX
+from storage.journal.segment import INDEX_SUFFIX, SUFFIX
 from storage.verify.data_folder import DataFolderReport, Report, verify_path
 from tests.hostile.attack import Outcome, Play, attack
 from tests.hostile.folders import (

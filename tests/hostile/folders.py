@@ -19,11 +19,11 @@ from service.sessions.tares import TareHistory
 from storage.checksummed_json import write_checksummed_json
 from storage.clock.log import ClockLog, ClockOffset
 from storage.journal.node.retention_requests import RetentionRequest, RetentionRequests
-from storage.secret_file import SECRETS_NAME, write_secrets
+from storage.permissions import SECRETS_NAME, write_secrets
 from storage.server_id import SERVER_ID_NAME, write_server_id
 from storage.sessions.folder import FRAMES_NAME, Marker, Part, SessionsFolder
+from storage.sessions.metadata import MARKERS_NAME, load_clock_table, read_markers
 from storage.sessions.reader import SealedFileReader
-from storage.sessions.sidecars import MARKERS_NAME, load_clock_table, read_markers
 from tests.builders.arrays import make_array
 from tests.builders.calibrations import make_calibration, make_tare
 from tests.service.sessions.crashed import BOOT, session, stream, t_ns

@@ -12,9 +12,8 @@ from service.offline.calibration_lookup import make_rig_scene
 from service.offline.simulation import SimulationOptions, run_simulation
 from service.rig.emulated_foot import EmulatedFoot
 from service.version import SOFTWARE_VERSION
-from storage.clock.file import CLOCK_NAME, write_clock_file
 from storage.clock.log import ClockOffset
-from storage.clock.table import StreamClockFacts
+from storage.clock.table import CLOCK_NAME, StreamClockFacts, write_clock_file
 from storage.parquet_hash import compute_sha256
 from storage.sessions.folder import (
     FRAMES_NAME,
@@ -25,8 +24,8 @@ from storage.sessions.folder import (
     Session,
     SessionsFolder,
 )
+from storage.sessions.metadata import write_markers
 from storage.sessions.reader import SealedFileReader
-from storage.sessions.sidecars import write_markers
 from storage.sessions.writer import SealedFileWriter
 
 SESSION_ID = "20260101T000000Z-be5c00"

@@ -30,7 +30,7 @@ def test_a_command_that_asks_for_nothing_more_does_not_load_arrow() -> None:
     code = """
 import sys
 import service.cli.main
-from service.memory import use_system_allocator
+from service.cli.main import use_system_allocator
 use_system_allocator()
 print("pyarrow" in sys.modules)
 """

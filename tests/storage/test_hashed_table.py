@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from devices.errors import DamagedFileError
-from storage.hashed_table import read_hashed_table, write_hashed_table
+from storage.parquet_hash import read_hashed_table, write_hashed_table
 
 TABLE = pa.table({"label": ["a", "slip"], "t_ns": pa.array([1, 2**62], pa.int64())})
 

@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 
 from devices.frames import FrameBatch
 from devices.types import SEQ_END
-from storage.message_batch import MessageBatch, MessageBatchDecoder
 from storage.schema import frames_to_record_batch, wire_schema
-from storage.wire import decode_message, encode_frames
+from storage.wire import MessageBatch, MessageBatchDecoder, decode_message, encode_frames
 from tests.builders.arrays import make_array
 from tests.builders.frames import any_frames, assert_same_bits
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
 from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
-from service.estimation.estimates import Estimates
+from service.estimation.records import Estimates
 from storage.schema import (
     ARRAY_INFO_KEY,
     COLUMNS_BY_NAME,

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.errors import DamagedFileError, StorageError
-from storage.secret_file import SECRETS_NAME, read_secrets_or_empty, write_secrets
+from storage.permissions import SECRETS_NAME, read_secrets_or_empty, write_secrets
 from tests.storage.faulty_disk import NO_SPACE, refusing
 
 SECRETS = {"leg": "5" * 64}

@@ -10,9 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
-from devices.chips.dynamixel.protocol import DynamixelProtocol
-from devices.chips.dynamixel.protocol1 import PROTOCOL_1
-from devices.chips.dynamixel.protocol2 import PROTOCOL_2
+from devices.chips.dynamixel.protocol import PROTOCOL_1, PROTOCOL_2, DynamixelProtocol
 
 COUNTS_PER_TURN = 4096
 """Encoder counts per turn of every MX servo (hardware.md 5)."""
@@ -35,7 +33,7 @@ class Register:
 
     address: int
     size: int
-    """Bytes to read: never two in 1.0, see `devices.chips.dynamixel.protocol1`."""
+    """Bytes to read: never two in 1.0, see `devices.chips.dynamixel.protocol`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +47,7 @@ class Firmware:
     position_bytes: int
     """Bytes of the present position: little-endian, signed, beyond one turn in multi-turn mode."""
     position_read_bytes: int
-    """Bytes to read from there: in 1.0 one more, see `devices.chips.dynamixel.protocol1`."""
+    """Bytes to read from there: in 1.0 one more, see `devices.chips.dynamixel.protocol`."""
     tick_register: Register
     """Realtime Tick: its first two bytes are milliseconds since power-up."""
     mode_register: Register

@@ -1,13 +1,22 @@
 """Common part of both Dynamixel protocols: packets, their decoder, and the protocol's interface.
 
 Sources: e-manual protocol1.md and protocol2.md, hardware.md 5.1 and 5.2.
+
+Requests and answers have the same form, and a one-wire adapter echoes requests. An answer may equal
+its request: the answer to a ping, with the voltage bit set, is a ping. So the driver sends no
+request whose answer would have the same length: no ping, no read of two bytes.
+
+Sources: e-manual protocol1.md, hardware.md 5.1.
+
+Sources: e-manual protocol2.md and crc.md, hardware.md 5.1.
 """
 
 from __future__ import annotations
 
+import struct
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import IntEnum, IntFlag
 
 BROADCAST_ID = 0xFE
 
@@ -138,3 +147,160 @@ class PacketDecoder:
         # A false header in noise may have swallowed a true one: go on right behind it.
         del self._buffer[: len(packet.raw_bytes) if packet.is_intact else 1]
         return packet
+
+
+# Instruction or error to checksum. Longer than the whole control table of an MX, which ends at
+# address 73, is noise: the header is short, and a wrong length would cause a timeout.
+_MIN_LENGTH_1, _MAX_LENGTH_1 = 2, 2 + 74
+
+
+class ErrorFlag(IntFlag):
+    """Bits of an answer's error byte (e-manual protocol1.md, "Error")."""
+
+    VOLTAGE = 0x01
+    ANGLE = 0x02
+    """The goal position, not the present one, is outside the limits."""
+    OVERHEAT = 0x04
+    RANGE = 0x08
+    CHECKSUM = 0x10
+    OVERLOAD = 0x20
+    INSTRUCTION = 0x40
+    UNDEFINED = 0x80
+
+    ALERT = VOLTAGE | ANGLE | OVERHEAT | OVERLOAD
+    """Mask of the bits that report a bad state; the request succeeded and the data are valid."""
+
+
+_REFUSALS = {
+    ErrorFlag.RANGE: "range",
+    ErrorFlag.CHECKSUM: "checksum of the request",
+    ErrorFlag.INSTRUCTION: "undefined instruction",
+    ErrorFlag.UNDEFINED: "unknown",
+}
+
+
+def compute_checksum(data: bytes) -> int:
+    """Compute the inverted sum of `data`, all bytes from the id on (e-manual protocol1.md)."""
+    return ~sum(data) & 0xFF
+
+
+class _Protocol1(DynamixelProtocol):
+    """`FF FF ID LEN INST parameters SUM`; an answer has its error byte in the place of INST."""
+
+    version = 1
+    max_servo_id = 253
+    header = b"\xff\xff"
+    preamble_bytes = 4
+    shortest_bytes = 4 + _MIN_LENGTH_1
+
+    def compute_packet_size(self, preamble: bytes) -> int:
+        servo_id, length = preamble[2], preamble[3]
+        # An id of FF is the header's second byte, after an FF of noise.
+        plausible = servo_id <= BROADCAST_ID and _MIN_LENGTH_1 <= length <= _MAX_LENGTH_1
+        return self.preamble_bytes + length if plausible else 0
+
+    def encode_packet(self, servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
+        body = bytes([servo_id, len(parameters) + _MIN_LENGTH_1, instruction]) + parameters
+        return self.header + body + bytes([compute_checksum(body)])
+
+    def decode_packet(self, raw_bytes: bytes) -> Packet:
+        intact = compute_checksum(raw_bytes[2:-1]) == raw_bytes[-1]
+        return Packet(raw_bytes[2], raw_bytes[4], raw_bytes[5:-1], intact, raw_bytes)
+
+    def encode_read_request(self, servo_id: int, address: int, length: int) -> bytes:
+        return self.encode_packet(servo_id, Instruction.READ, bytes([address, length]))
+
+    def encode_identity_request(self, servo_id: int) -> bytes:
+        return self.encode_read_request(servo_id, 0, 3)
+
+    def decode_answer(self, packet: Packet) -> ServoAnswer | None:
+        error = ErrorFlag(packet.instruction)
+        refusal = ", ".join(meaning for bit, meaning in _REFUSALS.items() if error & bit)
+        return ServoAnswer(packet, packet.parameters, bool(error & ErrorFlag.ALERT), refusal)
+
+
+PROTOCOL_1 = _Protocol1()
+
+
+ALERT = 0x80
+"""Bit of the error byte: a hardware error (register at address 70); the answer is valid."""
+ERRORS = (
+    "none",
+    "result fail",
+    "undefined instruction",
+    "CRC of the request",
+    "data range",
+    "data length",
+    "data limit",
+    "access",
+)
+"""Meaning of the number in the error byte's other bits (e-manual protocol2.md, "Error")."""
+
+_CRC = 2
+_MIN_LENGTH_2, _MAX_LENGTH_2 = 1 + _CRC, 1024  # instruction to CRC; more is noise (the SDK's limit)
+_PATTERN, _STUFFED = b"\xff\xff\xfd", b"\xff\xff\xfd\xfd"
+
+
+def _crc_table() -> list[int]:
+    table = []
+    for byte in range(256):
+        crc = byte << 8
+        for _ in range(8):
+            crc = (crc << 1) ^ (0x8005 if crc & 0x8000 else 0)
+        table.append(crc & 0xFFFF)
+    return table
+
+
+_CRC_TABLE = _crc_table()
+
+
+def compute_crc16(data: bytes) -> int:
+    """Compute the CRC-16 of Protocol 2.0: polynomial 0x8005, initially 0 (e-manual crc.md)."""
+    crc = 0
+    for byte in data:
+        crc = (crc << 8 & 0xFFFF) ^ _CRC_TABLE[crc >> 8 ^ byte]
+    return crc
+
+
+class _Protocol2(DynamixelProtocol):
+    """`FF FF FD 00 ID LEN LEN INST parameters CRC CRC`; a status begins with its error."""
+
+    version = 2
+    max_servo_id = 252
+    header = b"\xff\xff\xfd\x00"
+    preamble_bytes = 7
+    shortest_bytes = 7 + _MIN_LENGTH_2
+
+    def compute_packet_size(self, preamble: bytes) -> int:
+        length = int.from_bytes(preamble[5:7], "little")
+        return self.preamble_bytes + length if _MIN_LENGTH_2 <= length <= _MAX_LENGTH_2 else 0
+
+    def encode_packet(self, servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
+        # Length and CRC are of the stuffed bytes.
+        body = (bytes([instruction]) + parameters).replace(_PATTERN, _STUFFED)
+        packet = self.header + struct.pack("<BH", servo_id, len(body) + _CRC) + body
+        return packet + struct.pack("<H", compute_crc16(packet))
+
+    def decode_packet(self, raw_bytes: bytes) -> Packet:
+        intact = compute_crc16(raw_bytes[:-_CRC]) == int.from_bytes(raw_bytes[-_CRC:], "little")
+        body = raw_bytes[self.preamble_bytes : -_CRC].replace(_STUFFED, _PATTERN)
+        return Packet(raw_bytes[4], body[0], body[1:], intact, raw_bytes)
+
+    def encode_read_request(self, servo_id: int, address: int, length: int) -> bytes:
+        return self.encode_packet(servo_id, Instruction.READ, struct.pack("<HH", address, length))
+
+    def encode_identity_request(self, servo_id: int) -> bytes:
+        return self.encode_packet(servo_id, Instruction.PING)
+
+    def decode_answer(self, packet: Packet) -> ServoAnswer | None:
+        if packet.is_intact and packet.instruction != Instruction.STATUS:
+            return None
+        error = packet.parameters[0] if packet.parameters else 0
+        refusal, number = "", error & ~ALERT
+        if number:
+            meaning = ERRORS[number] if number < len(ERRORS) else "unknown"
+            refusal = f"error {number}, {meaning}"
+        return ServoAnswer(packet, packet.parameters[1:], bool(error & ALERT), refusal)
+
+
+PROTOCOL_2 = _Protocol2()

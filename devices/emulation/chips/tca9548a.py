@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from devices.emulation.buses.i2c import I2cDevice
 from devices.emulation.fault_timing import FaultTiming
+from devices.emulation.i2c_bus import I2cDevice
 
 
 class EmulatedTca9548a:

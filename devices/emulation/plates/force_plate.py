@@ -15,8 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Floats
-from devices.emulation.plates.plate_clock import PlateClock
-from devices.emulation.plates.plate_load import FORCES, MOMENTS, VERTICAL
+from devices.emulation.plates.plate import FORCES, MOMENTS, VERTICAL, PlateClock
 
 CHANNELS = ("fx_n", "fy_n", "fz_n", "mx_nm", "my_nm", "mz_nm")
 RATE_HZ = 1000.0

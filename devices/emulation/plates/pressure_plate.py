@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from devices.arrays import Floats
-from devices.emulation.plates.plate_clock import PlateClock
-from devices.emulation.plates.plate_load import PlateLoad
+from devices.emulation.plates.plate import PlateClock, PlateLoad
 
 RATE_HZ = 100.0
 PITCH_M = 0.005

@@ -20,7 +20,6 @@ from service.api.routes.common import (
 )
 from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
-from service.private_paths import PublicText
 from service.server.broadcast.views import (
     CalibrationSource,
     CalibrationView,
@@ -28,13 +27,13 @@ from service.server.broadcast.views import (
     View,
     absolute_scale,
 )
-from service.server.calibration_jobs import SESSIONS_MAX, CalibrationJob
-from service.server.calibrations import CalibrationSummary
+from service.server.calibrations import SESSIONS_MAX, CalibrationJob, CalibrationSummary
 from service.server.node import ServerNode
 from service.server.session_store import check_revision
 from service.server_clock import server_utc_ns
 from service.sessions.calibration_file import encode_calibration, parse_calibration
 from service.sessions.pipeline import EstimateOptions, EstimateStream
+from service.user_folders import PublicText
 
 router = APIRouter(tags=["calibrations"])
 

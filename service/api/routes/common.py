@@ -16,7 +16,7 @@ from devices.errors import StateError, UnknownError
 from service.api.problems import MEDIA_TYPE, Problem
 from service.server.server import Server
 from storage.formats.slice import SECONDS_MAX
-from storage.formats.writers.parquet import PARQUET
+from storage.formats.writers.tables import PARQUET
 from storage.sessions.folder import IdempotencyRecord, Session
 
 _SCHEMA = {"content": {MEDIA_TYPE: {"schema": Problem.model_json_schema()}}}

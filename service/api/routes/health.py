@@ -6,9 +6,9 @@ from fastapi import APIRouter
 from pydantic import Field
 
 from service.api.routes.common import ServerState, problem_responses
-from service.private_paths import PublicText
 from service.protocol import SUBPROTOCOL
 from service.server.broadcast.views import View
+from service.user_folders import PublicText
 from service.version import SOFTWARE_VERSION
 
 router = APIRouter(tags=["server"])

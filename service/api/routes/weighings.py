@@ -14,11 +14,11 @@ from service.api.routes.calibrations import Line, check_fits
 from service.api.routes.common import FULL, ServerState, parse_if_match, problem_responses
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.dead_weights import TOLERANCE_PERCENT, check_and_label_weights
-from service.private_paths import PublicText
 from service.server.broadcast.views import View
 from service.server.node import ServerNode
 from service.server.weighing import Method, Repeatability
 from service.server.weighings import NodeWeighing, WeighingPlan, WeighingState
+from service.user_folders import PublicText
 
 router = APIRouter(prefix="/nodes/{node}/weighing", tags=["calibrations"])
 

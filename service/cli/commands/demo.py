@@ -63,7 +63,7 @@ def demo_command(
     import uvloop
 
     from service.api.connection_limits import raise_open_files_limit
-    from service.rig.options import RigOptions
+    from service.rig.emulated_foot import RigOptions
 
     raise_open_files_limit()
     the_scene = load_adapted_scene(scene, bus=None, servo=None)

@@ -18,8 +18,7 @@ from devices.scene.scene_file import Scene, load_scene
 from service.cli.options import JsonOption, echo, print_json, show_progress, stdout
 
 if TYPE_CHECKING:
-    from service.offline.doctor import BusDiagnosis
-    from service.offline.servo_doctor import ServoDiagnosis
+    from service.offline.doctor import BusDiagnosis, ServoDiagnosis
 
 _EMULATED_SCENE = "standing"
 
@@ -49,8 +48,7 @@ def doctor_command(
     servo with both protocols at the usual baud rates. An emulated bus is examined in virtual time.
     Exit codes: 0 ready, 1 no working bus, 2 wrong usage, 3 something has to be changed.
     """
-    from service.offline.doctor import diagnose_bus
-    from service.offline.servo_doctor import diagnose_servo
+    from service.offline.doctor import diagnose_bus, diagnose_servo
 
     the_scene = load_scene(scene) if scene is not None else None
     name = bus or (the_scene.array.bus if the_scene is not None else None)

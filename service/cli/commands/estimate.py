@@ -35,7 +35,7 @@ from storage.sessions.folder import FRAMES_NAME
 
 if TYPE_CHECKING:
     from service.estimation.calibration import Calibration
-    from service.offline.estimate.estimate_change import EstimateChange
+    from service.offline.estimate_summary import EstimateChange
 
 
 @require_extra("server", "`foottile estimate`")
@@ -98,11 +98,11 @@ def estimate_command(
     from service.estimation.model_sensitivity import REASONS_BY_MODEL
     from service.offline.archive.locations import is_remote
     from service.offline.archive.tasks import EstimateTask
-    from service.offline.estimate.estimate_change import (
+    from service.offline.estimate.session import estimate_session
+    from service.offline.estimate_summary import (
         compute_estimate_change,
         read_stored_estimates,
     )
-    from service.offline.estimate.session import estimate_session
     from storage.formats.slice import Slice
 
     task = EstimateTask(

@@ -1,14 +1,15 @@
-"""`foottile invite`: one-time login links."""
+"""`foottile invite` and `foottile accept-node`: login links, and nodes on another machine."""
 
 from __future__ import annotations
 
 from typing import Annotated
+from urllib.parse import quote
 
 import typer
 
-from devices.errors import require_extra
+from devices.errors import StateError, require_extra
 from service.cli.commands.sessions import SERVER, ServerOption
-from service.cli.options import CaOption, JsonOption, print_json
+from service.cli.options import CaOption, JsonOption, echo, print_json
 from service.cli.tickets import TokenFolderOption, print_ticket, read_data_token
 
 
@@ -36,3 +37,35 @@ def invite_command(
         print_json(ticket)
     else:
         print_ticket(ticket["urls"], viewer=read_only)
+
+
+@require_extra("server", "`foottile accept-node`")
+def accept_node_command(
+    node: Annotated[str, typer.Argument(help="Name of the node.")],
+    fingerprint: Annotated[
+        str | None,
+        typer.Option(help="Fingerprint of the machine; default: the last one that connected."),
+    ] = None,
+    server: ServerOption = None,
+    ca: CaOption = None,
+    data: TokenFolderOption = None,
+) -> None:
+    """Accept another machine under the name of a node.
+
+    A server rejects a machine without the node's secret, for example after a change of its storage.
+    The accepted machine becomes the node; the previous one is disconnected and rejected. Compare
+    the fingerprint with the machine's output first. Run this on the server's computer.
+    """
+    import foottile
+
+    path = f"/nodes/{quote(node, safe='')}"
+    with foottile.connect(server or SERVER, read_data_token(data), ca=ca) as source:
+        replacement = source.http.get(path)["replacement"]
+        if replacement is None:
+            raise StateError(
+                f"no other machine asks to connect as {node!r}",
+                remedy="Start the machine; it retries every few seconds",
+            )
+        accepted = fingerprint or replacement["fingerprint"]
+        source.http.send("POST", f"{path}/accept-replacement", {"fingerprint": accepted})
+    echo(f"{node} is now the machine {accepted}")

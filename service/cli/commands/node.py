@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from service.estimation.calibration import Calibration
     from service.node.options import NodeOptions
     from service.node.running_node import NodeOutcome
-    from service.rig.options import RigOptions
+    from service.rig.emulated_foot import RigOptions
 
 SERVER = "http://127.0.0.1:8000"
 
@@ -74,11 +74,11 @@ def node_command(
 
     Exit code 3: frames of a session are lost, or still wait on this disk for their server.
     """
+    from foottile.connection import make_context
     from foottile.environment import read_token
-    from foottile.tls import make_context
     from service.node.options import NodeOptions
-    from service.node.tcp_connect import make_ingest_url
-    from service.rig.options import RigOptions
+    from service.node.server_connection import make_ingest_url
+    from service.rig.emulated_foot import RigOptions
     from service.user_folders import resolve_user_folder
     from storage.permissions import set_umask_and_restrict_folder
 

@@ -50,10 +50,9 @@ def query_command(
     Columns and examples are in docs/query.md. Queries are read-only. Sessions that are damaged or
     not yet sealed are left out and named on stderr; then the exit code is 3.
     """
+    from service.offline.archive.local_copies import SYSTEM_TEMP_FOLDER, create_workspace
     from service.offline.archive.locations import is_data_folder, is_remote, make_no_session_error
-    from service.offline.archive.query import run_query
-    from service.offline.archive.session_search import find_sessions
-    from service.offline.archive.temporary_folders import SYSTEM_TEMP_FOLDER, create_workspace
+    from service.offline.archive.query import find_sessions, run_query
 
     if data is not None and places:
         raise UsageError("--data and places exclude each other", remedy="Name one")
@@ -77,7 +76,7 @@ def query_command(
     elif as_json:
         print_json({"rows": _to_rows(table), "left_out": archive.left_out_reasons})
     elif as_csv:
-        from storage.formats.writers.csv_text import write_spreadsheet_safe_csv
+        from storage.formats.writers.tables import write_spreadsheet_safe_csv
 
         with _explain_unwritable("the answer"):
             write_spreadsheet_safe_csv(sys.stdout.buffer, table)

@@ -18,7 +18,7 @@ from service.cli.options import (
     remark,
     show_progress,
 )
-from service.cli.result_folder import open_result_folder
+from service.cli.report import open_result_folder
 from service.json_output import to_json_text
 
 TRIALS_MAX, JOBS_MAX = 100, 64

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import inspect
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 
 import typer
+from pydantic import ValidationError
+from pydantic.fields import FieldInfo
 
 from devices.errors import UsageError
 from devices.text import escape_control_chars
-from service.cli.format_options import FormatOption, add_format_options
 from service.cli.multi_session import (
     EXIT_INCOMPLETE,
     JobsOption,
@@ -26,6 +28,7 @@ from service.cli.options import (
     JsonOption,
     StartOption,
     echo,
+    expand_options,
     print_json,
     remark,
     resolve_data_folder,
@@ -33,13 +36,47 @@ from service.cli.options import (
     show_progress,
     stdout,
 )
-from storage.formats.options import FormatOptions
-from storage.formats.writers.registry import MULTI_SESSION_FORMATS
-from storage.sessions.sidecars import MARKERS_NAME
+from storage.formats.slice import FormatOptions
+from storage.formats.writers.registry import FORMATS, MULTI_SESSION_FORMATS
+from storage.sessions.metadata import MARKERS_NAME
 
 if TYPE_CHECKING:
     from storage.formats.export import ClockName
-    from storage.sessions.filters import SessionFilter
+    from storage.sessions.metadata import SessionFilter
+
+FormatOption = Annotated[str, typer.Option("--format", help=", ".join(FORMATS) + ".")]
+
+
+def add_format_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Replace the parameter `options` of a command by an option for each field of `FormatOptions`.
+
+    Raises:
+        UsageError: a value that `FormatOptions` rejects.
+    """
+    parameters = [
+        _make_parameter(name, field) for name, field in FormatOptions.model_fields.items()
+    ]
+    return expand_options(command, parameters, _make_options)
+
+
+def _make_options(values: dict[str, Any]) -> FormatOptions:
+    try:
+        return FormatOptions(**values)
+    except ValidationError as error:
+        (name, *_), why = error.errors()[0]["loc"], error.errors()[0]["msg"]
+        raise UsageError(f"--{name} {values[str(name)]!r}: {why}") from error
+
+
+def _make_parameter(name: str, field: FieldInfo) -> inspect.Parameter:
+    kinds = [kind for kind in get_args(field.annotation) if kind is not type(None)]
+    choices = get_args(kinds[0]) if get_origin(kinds[0]) is Literal else ()
+    text = f"{' or '.join(choices)}. {field.description}" if choices else field.description
+    kind: Any = str if choices else kinds[0]
+    annotation: Any = Annotated[kind | None, typer.Option(help=text)]
+    return inspect.Parameter(
+        name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation
+    )
+
 
 SERVER = "http://127.0.0.1:8000"
 
@@ -90,7 +127,7 @@ def sessions_command(
     from rich.markup import escape
     from rich.table import Table
 
-    from storage.sessions.filters import SessionFilter, parse_completeness, parse_iso_or_t_ns
+    from storage.sessions.metadata import SessionFilter, parse_completeness, parse_iso_or_t_ns
 
     filters = SessionFilter(
         nodes=tuple(node or ()),
@@ -161,8 +198,8 @@ def pull_command(
     import foottile
     from service.pull import pull_export, pull_session, pull_take_export
     from storage.formats.slice import Slice
-    from storage.formats.writers.parquet import PARQUET
     from storage.formats.writers.registry import get_format, get_multi_session_format
+    from storage.formats.writers.tables import PARQUET
 
     if (session is None) == (take is None):
         raise UsageError(
@@ -337,7 +374,7 @@ def _find_take_sessions(take: str, data: Path | None) -> list[str]:
     Raises:
         UsageError: no session.
     """
-    from storage.sessions.filters import SessionFilter
+    from storage.sessions.metadata import SessionFilter
 
     found = _list_folder_sessions(resolve_data_folder(data), SessionFilter(take=take))
     if not found:

@@ -20,11 +20,15 @@ from service.estimation.effects import (
     RubberEffect,
     TemperatureEffect,
 )
-from service.estimation.fitting.dome_model import DomeModel
+from service.estimation.fitting.dome_model import (
+    SAMPLE_DELAY_SIGMA_S,
+    TERMS_MAX,
+    DomeModel,
+    FittedEffects,
+)
 from service.estimation.fitting.output_error import DomeFit, OutputErrorProblem
 from service.estimation.fitting.rig.loading import LoadingPoints
 from service.estimation.fitting.thermal_soak import list_parameters_at_bound
-from service.estimation.fitting.unknowns import SAMPLE_DELAY_SIGMA_S, TERMS_MAX, FittedEffects
 from service.estimation.models.hysteresis import WIDTHS_N
 
 _SIGNIFICANT_SIGMAS = 5.0

@@ -14,15 +14,22 @@ import numpy as np
 from scipy.optimize import nnls
 
 from devices.arrays import Bools, Floats
-from service.estimation.fitting.confidence import compute_fit_covariance, compute_step_beyond_bound
-from service.estimation.fitting.dome_model import DomeModel, DomeResponse, make_clamped_pchip_force
+from service.estimation.fitting.dome_model import (
+    DomeModel,
+    DomeResponse,
+    FittedEffects,
+    compute_creep_range_s,
+    list_unknowns,
+    make_clamped_pchip_force,
+)
 from service.estimation.fitting.least_squares import (
     COST_TOLERANCE,
     LeastSquaresResult,
+    compute_fit_covariance,
+    compute_step_beyond_bound,
     minimize_squares,
 )
 from service.estimation.fitting.rig.loading import LoadingPoints
-from service.estimation.fitting.unknowns import FittedEffects, compute_creep_range_s, list_unknowns
 from service.estimation.models.hysteresis import WIDTHS_N
 
 _SCATTER = (0.003, 0.03)

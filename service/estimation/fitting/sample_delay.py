@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from service.estimation.effects import Effects, Parameter
-from service.estimation.fitting.unknowns import SAMPLE_DELAY_SIGMA_S
+from service.estimation.fitting.dome_model import SAMPLE_DELAY_SIGMA_S
 
 DEFAULT_REFERENCE_DELAY = Parameter(value=0.0, sigma=0.0005)
 """Delay of a load cell behind an amplifier of some 300 Hz."""

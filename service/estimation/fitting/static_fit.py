@@ -22,7 +22,7 @@ from service.estimation.calibration import (
     compute_relative_loop_width,
     is_increasing_cubic,
 )
-from service.estimation.fitting.confidence import (
+from service.estimation.fitting.least_squares import (
     compute_cubic_basis_through_zero,
     compute_curve_n,
     compute_mean_half_width_95_n,

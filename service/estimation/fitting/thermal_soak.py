@@ -15,8 +15,11 @@ import numpy as np
 from devices.arrays import Bools, Floats, Ints
 from devices.chips.mpl115a2 import TADC_PER_KELVIN, estimate_degc
 from service.estimation.effects import Parameter, TemperatureEffect
-from service.estimation.fitting.confidence import compute_fit_covariance, compute_step_beyond_bound
-from service.estimation.fitting.least_squares import minimize_squares
+from service.estimation.fitting.least_squares import (
+    compute_fit_covariance,
+    compute_step_beyond_bound,
+    minimize_squares,
+)
 from service.estimation.fitting.rig.indentation import ThermalSoak
 from service.estimation.models.temperature import compute_gas_temperatures
 

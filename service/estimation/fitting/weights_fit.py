@@ -25,11 +25,14 @@ from service.estimation.calibration import (
 )
 from service.estimation.dead_weights import check_enough_distinct_weights
 from service.estimation.effects import EffectName, Effects
-from service.estimation.estimates import SIGMAS_95
-from service.estimation.fitting.confidence import compute_cubic_basis_through_zero, compute_curve_n
+from service.estimation.fitting.least_squares import (
+    compute_cubic_basis_through_zero,
+    compute_curve_n,
+)
 from service.estimation.fitting.rig.indentation import Indentation, format_origin
-from service.estimation.fitting.rig.weight_holds import WeightHold, measure_holds
+from service.estimation.fitting.rig.loading import WeightHold, measure_holds
 from service.estimation.models.static import StaticCurves
+from service.estimation.records import SIGMAS_95
 
 SMALL_FORCE_N = 2.0
 """Force below which an error is absolute rather than relative."""

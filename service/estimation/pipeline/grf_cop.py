@@ -6,7 +6,6 @@ import math
 
 from devices.arrays import Floats
 from devices.jit import jit_inlined
-from service.estimation.pipeline.frame_buffer import TileSample
 from service.estimation.pipeline.params import KernelParams
 from service.estimation.pipeline.plan import SIGNIFICANCE_SIGMAS
 from service.estimation.pipeline.smoothing_stage import (
@@ -15,6 +14,7 @@ from service.estimation.pipeline.smoothing_stage import (
     TileForce,
     compute_weighted_sum_sigma,
 )
+from service.estimation.pipeline.state import TileSample
 from service.estimation.records import RecordArray
 
 VERTICAL_FRACTION_MIN = 0.1

@@ -30,8 +30,8 @@ from service.estimation.foot.geometry import (
 from service.estimation.models import denoise
 from service.estimation.pipeline.model_set import MODEL_NAMES, ModelSet, make_model_set
 from service.estimation.pipeline.saturation import SaturationBounds, make_saturation_bounds
-from service.estimation.tare.correlated_noise import compute_variance_inflation
 from service.estimation.tare.tare import Tare
+from service.estimation.tare.unloaded_windows import compute_variance_inflation
 
 CONTACT_ON_SIGMA = 5.0  # of the GRF unloaded: noise alone does not get there
 CONTACT_OFF_SIGMA = 3.0  # lower than on, so that noise about a threshold does not chatter

@@ -13,14 +13,13 @@ from typing import Annotated
 from devices.arrays import Floats
 from devices.jit import jit_cached, jit_inlined
 from service.estimation.models import denoise, flow, hysteresis, rubber
-from service.estimation.pipeline.frame_buffer import FrameBuffer, TileSample
 from service.estimation.pipeline.params import FootParams, KernelParams, TileParams
 from service.estimation.pipeline.saturation import (
     UNIFORM_SIGMA,
     is_after_long_gap,
     select_farther_bound,
 )
-from service.estimation.pipeline.state import DomeState, TileState
+from service.estimation.pipeline.state import DomeState, FrameBuffer, TileSample, TileState
 from service.estimation.records import KernelRecord, RecordArray
 
 BOUND_SIGMAS = 2.33

@@ -1,6 +1,9 @@
-"""A job: one task applied to one session. It is idempotent.
+"""Jobs: one idempotent task applied to one session, and their run over many sessions.
 
 The worker that runs a job checks for an existing result; the client keeps no list of results.
+
+Only running jobs are in memory, however many sessions there are. The caller passes the function
+that maps jobs over processes or a cluster; both yield each job with its outcome.
 """
 
 from __future__ import annotations
@@ -8,7 +11,8 @@ from __future__ import annotations
 import json
 import logging
 import os
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -16,13 +20,16 @@ from typing import Any, Literal
 
 import pyarrow as pa
 
-from devices.errors import FootTileError, StateError, UsageError
-from service.offline.archive.chunk_store import ChunkStore
-from service.offline.archive.local_copies import hash_session, open_local_session
+from devices.errors import FootTileError, StateError, UsageError, WorkerLostError
+from service.offline.archive.local_copies import (
+    SYSTEM_TEMP_FOLDER,
+    create_workspace,
+    hash_session,
+    open_local_session,
+)
 from service.offline.archive.locations import SessionLocation, check_utf8, is_remote
-from service.offline.archive.result_store import ResultNote, ResultStore, hash_files
+from service.offline.archive.result_store import ChunkStore, ResultNote, ResultStore, hash_files
 from service.offline.archive.tasks import ChunkedTask, SessionTask
-from service.offline.archive.temporary_folders import SYSTEM_TEMP_FOLDER, create_workspace
 from service.offline.process_pool import Unfinished
 from service.version import compute_exact_version
 
@@ -176,3 +183,49 @@ def _check_result_folder(place: SessionLocation, out: str) -> None:
 def normalize_json(value: Any) -> Any:
     """Return a value as a JSON round trip gives it back."""
     return json.loads(json.dumps(value))
+
+
+JobMapper = Callable[
+    [Callable[[Job], Outcome | Unfinished], Iterable[Job]],
+    Iterator[tuple[Job, Outcome | Exception]],
+]
+MAX_LISTED_FAILURES = 20
+"""Number of failures kept for display; the report has all."""
+
+
+@dataclass
+class OutcomeCounts:
+    """Counts over the outcomes of a batch of jobs.
+
+    Attributes:
+        states: number of jobs by state: made, there, failed.
+        verdicts: number of each verdict, for tasks with a verdict.
+        failures: the first `MAX_LISTED_FAILURES` failures.
+    """
+
+    states: Counter[str] = field(default_factory=Counter)
+    verdicts: Counter[str] = field(default_factory=Counter)
+    failures: list[Outcome] = field(default_factory=list)
+
+    def add_outcome(self, outcome: Outcome) -> None:
+        """Count an outcome."""
+        self.states[outcome.state] += 1
+        if verdict := outcome.facts.get("verdict"):
+            self.verdicts[verdict] += 1
+        if outcome.state == "failed" and len(self.failures) < MAX_LISTED_FAILURES:
+            self.failures.append(outcome)
+
+
+def run_jobs(jobs: Iterable[Job], map_jobs: JobMapper) -> Iterator[Outcome]:
+    """Run every job and yield its outcome, in order of completion.
+
+    Raises:
+        FootTileError: no job can run: workers have another version, or are not reachable.
+    """
+    for job, outcome in map_jobs(run_job, jobs):
+        if isinstance(outcome, WorkerLostError):
+            yield make_failed_outcome(job, str(outcome))
+        elif isinstance(outcome, Exception):
+            raise outcome
+        else:
+            yield outcome

@@ -1,8 +1,16 @@
-"""Local copies of sessions and files in object stores; local ones are used in place."""
+"""Local copies of sessions and files in object stores, and temporary folders of workers.
+
+They are named by machine and process, because several machines may share the parent folder.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import os
+import re
+import shutil
+import socket
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -18,8 +26,11 @@ from service.offline.archive.locations import (
     parse_session_location,
     read_bytes,
 )
-from service.offline.archive.temporary_folders import SYSTEM_TEMP_FOLDER, create_workspace
-from storage.durable_files import translate_storage_errors
+from storage.durable_files import (
+    is_dead_process_temporary,
+    make_temporary_path,
+    translate_storage_errors,
+)
 from storage.parquet_hash import read_footer_or_empty_from
 from storage.sessions.folder import FRAMES_NAME
 from storage.sessions.metadata import (
@@ -28,6 +39,35 @@ from storage.sessions.metadata import (
     parse_session_metadata,
     read_bytes_or_none,
 )
+
+_MACHINE = re.sub(r"[^\w-]", "-", socket.gethostname())
+SYSTEM_TEMP_FOLDER = Path(tempfile.gettempdir()) / f"foottile-{os.getuid()}"
+"""Parent of the temporary folders for downloads and uploads."""
+
+
+@contextmanager
+def create_workspace(parent: Path) -> Iterator[Path]:
+    """Provide an empty folder in `parent`, created if missing; delete it when the block ends.
+
+    Raises:
+        StorageError: it cannot be created.
+    """
+    with translate_storage_errors(parent, "Name a folder that can be written to"):
+        parent.mkdir(0o700, parents=True, exist_ok=True)
+        folder = make_temporary_path(parent / _MACHINE)
+        folder.mkdir()
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def remove_stale_workspaces(parent: Path) -> None:
+    """Delete folders left by killed processes of this machine."""
+    for folder in parent.glob(f".{_MACHINE}.*.tmp"):
+        if is_dead_process_temporary(folder.name):
+            shutil.rmtree(folder, ignore_errors=True)
+
 
 _BLOCK = 1 << 20
 _MAX_REQUESTS = 16

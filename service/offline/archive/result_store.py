@@ -2,6 +2,9 @@
 
 Files are written first, atomically, then the note with their hashes. Files without a note do not
 count, so an interrupted job runs again. Object stores write objects atomically.
+
+The folder's name contains the hash of version, input and options, so chunks made from other input
+are never used. It is deleted once the result is written.
 """
 
 from __future__ import annotations
@@ -9,14 +12,19 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from devices.errors import FileFormatError
-from service.offline.archive.chunk_store import CHUNKS_NAME
+from service.offline.archive.local_copies import (
+    SYSTEM_TEMP_FOLDER,
+    create_workspace,
+    download_and_hash,
+    remove_stale_workspaces,
+)
 from service.offline.archive.locations import (
     convert_write_errors,
     is_remote,
@@ -24,11 +32,6 @@ from service.offline.archive.locations import (
     open_filesystem,
     read_bytes,
     upload,
-)
-from service.offline.archive.temporary_folders import (
-    SYSTEM_TEMP_FOLDER,
-    create_workspace,
-    remove_stale_workspaces,
 )
 from storage.checksummed_json import append_json_checksum, verify_and_strip_json_checksum
 from storage.durable_files import (
@@ -39,6 +42,60 @@ from storage.durable_files import (
     translate_storage_errors,
 )
 from storage.parquet_hash import compute_sha256
+
+CHUNKS_NAME = ".pieces"
+
+
+class ChunkStore:
+    """Store of the chunks of one session's result.
+
+    Args:
+        out: results folder, as a path or URI.
+        name: session id.
+        key: hash of version, input and options.
+    """
+
+    def __init__(self, out: str, name: str, key: str) -> None:
+        self._all = f"{out.rstrip('/')}/{CHUNKS_NAME}/{name}"
+        self._where = f"{self._all}/{key}"
+
+    @contextmanager
+    def open_folder(self, suffixes: Sequence[str] | None = None) -> Iterator[Path]:
+        """Open the folder of the chunks; files added to it are published when the block succeeds.
+
+        Args:
+            suffixes: suffixes of the files to load; None: all.
+
+        Raises:
+            StorageError: chunks cannot be read or written.
+        """
+        if not is_remote(self._where):
+            path = Path(self._where)
+            with translate_storage_errors(path):
+                make_synced_folder(path)
+            yield path
+            return
+        with create_workspace(SYSTEM_TEMP_FOLDER) as path:
+            there = set(list_file_sizes(self._where))
+            for name in there:
+                if suffixes is None or name.rpartition(".")[2] in suffixes:
+                    download_and_hash(f"{self._where}/{name}", path / name)
+            yield path
+            made = [file for file in path.iterdir() if file.name not in there]
+            for file in sorted(made, key=_is_chunk_index):
+                upload(f"{self._where}/{file.name}", file)
+
+    def delete(self) -> None:
+        """Delete all chunks of this session, once its result is written."""
+        filesystem, path = open_filesystem(self._all)
+        with convert_write_errors(self._all):
+            filesystem.delete_dir(path)
+
+
+def _is_chunk_index(file: Path) -> bool:
+    """Return whether a file names the other files of its chunk; it must be published last."""
+    return file.suffix == ".json"
+
 
 _WORK_FOLDER_NAME = ".work"
 

@@ -29,8 +29,7 @@ from service.sessions.stances import load_stances
 from storage.durable_files import write_atomically
 from storage.sessions.folder import FRAMES_NAME
 from storage.sessions.footer import SealedFileFooter
-from storage.sessions.metadata import StoredMetadata
-from storage.sessions.sidecars import MARKERS_NAME, read_markers
+from storage.sessions.metadata import MARKERS_NAME, StoredMetadata, read_markers
 from storage.sessions.stances import STANCE_SCHEMA, STANCES_NAME
 
 _ID: pa.Field[Any] = pa.field("session_id", pa.string(), nullable=False)

@@ -20,22 +20,22 @@ from service.offline.archive.local_copies import (
     open_local_file,
     read_session_metadata,
 )
-from service.offline.estimate.request import CHUNK_FRAMES, EstimateRequest
+from service.offline.estimate.preparation import CHUNK_FRAMES, EstimateRequest
 from service.offline.export import ExportOptions, export_session
 from storage.checksummed_json import append_json_checksum
-from storage.clock.file import CLOCK_NAME
+from storage.clock.table import CLOCK_NAME
 from storage.formats.slice import Slice
 from storage.formats.writers.registry import get_format
 from storage.parquet_hash import compute_sha256
 from storage.sessions.folder import FRAMES_NAME
 from storage.sessions.metadata import (
     LEDGER_NAME,
+    MARKERS_NAME,
     PULLED_MARKERS_NAME,
     SESSION_NAME,
     read_bytes_or_none,
 )
 from storage.sessions.reader import SealedFileReader
-from storage.sessions.sidecars import MARKERS_NAME
 from storage.verify.data_folder import find_verdict, verify_path
 
 if TYPE_CHECKING:
@@ -133,13 +133,13 @@ class EstimateTask(EstimateRequest):
 
     def needs_chunks(self, source: Path) -> bool:
         """See `ChunkedTask`."""
-        from service.offline.estimate.chunks import needs_chunks
+        from service.offline.estimate.session import needs_chunks
 
         return needs_chunks(get_sealed_frames_path(source), self, self.piece_frames)
 
     def process_next_chunk(self, source: Path, chunks_folder: Path) -> bool:
         """See `ChunkedTask`."""
-        from service.offline.estimate.chunks import estimate_next_chunk
+        from service.offline.estimate.session import estimate_next_chunk
 
         return estimate_next_chunk(
             get_sealed_frames_path(source),
@@ -151,7 +151,7 @@ class EstimateTask(EstimateRequest):
 
     def join_chunks(self, source: Path, chunks_folder: Path, result_folder: Path) -> dict[str, Any]:
         """See `ChunkedTask`."""
-        from service.offline.estimate.chunks import join_chunks
+        from service.offline.estimate.session import join_chunks
 
         remarks, out = list[str](), result_folder / FRAMES_NAME
         made = join_chunks(
@@ -230,7 +230,7 @@ class CompareTask:
 
     def process_session(self, source: Path, result_folder: Path) -> dict[str, Any]:
         """See `SessionTask`."""
-        from service.offline.comparison_output import write_comparison
+        from service.offline.comparison import write_comparison
 
         title = f"{source.name} against {self.reference.rpartition('/')[2]}"
         with open_local_file(self.reference) as reference:

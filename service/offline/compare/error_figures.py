@@ -15,11 +15,15 @@ import numpy.typing as npt
 
 from devices.arrays import Bools, Floats
 from devices.errors import ComparisonError
-from service.estimation.estimates import SIGMAS_95
+from service.estimation.records import SIGMAS_95
 from service.estimation.stances import Stance, compute_stances
 from service.offline.accuracy import PHASES, CoverageCount, classify_phases
-from service.offline.compare.paired_frames import PairedFrames
-from service.offline.compare.trials import Trial, TrialMean, average_over_trials
+from service.offline.compare.paired_frames import (
+    PairedFrames,
+    Trial,
+    TrialMean,
+    average_over_trials,
+)
 
 STANCE_MARGIN_NS = 50_000_000
 """Window beyond our stance in which the reference may land earlier or lift off later."""

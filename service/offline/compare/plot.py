@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from devices.arrays import Bools, Floats
-from service.estimation.estimates import SIGMAS_95
+from service.estimation.records import SIGMAS_95
 from service.offline.compare.error_figures import ComparisonErrors
 from service.offline.compare.paired_frames import PairedFrames
 from service.offline.figure_output import create_figure, render_png

@@ -7,12 +7,10 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from devices.text import escape_control_chars
 from service.offline.accuracy import PHASES
-from service.offline.compare.alignment import Alignment
+from service.offline.compare.alignment import Alignment, ClockLag
 from service.offline.compare.block_covariance import UncertainValue
-from service.offline.compare.clock_lag import ClockLag
 from service.offline.compare.error_figures import ComparisonErrors
-from service.offline.compare.paired_frames import PairedFrames
-from service.offline.compare.trials import TrialMean
+from service.offline.compare.paired_frames import PairedFrames, TrialMean
 
 FIGURE_TITLES: Mapping[str, str] = {
     "grf_frames": "frames under load that are judged",

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from devices.arrays import Floats
 from devices.frames import FrameBatch
 from service.estimation.foot import CONTACT_UNKNOWN
-from service.server.broadcast.force_span import ForceSpan
+from service.server.broadcast.history import ForceSpan
 from storage.intervals import Intervals
 
 SUMMARY_NS = 1_000_000_000

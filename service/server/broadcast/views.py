@@ -17,14 +17,14 @@ from service.estimation.tare.tare import (
     compute_warming_k,
     fit_recent_baseline_trend,
 )
-from service.private_paths import PublicText
-from service.server.estimates.ranges import TileRanges
+from service.server.estimates.live_estimator import TileRanges
 from service.server.estimates.tare_controller import AutoTare
 from service.server.identities import RefusedMachine
 from service.server.node import ServerNode
 from service.server.recorder import Recorder
 from service.server.session_store import marker_revision, user_fields_revision
-from service.sessions.tare_file import RecordedTare
+from service.sessions.tares import RecordedTare
+from service.user_folders import PublicText
 from storage.sessions.folder import Marker, Part, Session
 
 T = TypeVar("T")

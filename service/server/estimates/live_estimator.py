@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from itertools import takewhile
+from typing import Self
 
 import numpy as np
 
@@ -17,9 +18,10 @@ from devices.flags import TileFlag
 from devices.frames import NOT_READ, ArrayInfo, FrameBatch
 from devices.temperature_hold import hold_temperature
 from service.estimation import LIVE_LAG_MS
-from service.estimation.calibration import Calibration
+from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.compilation import is_compiling
 from service.estimation.foot import LONG_GAP_NS
+from service.estimation.models.static import StaticCurves
 from service.estimation.pipeline.plan import make_plan
 from service.estimation.tare.automatic import (
     HISTORY_NS,
@@ -31,8 +33,52 @@ from service.estimation.tare.automatic import (
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded_windows import TareFrames, compute_recording_tare
 from service.estimation.tare_recovery import remove_recovery
-from service.server.estimates.ranges import TileRanges
 from service.sessions.pipeline import Columns, EstimateOptions, EstimateRun, EstimateStream
+
+
+@dataclass(frozen=True)
+class TileRanges:
+    """Ranges of an array's tiles; arrays are (tiles,), NaN for tiles that bear no load.
+
+    Attributes:
+        entries: calibration of each tile; None for bare ones.
+        end_kpa: end of each tile's calibrated range.
+        full_scale_n: force at that end.
+        slope_n_per_kpa: slope near zero.
+    """
+
+    entries: tuple[TileCalibration | None, ...]
+    end_kpa: Floats
+    full_scale_n: Floats
+    slope_n_per_kpa: Floats
+
+    @classmethod
+    def from_calibration(cls, info: ArrayInfo, calibration: Calibration) -> Self:
+        """Compute ends of ranges from curves and mount gains; NaN for reference tiles.
+
+        Raises:
+            CalibrationError: a tile that bears load is not in it.
+        """
+        serials = info.serials
+        bearing = [i for i, tile in enumerate(info.tiles) if not tile.reference]
+        curves = StaticCurves(calibration.get_tiles([serials[i] for i in bearing]))
+        gains = [calibration.find_mount_gain(serials[i]) for i in bearing]
+        gain = np.array([1.0 if one is None else one.value for one in gains])
+
+        def by_tile(values: Floats) -> Floats:
+            of_all = np.full(len(info.tiles), np.nan)
+            of_all[bearing] = values
+            return of_all
+
+        return cls(
+            entries=tuple(calibration.find_tile(serial) for serial in serials),
+            end_kpa=by_tile(curves.range_high_kpa),
+            full_scale_n=by_tile(
+                gain * curves.compute_forces(curves.range_high_kpa[None]).force_n[0]
+            ),
+            slope_n_per_kpa=by_tile(gain * curves.slope_at_zero_n_per_kpa),
+        )
+
 
 _TADC_OVER_NS = 1_000_000_000
 _EPOCHS_MAX = 256

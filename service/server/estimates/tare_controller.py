@@ -28,8 +28,7 @@ from service.estimation.tare.tare import (
     has_temperature_changed,
 )
 from service.server.estimates.live_estimator import LiveEstimator
-from service.sessions.tare_file import RecordedTare
-from service.sessions.tares import TareHistory
+from service.sessions.tares import RecordedTare, TareHistory
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
 

@@ -21,15 +21,16 @@ import numpy as np
 from devices.arrays import Floats
 from devices.errors import FileFormatError
 from storage.formats.readers.c3d import C3dFile, read_c3d
-from storage.formats.readers.plate_geometry import (
+from storage.formats.readers.plate_signals import (
     PlatePose,
+    PlateSignals,
     compute_fz_and_local_cop,
     compute_loaded_eccentricity,
     compute_plate_pose,
     correct_cop_for_bending,
+    make_plate_table,
     transform_cop_to_laboratory,
 )
-from storage.formats.readers.plate_signals import PlateSignals, make_plate_table
 from storage.formats.readers.table import ForceTable, check_table_size
 
 FORM = "force platforms of types 1 to 4"

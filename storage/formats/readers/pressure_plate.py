@@ -1,13 +1,19 @@
-"""Reader of a pressure plate's frames, reduced to force and centre of pressure.
+"""Readers of pressure plates: frames of an array, and the ASCII export of Tekscan sensors.
 
 Arrays of numpy's `.npz` file: `time_s` (n,); `force_n` or `pressure_kpa` (n, cells along x, cells
 along y); `pitch_m` (2,), distance of cells along x and y; and `origin_m` (2,), centre of the first
 cell, zero if absent. x is forward and y to the left, as in the foot frame.
+
+Facts, `NAME value`, precede `ASCII_DATA @@`. Each frame has a line `Frame N`, and a line of cells
+for each row. `B` is a cell outside of the sensor. The first row is at the toes of an F-Scan insole,
+seen from above: the first column is on the left.
 """
 
 from __future__ import annotations
 
+import re
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +22,12 @@ import numpy as np
 from devices.arrays import Floats
 from devices.errors import FileFormatError
 from devices.input_files import check_regular_file
-from storage.formats.readers.table import ForceTable, make_table_with_standard_names
+from storage.formats.readers.plate_signals import PlateSignals, make_plate_table
+from storage.formats.readers.table import (
+    ForceTable,
+    check_table_size,
+    make_table_with_standard_names,
+)
 
 _CELL_FACTORS = {"force_n": 1.0, "pressure_kpa": 1e3}
 """Factor of cells to newtons or to pascals, by name of the array."""
@@ -105,3 +116,143 @@ def _read_arrays(path: Path, bytes_max: int) -> dict[str, Floats]:
         raise FileFormatError(
             f"no arrays of numpy: {error}", where=where, expected="a file that numpy.savez wrote"
         ) from error
+
+
+FORM = "facts above ASCII_DATA @@, then frames of ROWS lines with COLS cells"
+_BEGIN = re.compile(r"^ASCII_DATA @@[\s,]*^Frame \d+\b", re.MULTILINE)
+_FACT = re.compile(r"^([A-Z_0-9]+) +(.*?)[ ,]*$", re.MULTILINE)
+_FRAME = re.compile(r"^Frame (\d+)\b.*\n", re.MULTILINE)
+_QUANTITY = re.compile(r"([0-9.]+(?:[eE][+-]?\d+)?) *([A-Za-z]\w*)")
+_PASCALS = {"kpa": 1e3, "mpa": 1e6, "psi": 6894.757293}
+_METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254, "inch": 0.0254, "inches": 0.0254}
+
+
+def is_tekscan(head: str) -> bool:
+    """Return whether a text is an ASCII export of a Tekscan sensor."""
+    return _BEGIN.search(head) is not None
+
+
+def parse_tekscan_force_and_cop(text: str, where: str, values_max: int) -> ForceTable:
+    """Parse the frames of cells to total force and centre of pressure, from the sensor's middle.
+
+    Raises:
+        FileFormatError: a fact is missing, frames are truncated, or a cell is no number.
+    """
+    head, _, body = text.partition("ASCII_DATA @@")
+    facts = {match[1]: match[2] for match in _FACT.finditer(head)}
+    rows, columns = _parse_count(facts, "ROWS", where), _parse_count(facts, "COLS", where)
+    pitch_m = [_parse_metres(facts, name, 1, where) for name in ("ROW_SPACING", "COL_SPACING")]
+    area_m2 = _parse_metres(facts, "SENSEL_AREA", 2, where)
+    unit = facts.get("UNITS", "")
+    if unit.lower() not in _PASCALS:
+        raise FileFormatError(
+            f"UNITS is {unit or 'not there'}",
+            where=where,
+            expected="KPa, MPa or PSI, of a sensor that was calibrated",
+            remedy="Save it again with a calibration, in one of these units",
+        )
+    try:
+        step_s = float(facts.get("SECONDS_PER_FRAME", ""))
+    except ValueError:
+        step_s = 0.0
+    if not 0.0 < step_s < np.inf:
+        raise FileFormatError("SECONDS_PER_FRAME is no time", where=where, expected=FORM)
+    numbers, pressure = _parse_frames(body, rows, columns, values_max, where)
+    last = facts.get("END_FRAME", "")
+    if last.isdecimal() and int(last) > numbers[-1]:
+        raise FileFormatError(
+            f"it is cut off: its last frame is {numbers[-1]:.0f} of {last}",
+            where=where,
+            expected=FORM,
+        )
+    x_m, y_m = (
+        np.asarray(pitch * ((count - 1) / 2 - np.arange(count)), dtype=np.float64)
+        for pitch, count in zip(pitch_m, (rows, columns), strict=True)
+    )
+    force_n, cop_m = compute_total_force_and_cop(
+        pressure * (_PASCALS[unit.lower()] * area_m2), x_m, y_m
+    )
+    notes = [f"a sensor of {rows} by {columns} cells, added up"]
+    is_mirrored = any(facts.get(name, "0") != "0" for name in ("MIRROR_ROW", "MIRROR_COL"))
+    if is_mirrored:
+        notes.append("it is mirrored (MIRROR_ROW, MIRROR_COL): no centre of pressure")
+    else:
+        notes.append("COP is from the sensor's middle, x to its first row, y to its first column")
+    notes += _saturation_notes(facts, unit, pressure)
+    plate = PlateSignals(
+        "sensor", force_n, None if is_mirrored else cop_m, "N", "m", is_positive_under_load=True
+    )
+    return make_plate_table(where, step_s * (numbers - numbers[0]), [plate], notes)
+
+
+def _parse_frames(
+    body: str, rows: int, columns: int, values_max: int, where: str
+) -> tuple[Floats, Floats]:
+    """Return the numbers of the frames (n,), and their cells (n, rows, columns).
+
+    Raises:
+        FileFormatError: a frame has another number of cells, or frame numbers do not rise.
+    """
+    parts = _FRAME.split(body.partition("@@")[0].lstrip(" ,"))
+    numbers = np.array([float(number) for number in parts[1::2]])
+    if not len(numbers):
+        raise FileFormatError("there is no frame in it", where=where, expected=FORM)
+    check_table_size(len(numbers), rows * columns, values_max, where)
+    lines: list[str] = []
+    for number, part in zip(parts[1::2], parts[2::2], strict=True):
+        own = [line.strip(" ,") for line in part.split("\n") if line.strip(" ,")]
+        if len(own) != rows or any(line.count(",") != columns - 1 for line in own):
+            raise FileFormatError(
+                f"frame {number} has not {rows} rows of {columns} cells",
+                where=where,
+                expected=FORM,
+            )
+        lines += own
+    if not (np.diff(numbers) > 0.0).all():
+        raise FileFormatError("the numbers of its frames do not rise", where=where, expected=FORM)
+    try:
+        cells = np.loadtxt(
+            (line.upper().replace("B", "0") for line in lines), delimiter=",", ndmin=2
+        )
+    except ValueError as error:
+        raise FileFormatError(
+            f"a cell is no number: {error}", where=where, expected=FORM
+        ) from error
+    if not np.isfinite(cells).all():
+        raise FileFormatError("a cell is not finite", where=where, expected=FORM)
+    return numbers, cells.reshape(len(numbers), rows, columns)
+
+
+def _saturation_notes(facts: Mapping[str, str], unit: str, pressure: Floats) -> list[str]:
+    """Return a note about frames with a saturated cell; empty if there are none."""
+    match = _QUANTITY.match(facts.get("SATURATION_PRESSURE", ""))
+    if match is None or match[2].lower() != unit.lower():
+        return []
+    frames = int((pressure.max(axis=(1, 2)) >= np.floor(float(match[1]))).sum())
+    if not frames:
+        return []
+    return [f"in {frames} of {len(pressure)} frames a cell is saturated: their force is too small"]
+
+
+def _parse_count(facts: Mapping[str, str], name: str, where: str) -> int:
+    text = facts.get(name, "")
+    if not (text.isdecimal() and 0 < int(text) < 10_000):
+        raise FileFormatError(f"{name} is {text or 'not there'}", where=where, expected=FORM)
+    return int(text)
+
+
+def _parse_metres(facts: Mapping[str, str], name: str, power: int, where: str) -> float:
+    """Return a length in m, or an area in m2."""
+    match = _QUANTITY.match(facts.get(name, ""))
+    unit = match[2].lower().removesuffix("2" if power == 2 else "") if match else ""
+    try:
+        value = float(match[1]) if match else 0.0
+    except ValueError:
+        value = 0.0
+    if unit not in _METRES or not value > 0.0:
+        raise FileFormatError(
+            f"{name} is {facts.get(name) or 'not there'}",
+            where=where,
+            expected=f"{'an area' if power == 2 else 'a length'} in mm, cm, m or inches",
+        )
+    return float(value * _METRES[unit] ** power)

@@ -9,17 +9,19 @@ from pathlib import Path
 from devices.errors import FileFormatError, UsageError
 from storage.formats.readers.bioware import is_bioware, parse_bioware_force_and_cop
 from storage.formats.readers.force_platform import read_c3d_force_platforms
-from storage.formats.readers.loadsol import is_loadsol, parse_loadsol_forces
 from storage.formats.readers.moticon import is_moticon, parse_moticon_force_and_cop
 from storage.formats.readers.netforce import is_netforce, parse_netforce_force_and_cop
 from storage.formats.readers.nexus import is_nexus, parse_nexus_force_and_cop
+from storage.formats.readers.novel import is_loadsol, is_pedar, parse_loadsol_forces, refuse_pedar
 from storage.formats.readers.opensim import read_opensim_table
 from storage.formats.readers.parquet import read_parquet_table
-from storage.formats.readers.pedar import is_pedar, refuse_pedar
-from storage.formats.readers.pressure_plate import read_npz_pressure_plate
+from storage.formats.readers.pressure_plate import (
+    is_tekscan,
+    parse_tekscan_force_and_cop,
+    read_npz_pressure_plate,
+)
 from storage.formats.readers.rosbag import is_bag_folder, read_bag_wrenches
 from storage.formats.readers.table import VALUES_MAX, ColumnFilter, ForceTable
-from storage.formats.readers.tekscan import is_tekscan, parse_tekscan_force_and_cop
 from storage.formats.readers.text import HEAD_CHARACTERS, parse_text_table, read_decoded_text
 from storage.formats.readers.text_options import TextOptions
 

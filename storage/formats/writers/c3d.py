@@ -26,7 +26,7 @@ from devices.errors import FootTileError, StorageError
 from devices.frames import TileInfo
 from storage.formats.export import Export
 from storage.formats.writers.format import ExportFormat
-from storage.formats.writers.ground_reaction import (
+from storage.formats.writers.resampling import (
     OPTIONAL_COLUMNS,
     GroundReaction,
     read_reactions_on_common_axis,
@@ -148,7 +148,7 @@ def build_c3d_content(reactions: Sequence[GroundReaction], exports: Sequence[Exp
         row[:samples] = values
     rate_hz = reactions[0].resampling.rate_hz
     groups: dict[str, dict[str, Any]] = {
-        "POINT": {
+        "POINT_COLUMNS": {
             "RATE": [rate_hz / per_frame],
             "UNITS": ["mm"],
             "X_SCREEN": ["+X"],

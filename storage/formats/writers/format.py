@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import io
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from importlib.util import find_spec
+from typing import Any
 
+import pyarrow as pa
+
+from devices.arrays import Times
 from devices.errors import Extra, UsageError, require_extra
 from storage.formats.export import Export
+from storage.schema import UNKNOWN_T_NS, Array
 
 TABLE_OPTIONS = ("names", "times")
 """Options of every format that writes `Export.read_tables`."""
@@ -124,3 +130,87 @@ class ExportFormat:
                 remedy="Add them with `foottile estimate`, or ask for its counts as Parquet, "
                 "Arrow or CSV",
             )
+
+
+def make_names_unique(names: Sequence[str]) -> list[str]:
+    """Return the names with a number appended to repeated ones, such as `left_2`."""
+    unique: list[str] = []
+    for name in names:
+        number, candidate = 1, name
+        while candidate in unique:
+            number += 1
+            candidate = f"{name}_{number}"
+        unique.append(candidate)
+    return unique
+
+
+def get_instants_on_export_clock_ns(export: Export, columns: Mapping[str, Array]) -> Times:
+    """Return the instants of frames on the export's clock, int64[n].
+
+    Args:
+        export: export of the frames.
+        columns: `t_ns`, `part` if the session has parts, `t_server_ns` with the server's clock.
+
+    Raises:
+        UsageError: the server's time of some frames is unknown.
+    """
+    t_ns: Times = (
+        export.to_session_axis_ns(columns) if export.clock is None else columns["t_server_ns"]
+    )
+    unknown = int((t_ns == UNKNOWN_T_NS).sum())
+    if unknown:
+        raise UsageError(
+            f"the server's time is not known for {unknown} frames",
+            where=export.display_name,
+            remedy="Ask for the node's clock, or a slice of a part whose clock was compared",
+        )
+    return t_ns
+
+
+class DrainedBuffer(io.BytesIO):
+    """Buffer of written bytes until they are drained; not seekable."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._drained_bytes = 0
+
+    def seekable(self) -> bool:
+        """Return False: drained bytes are gone."""
+        return False
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """Raise UnsupportedOperation: zipfile tries `seek` instead of `seekable`."""
+        raise io.UnsupportedOperation("seek")
+
+    def tell(self) -> int:
+        """Return the position in the whole file, drained bytes included."""
+        return self._drained_bytes + super().tell()
+
+    def drain(self) -> bytes:
+        """Remove and return the bytes written since the last call."""
+        piece = self.getvalue()
+        self._drained_bytes += len(piece)
+        super().seek(0)
+        self.truncate()
+        return piece
+
+
+def encode_tables(
+    tables: Iterator[pa.Table], open_writer: Callable[[DrainedBuffer, pa.Schema], Any]
+) -> Iterator[bytes]:
+    """Yield a file of tables: a chunk for each table, and a last chunk for the file's end.
+
+    Args:
+        tables: at least one table; all have one schema.
+        open_writer: function that returns a writer with `write_hashed_table` and `close`.
+    """
+    first = next(tables)
+    sink = DrainedBuffer()
+    writer = open_writer(sink, first.schema)
+    writer.write_table(first)
+    yield sink.drain()
+    for table in tables:
+        writer.write_table(table)
+        yield sink.drain()
+    writer.close()
+    yield sink.drain()

@@ -8,14 +8,12 @@ from typing import Annotated
 from pydantic import AfterValidator, WithJsonSchema
 
 from devices.errors import UsageError
-from storage.formats.writers.arrow import ARROW
 from storage.formats.writers.c3d import C3D
-from storage.formats.writers.csv_text import CSV
 from storage.formats.writers.format import ExportFormat
-from storage.formats.writers.matlab.file import MATLAB
+from storage.formats.writers.matlab import MATLAB
 from storage.formats.writers.mcap.file import MCAP
-from storage.formats.writers.opensim.file import OPENSIM
-from storage.formats.writers.parquet import PARQUET
+from storage.formats.writers.opensim import OPENSIM
+from storage.formats.writers.tables import ARROW, CSV, PARQUET
 from storage.formats.writers.xdf import XDF
 
 FORMATS: Mapping[str, ExportFormat] = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import unicodedata
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -9,9 +10,8 @@ from datetime import UTC, datetime
 import numpy as np
 
 from devices.arrays import Floats
-from storage.formats.export import Export
-from storage.formats.export_facts import read_completeness_and_losses
-from storage.formats.writers.row_place import make_tile_row_metadata
+from storage.formats.export import Export, read_completeness_and_losses
+from storage.formats.writers.resampling import make_tile_row_metadata
 
 
 def format_metadata(export: Export, begin_ns: int) -> dict[str, str]:
@@ -91,3 +91,11 @@ def _calibration_text(notes: Mapping[str, object]) -> str:
     if not isinstance(found, dict):
         return "not known"
     return ", ".join(f"{name} {value}" for name, value in found.items() if isinstance(value, str))
+
+
+_NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+def escape_xml_invalid_characters(text: str) -> str:
+    r"""Return text with characters that XML does not allow as escapes: `\\ufffe`."""
+    return _NOT_IN_XML.sub(lambda found: found[0].encode("unicode_escape").decode(), text)

@@ -22,10 +22,13 @@ import pyarrow as pa
 
 from devices.errors import UsageError
 from storage.formats.export import Export
-from storage.formats.writers.format import ExportFormat
-from storage.formats.writers.multi_session import get_instants_on_export_clock_ns, make_names_unique
+from storage.formats.writers.format import (
+    ExportFormat,
+    get_instants_on_export_clock_ns,
+    make_names_unique,
+)
 from storage.formats.writers.resampling import make_resampling, make_sample_axis
-from storage.formats.writers.xml_text import escape_xml_invalid_characters
+from storage.formats.writers.text_metadata import escape_xml_invalid_characters
 from storage.schema import COLUMNS_BY_NAME, SERVER_TIME_COLUMNS, UNKNOWN_T_NS, Array
 
 _MAGIC = b"XDF:"

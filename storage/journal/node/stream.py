@@ -10,7 +10,8 @@ from __future__ import annotations
 import shutil
 import threading
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from itertools import takewhile
 from pathlib import Path
@@ -19,7 +20,6 @@ from devices.errors import DamagedFileError, StorageError
 from storage.durable_files import set_aside_and_describe
 from storage.intervals import CORRUPT, EVICTED, NODE_BUSY, Intervals, Losses, union
 from storage.journal.journal import Journal
-from storage.journal.node.batch_queue import BatchQueue
 from storage.journal.node.in_flight import (
     IN_FLIGHT_FILE,
     read_in_flight_frames_from,
@@ -28,6 +28,37 @@ from storage.journal.node.in_flight import (
 from storage.journal.node.retention_requests import RetentionRequests
 from storage.journal.stream_notes import MAX_UNSYNCED_S, StreamNotes, compute_max_lost_tail_frames
 from storage.wire import EncodedBatch, encode_as_messages
+
+
+class BatchQueue:
+    """Queue of batches, oldest first, with its size in bytes."""
+
+    def __init__(self) -> None:
+        self.batches: deque[EncodedBatch] = deque()
+        self.size_bytes = 0
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames in the queue."""
+        return sum(batch.seq_last - batch.seq_first + 1 for batch in self.batches)
+
+    def append(self, batch: EncodedBatch) -> None:
+        """Append the newest batch."""
+        self.batches.append(batch)
+        self.size_bytes += len(batch.payload)
+
+    def popleft(self) -> EncodedBatch:
+        """Remove and return the oldest batch."""
+        batch = self.batches.popleft()
+        self.size_bytes -= len(batch.payload)
+        return batch
+
+    def prepend(self, batches: Iterable[EncodedBatch]) -> None:
+        """Put removed batches back, before all others."""
+        given = list(batches)
+        self.batches.extendleft(reversed(given))
+        self.size_bytes += sum(len(batch.payload) for batch in given)
+
 
 MAX_RECENT_BYTES = 4 << 20
 """Memory for the newest frames, for the live picture."""

@@ -15,10 +15,10 @@ from devices.array.startup import prepare_array
 from devices.array.tile_array import TileArray
 from devices.buses.i2c import open_bus
 from devices.clock import UtcAnchor, VirtualClock
-from devices.emulation.buses.gpio import EmulatedGpioLines
+from devices.emulation.i2c_bus import EmulatedGpioLines
 from devices.emulation.world import World
 from devices.frames import FrameBatch
-from devices.recovery.bus_recovery import GpioRecovery
+from devices.recovery import GpioRecovery
 from devices.scene.emulation_sections import FaultKind, MuxFault, TileFault
 from devices.scene.hardware_sections import ScheduleName
 from devices.scene.scene_file import validate_scene

@@ -8,7 +8,7 @@ from itertools import pairwise
 import pytest
 from smbus2 import i2c_msg
 
-from devices.buses.device_reopener import DeviceReopener
+from devices.buses.device_files import DeviceReopener
 from devices.buses.i2c import I2cBus
 from devices.errors import BusMisuseError, BusSetupError
 from devices.flags import TileFlag

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from devices.array.bus_monitor import BusMonitor
-from devices.array.tile_io import Scan
+from devices.array.tile import Scan
 from devices.chips.tca9548a import MuxRouter
 from devices.errors import BusSetupError
 from tests.devices.rigs import TWO_MUXES, Wires

@@ -6,10 +6,9 @@ from typing import Any
 
 import pytest
 
-from devices.array.conversion_monitor import ConversionMonitor
-from devices.array.tile_health import TileHealth
-from devices.array.tile_io import TileIo
-from devices.array.timing_budget import BusTiming
+from devices.array.plausibility import ConversionMonitor
+from devices.array.schedules import BusTiming
+from devices.array.tile import TileHealth, TileIo
 from devices.errors import NoAcknowledgeError
 from tests.devices.rigs import FOUR, TYPICAL_NS, Wires, hesitating
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from smbus2 import i2c_msg
 
-from devices.array.timing_budget import BusTiming, compute_frame_s
+from devices.array.schedules import BusTiming, compute_frame_s
 from devices.scene.emulation_sections import ReadDuringConversion
 from devices.scene.hardware_sections import ScheduleName
 from tests.devices.rigs import (

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.array.tile_health import TileHealth, classify_impossible_counts
+from devices.array.tile import TileHealth, classify_impossible_counts
 from devices.flags import TileFlag
 from devices.frames import NOT_READ
 from tests.builders.arrays import DATA_SHEET_CHIP

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.array.timing_budget import (
+from devices.array.schedules import (
     BusTiming,
     check_broadcast_channels,
     choose_schedule,

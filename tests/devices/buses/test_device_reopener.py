@@ -8,7 +8,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devices.buses.device_reopener import ATTEMPT_INTERVAL_NS, DeviceReopener
+from devices.buses.device_files import ATTEMPT_INTERVAL_NS, DeviceReopener
 from devices.errors import BusSetupError
 from tests.waiting import until
 

@@ -14,13 +14,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from smbus2 import SMBus, i2c_msg
 
-from devices.array.tile_health import classify_impossible_counts
+from devices.array.tile import classify_impossible_counts
 from devices.buses.i2c import I2cBus, RetryingBus, open_bus
 from devices.chips.mpl115a2 import Mpl115a2
 from devices.clock import VirtualClock
-from devices.emulation.buses.i2c import EmulatedI2cAdapter, FaultyWires
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.fault_timing import SceneFaults
+from devices.emulation.i2c_bus import EmulatedI2cAdapter, FaultyWires
 from devices.errors import (
     BusFaultError,
     BusLostError,

@@ -9,7 +9,7 @@ from types import ModuleType
 
 import pytest
 
-from devices.buses.device_reopener import ATTEMPT_INTERVAL_NS
+from devices.buses.device_files import ATTEMPT_INTERVAL_NS
 from devices.buses.spi import SpiDevice, open_spi
 from devices.errors import MissingExtraError, SpiSetupError, UsageError
 from tests.waiting import until

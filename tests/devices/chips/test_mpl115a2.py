@@ -24,9 +24,9 @@ from devices.chips.mpl115a2 import (
     compute_padc,
 )
 from devices.clock import VirtualClock
-from devices.emulation.buses.i2c import EmulatedI2cAdapter
 from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
+from devices.emulation.i2c_bus import EmulatedI2cAdapter
 from devices.errors import NoAcknowledgeError, TileSetupError
 from tests.devices.adapters import Adapter
 

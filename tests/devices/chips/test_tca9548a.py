@@ -13,8 +13,8 @@ from smbus2 import i2c_msg
 from devices.buses.i2c import I2cBus
 from devices.chips.tca9548a import ADDRESSES, CHANNELS, MuxRouter, Tca9548a
 from devices.clock import VirtualClock
-from devices.emulation.buses.i2c import EmulatedI2cAdapter
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
+from devices.emulation.i2c_bus import EmulatedI2cAdapter
 from devices.errors import BusFaultError, BusMisuseError, I2cError, NoAcknowledgeError
 from tests.devices.adapters import Adapter
 

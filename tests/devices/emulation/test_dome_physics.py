@@ -18,8 +18,7 @@ from hypothesis import strategies as st
 
 from devices.emulation import dome_physics
 from devices.emulation.dome_physics import GRID_S
-from devices.emulation.part_families import draw_family_dome
-from devices.emulation.parts import DomeProperties
+from devices.emulation.parts import DomeProperties, draw_family_dome
 from tests.devices.emulation.domes import (
     PART,
     Floats,

@@ -11,8 +11,13 @@ import numpy as np
 import pytest
 
 from devices.clock import VirtualClock
-from devices.emulation.part_families import draw_family_chip, draw_family_dome
-from devices.emulation.parts import DomeProperties, draw_chip, draw_dome
+from devices.emulation.parts import (
+    DomeProperties,
+    draw_chip,
+    draw_dome,
+    draw_family_chip,
+    draw_family_dome,
+)
 from devices.emulation.world import World
 from devices.errors import SceneError
 from devices.scene.scene_file import Scene, load_scene

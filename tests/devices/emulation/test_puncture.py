@@ -7,7 +7,7 @@ import math
 import pytest
 
 from devices.emulation.fault_timing import FaultTiming
-from devices.emulation.puncture import Puncture
+from devices.emulation.surroundings import Puncture
 
 STEP_S = 0.001
 

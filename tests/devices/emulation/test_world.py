@@ -11,9 +11,9 @@ import numpy.typing as npt
 import pytest
 from smbus2 import i2c_msg
 
+from devices.array.schedules import BusTiming
 from devices.array.self_test import identify_tiles
 from devices.array.tile_array import TileArray
-from devices.array.timing_budget import BusTiming
 from devices.buses.i2c import I2cBus, open_bus
 from devices.chips.dynamixel.driver import open_servo
 from devices.chips.mpl115a2 import Coefficients, compensate_kpa

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from devices.array.schedules import BusTiming
 from devices.array.self_test import identify_tiles
 from devices.array.tile_array import TileArray
-from devices.array.timing_budget import BusTiming
 from devices.buses.i2c import open_bus
 from devices.clock import VirtualClock
 from devices.emulation.world import World

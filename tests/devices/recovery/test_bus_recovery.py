@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.clock import VirtualClock
-from devices.recovery.bus_recovery import (
+from devices.recovery import (
     RECOVERY_CLOCKS,
     GpioRecovery,
     OpenDrainLine,

@@ -12,8 +12,7 @@ import pytest
 
 from devices.clock import VirtualClock
 from devices.errors import BusSetupError, MissingExtraError
-from devices.recovery.bus_recovery import GpioRecovery, open_gpio_recovery
-from devices.recovery.gpio import GpioLines
+from devices.recovery import GpioLines, GpioRecovery, open_gpio_recovery
 from devices.scene.hardware_sections import RecoverySection
 
 pytestmark = pytest.mark.process

@@ -13,12 +13,13 @@ from hypothesis import strategies as st
 
 from devices.errors import LinkError, UsageError
 from service.api.address import (
+    InterfaceAddress,
     list_own_names,
     list_urls,
     open_listening_socket,
     parse_advertised_url,
+    sort_addresses,
 )
-from service.api.interfaces import InterfaceAddress, sort_addresses
 
 
 def test_where_a_server_will_be_is_known_without_importing_what_it_is_made_of() -> None:

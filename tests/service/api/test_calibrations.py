@@ -13,7 +13,7 @@ import pytest
 from service.estimation.calibration import UNPROVEN_SUFFIX, Calibration
 from service.server import calibrations as book
 from service.sessions.calibration_file import encode_calibration, parse_calibration
-from service.sessions.session_rebuild import rebuild_session
+from service.sessions.sealing import rebuild_session
 from storage.sessions.folder import SessionsFolder
 from tests.builders.calibrations import make_calibration
 from tests.service import benches
@@ -356,6 +356,6 @@ def test_what_cannot_be_fitted_is_refused_at_once(
     )
     for wrong in wrongs:
         assert fit(running, **wrong).status_code == 422, wrong
-    monkeypatch.setattr("service.server.calibration_jobs.FRAMES_MAX", 10)
+    monkeypatch.setattr("service.server.calibrations.FRAMES_MAX", 10)
     assert_refused(fit(running), 422, "at most 10 in one fit")
     assert running.http.get("/calibrations/jobs").json()["items"] == []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from storage.sessions.sidecars import read_markers
+from storage.sessions.metadata import read_markers
 from storage.verify.session import verify_session
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording

@@ -19,7 +19,7 @@ import foottile
 from service import server_clock
 from service.pull import pull_session
 from storage.clock.log import ClockLog
-from storage.hashed_table import write_hashed_table
+from storage.parquet_hash import write_hashed_table
 from tests.service.command import command
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.recording import Recording

@@ -10,7 +10,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 
 from service.node_identity import compute_fingerprint
-from storage.secret_file import SECRETS_NAME, read_secrets_or_empty
+from storage.permissions import SECRETS_NAME, read_secrets_or_empty
 from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import Earlier, FakeNode, NodeOf
 from tests.service.node.publishing import Publishing

@@ -12,7 +12,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection
 
-import service.api.routes.sockets.live_frames
+import service.api.routes.sockets.live
 import service.server.live_feed.buffer
 from tests.service.api.test_calibrations import assign, stiffer
 from tests.service.fake_node import FakeNode, NodeOf
@@ -330,7 +330,7 @@ def test_a_node_that_is_switched_on_again_goes_on_with_its_new_stream(
 def test_a_lossless_client_that_does_not_read_is_told_from_where_to_resume(
     running: Running, node_of: NodeOf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(service.api.routes.sockets.live_frames, "TOO_SLOW_S", 0.05)
+    monkeypatch.setattr(service.api.routes.sockets.live, "TOO_SLOW_S", 0.05)
     wide = node_of(running, tiles=24)  # what kernels take in on the way is a few seconds of these
     wide.connect()
     wide.tared()

@@ -16,7 +16,7 @@ import foottile
 from devices.errors import StorageError
 from service.pull import pull_session
 from storage.sessions.folder import Session
-from storage.sessions.sidecars import read_markers, write_markers
+from storage.sessions.metadata import read_markers, write_markers
 from tests.service.command import command
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording

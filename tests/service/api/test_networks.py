@@ -64,7 +64,7 @@ def test_what_is_advertised_is_shown_instead() -> None:
 SERVED = """
 import asyncio, os, subprocess, sys
 import foottile
-from service.node.tcp_connect import connect_tcp, make_ingest_url
+from service.node.server_connection import connect_tcp, make_ingest_url
 
 os.environ.pop("FOOTTILE_TOKEN", None)
 words = [sys.executable, "-c", "from service.cli.main import main; main()"]

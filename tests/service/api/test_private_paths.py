@@ -8,8 +8,8 @@ import httpx
 import pytest
 
 from devices.errors import FootTileError
-from service.private_paths import register_private_folder, strip_private_folders
 from service.protocol import format_close_reason
+from service.user_folders import register_private_folder, strip_private_folders
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
 from tests.service.running import Running

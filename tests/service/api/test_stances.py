@@ -10,7 +10,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-import service.sessions.stance_overlay
 import service.sessions.stances
 from devices.errors import StorageError
 from service.estimation.stances import STANCE_INPUT_COLUMNS, StanceDetector, compute_stances
@@ -196,7 +195,7 @@ def test_of_many_stances_some_are_there_one_by_one_and_the_mean_is_of_all(
     assert found["spread"]["grf_n"]["count"] == [2] * 11
     assert found["whole"] == 2
     with monkeypatch.context() as patch:
-        patch.setattr(service.sessions.stance_overlay, "STANCES_MAX", 1)
+        patch.setattr(service.sessions.stances, "STANCES_MAX", 1)
         fewer = http.get(url, params={"points": 11}).json()
     assert (fewer["whole"], fewer["overlaid"], fewer["not_whole"]) == (2, 1, 0)
     assert fewer["spread"]["grf_n"]["count"] == [1] * 11

@@ -12,7 +12,7 @@ import pytest
 
 import service.api.app
 from service.api.app import find_page_folder
-from service.api.compression import accepts_gzip
+from service.api.static_files import accepts_gzip
 from tests.service.running import Running, ServeWith
 
 PLAIN = {"Accept-Encoding": "identity"}

@@ -11,7 +11,7 @@ import pytest
 import service.api.routes.recordings.sessions
 import service.server.recorder
 from devices.errors import StorageError
-from service.sessions.session_rebuild import rebuild_session
+from service.sessions.sealing import rebuild_session
 from storage.sessions.folder import SessionsFolder
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import Running, assert_refused

@@ -15,9 +15,9 @@ from typing import Any
 import httpx
 import pytest
 
-import storage.formats.zip_stream
+import service.api.routes.downloads.zips
 from service.api.routes.common import file_response
-from storage.formats.zip_stream import ZippedSession, stream_zip
+from service.api.routes.downloads.zips import ZippedSession, stream_zip
 from storage.parquet_hash import compute_sha256
 from storage.verify.session import verify_session
 from tests.service.fake_node import FakeNode
@@ -164,7 +164,11 @@ def test_of_a_session_that_is_deleted_on_the_way_there_is_no_zip_that_opens(
     two: list[Recording], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     running = two[0].running
-    real, begun, deleted = storage.formats.zip_stream._put, threading.Event(), threading.Event()
+    real, begun, deleted = (
+        service.api.routes.downloads.zips._put,
+        threading.Event(),
+        threading.Event(),
+    )
 
     def slow(*args: Any) -> Any:
         if args[2].parent.name == two[1].id:
@@ -172,7 +176,7 @@ def test_of_a_session_that_is_deleted_on_the_way_there_is_no_zip_that_opens(
             assert deleted.wait(30)
         return real(*args)
 
-    monkeypatch.setattr(storage.formats.zip_stream, "_put", slow)
+    monkeypatch.setattr(service.api.routes.downloads.zips, "_put", slow)
 
     def delete() -> None:
         assert begun.wait(30)

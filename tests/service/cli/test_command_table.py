@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from service.cli import commands
-from service.cli.command_table import SUMMARIES, get_command_function
+from service.cli.main import SUMMARIES, get_command_function
 from tests.service.cli.outcome import Run
 
 

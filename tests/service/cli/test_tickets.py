@@ -10,7 +10,7 @@ import httpx
 import pytest
 import segno
 
-from service.api import interfaces
+from service.api import address as interfaces
 from service.api.logins import Logins, Role
 from service.cli.commands.serve import print_addresses
 from service.cli.tickets import make_qr_lines, remark_unreachable

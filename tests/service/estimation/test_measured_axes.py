@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.flags import EstimateFlag
-from service.estimation.estimates import Estimates
+from service.estimation.records import Estimates
 from tests.builders.arrays import array_at, make_servo
 from tests.builders.estimates import estimate, newton_plan
 from tests.builders.frames import cut_up, loaded_frames

@@ -14,9 +14,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.estimation.estimates import Estimates
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from service.estimation.quantization import STEPS_PER_SIGMA, Quantization
+from service.estimation.records import Estimates
 from service.estimation.tare.tare import Tare
 from tests.builders.arrays import COUNT_KPA, UTC_NS, array_at, make_servo
 from tests.builders.calibrations import make_calibration, make_effects, make_tare, newton_tile

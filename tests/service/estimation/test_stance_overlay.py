@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from service.estimation.stance_overlay import (
+from service.estimation.stance_curves import (
     OVERLAY_COLUMNS,
     Overlay,
     StanceOverlayBuilder,

@@ -27,7 +27,7 @@ from devices.errors import (
 )
 from devices.scene.scene_file import load_scene
 from service.node.acquisition_process import WaitingForArray
-from service.rig.options import RigOptions
+from service.rig.emulated_foot import RigOptions
 from tests.builders.scenes import ONE_TILE_FILE, make_scene
 from tests.service.process import Process, Start, acquisition_of
 from tests.service.running import Running

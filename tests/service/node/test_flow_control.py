@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.node.flow_control import WINDOW_MAX_BYTES, WINDOW_MIN_BYTES, WINDOW_S, SendWindow
+from service.node.frame_sender import WINDOW_MAX_BYTES, WINDOW_MIN_BYTES, WINDOW_S, SendWindow
 
 
 class LinkOf:

@@ -10,7 +10,7 @@ from devices.errors import CalibrationError
 from service.node.options import NodeOptions
 from service.node.server_connection import make_hello
 from service.protocol import NodeStatus
-from service.rig.options import RigOptions
+from service.rig.emulated_foot import RigOptions
 from storage.journal.node.journal import NodeJournal
 from tests.builders.arrays import make_array
 from tests.builders.scenes import make_scene

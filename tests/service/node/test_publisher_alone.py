@@ -16,7 +16,7 @@ from websockets.asyncio.server import ServerConnection, serve
 import service.node.frame_sender
 import service.server
 from devices.errors import UsageError
-from service.node.tcp_connect import make_ingest_url
+from service.node.server_connection import make_ingest_url
 from service.node_identity import compute_fingerprint, make_proof
 from service.protocol import (
     NODE_MESSAGES,

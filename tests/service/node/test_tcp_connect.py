@@ -9,8 +9,8 @@ import pytest
 from websockets.exceptions import ConnectionClosed, ConnectionClosedError
 from websockets.frames import Close
 
-from service.node import tcp_connect as dial_module
-from service.node.tcp_connect import ReconnectBackoff, connect_tcp
+from service.node import server_connection
+from service.node.server_connection import ReconnectBackoff, connect_tcp
 from tests.waiting import in_a_loop
 
 
@@ -47,7 +47,7 @@ async def test_a_link_that_returns_is_noticed_by_a_fresh_attempt_beside_those_th
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The kernel repeats its first packet after 1, 3, 7 s only."""
-    monkeypatch.setattr(dial_module, "ATTEMPT_INTERVAL_S", 0.02)
+    monkeypatch.setattr(server_connection, "ATTEMPT_INTERVAL_S", 0.02)
     begun: list[int] = []
 
     loop = asyncio.get_running_loop()
@@ -68,8 +68,8 @@ async def test_a_link_that_returns_is_noticed_by_a_fresh_attempt_beside_those_th
 
 @in_a_loop
 async def test_nobody_who_answers_is_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dial_module, "ATTEMPT_INTERVAL_S", 0.01)
-    monkeypatch.setattr(dial_module, "CONNECT_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(server_connection, "ATTEMPT_INTERVAL_S", 0.01)
+    monkeypatch.setattr(server_connection, "CONNECT_TIMEOUT_S", 0.05)
 
     loop = asyncio.get_running_loop()
 
@@ -89,7 +89,7 @@ def test_a_node_that_is_let_go_for_what_it_sends_comes_back_ever_later(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A welcome is no success: it would be let go for the same again, twice a second."""
-    monkeypatch.setattr(dial_module, "REFUSED_BACKOFF_S", (0.2, 5.0))
+    monkeypatch.setattr(server_connection, "REFUSED_BACKOFF_S", (0.2, 5.0))
     back_off, waits = ReconnectBackoff(), []
     for _ in range(8):
         back_off.set_delays_for(let_go_with(4001))

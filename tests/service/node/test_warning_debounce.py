@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.node.warning_debounce import WarningDebouncer
+from service.node.acquisition_process import WarningDebouncer
 
 SILENT = {"T02": "tile T02 does not answer"}
 

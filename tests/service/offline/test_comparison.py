@@ -10,11 +10,11 @@ import pytest
 from devices.errors import FileFormatError
 from service.offline.compare.report import format_comparison_report
 from service.offline.comparison import CompareOptions, compare_session
-from storage.clock.file import write_clock_file
 from storage.clock.log import ClockOffset
+from storage.clock.table import write_clock_file
 from storage.formats.reference import ReferenceOptions
 from storage.sessions.folder import Marker, Part, Session
-from storage.sessions.sidecars import write_markers
+from storage.sessions.metadata import write_markers
 from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames

@@ -10,9 +10,8 @@ import pytest
 
 from devices.errors import UsageError
 from service.offline.export import ExportOptions, export_merged, export_session
-from storage.clock.file import CLOCK_NAME, write_clock_file
 from storage.clock.log import ClockOffset
-from storage.clock.table import StreamClockFacts
+from storage.clock.table import CLOCK_NAME, StreamClockFacts, write_clock_file
 from storage.formats.slice import Slice
 from storage.sessions.folder import FRAMES_NAME
 from storage.sessions.writer import SealedFileWriter

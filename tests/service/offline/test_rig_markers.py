@@ -10,7 +10,7 @@ import pytest
 from devices.errors import CalibrationError
 from service.offline.calibration_fit import read_indentations
 from storage.sessions.folder import FRAMES_NAME, Marker, Session, SessionsFolder
-from storage.sessions.sidecars import write_markers
+from storage.sessions.metadata import write_markers
 from tests.service import benches
 
 pytestmark = pytest.mark.slow

@@ -11,8 +11,8 @@ import pytest
 from devices.buses.serial_line import open_serial_line
 from devices.clock import VirtualClock
 from devices.scene.scene_file import load_scene
-from service.offline import servo_doctor
-from service.offline.servo_doctor import diagnose_servo
+from service.offline import doctor
+from service.offline.doctor import diagnose_servo
 from tests.builders.servo import FaultyServo
 
 
@@ -21,9 +21,9 @@ def test_an_answer_that_a_busy_machine_hears_late_is_still_an_answer(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     wanted = load_scene("rolling").servo
-    monkeypatch.setattr(servo_doctor, "TIMEOUTS_S", (0.01, 1.0))
+    monkeypatch.setattr(doctor, "TIMEOUTS_S", (0.01, 1.0))
     # One rate: what is said at others comes after the answer to the first.
-    monkeypatch.setattr(servo_doctor, "BAUDRATES", ())
+    monkeypatch.setattr(doctor, "BAUDRATES", ())
     with FaultyServo(lambda _: 0, VirtualClock(), model="MX-28") as servo, servo.late(0.05):
         diagnosis = diagnose_servo(servo.port, VirtualClock(), wanted)
     assert [found.model for found in diagnosis.found] == ["MX-28"]
@@ -33,7 +33,7 @@ def test_an_answer_that_a_busy_machine_hears_late_is_still_an_answer(
 def test_who_never_answers_is_not_found_however_patient_one_is(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(servo_doctor, "TIMEOUTS_S", (0.01, 0.02))
+    monkeypatch.setattr(doctor, "TIMEOUTS_S", (0.01, 0.02))
     with FaultyServo(lambda _: 0, VirtualClock()) as servo, servo.silent():
         diagnosis = diagnose_servo(servo.port, VirtualClock(), None)
     assert not diagnosis.is_well

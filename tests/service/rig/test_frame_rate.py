@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.rig.frame_rate import FrameRateMonitor, estimate_undisturbed_rate_hz
+from service.rig.rig import FrameRateMonitor, estimate_undisturbed_rate_hz
 from tests.builders.frames import make_frames
 
 PERIOD_NS = 2_000_000

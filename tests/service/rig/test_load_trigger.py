@@ -10,7 +10,7 @@ from devices.clock import VirtualClock
 from devices.emulation.world import World
 from devices.flags import TileFlag
 from service.estimation.tare.unloaded_windows import FRAMES_MIN
-from service.rig.load_trigger import LEAD_TIMEOUT_NS, USABLE_FRAMES_MIN, LoadTrigger
+from service.rig.rig import LEAD_TIMEOUT_NS, USABLE_FRAMES_MIN, LoadTrigger
 from tests.builders.frames import make_frames
 from tests.builders.scenes import make_scene
 

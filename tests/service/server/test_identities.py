@@ -13,11 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import ChangedError, StateError, StorageError
-from service.node.secrets import ServerSecrets
+from service.node.options import ServerSecrets
 from service.node_identity import compute_fingerprint, generate_secret, make_proof
 from service.protocol import CloseConnection, LinkCloseCode, Proof
 from service.server.identities import IdentityClaim, NodeIdentities
-from storage.secret_file import SECRETS_NAME
+from storage.permissions import SECRETS_NAME
 from tests.storage.faulty_disk import NO_SPACE, refusing
 
 SERVER, NODE, NOW_T_NS = "5" * 32, "leg", 1_800_000_000 * 10**9

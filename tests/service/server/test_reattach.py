@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.server.session_parts import abandon_missing, extend_or_continue_session
-from service.sessions.creation import create_session
+from service.sessions.parts import create_session
 from storage.intervals import Intervals
 from storage.sessions.folder import Part, Session
 from storage.sessions.ledger import group_numbers_by_stream

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.frames import FrameBatch
-from service.server.stream_limit import AHEAD_MAX_NS, StreamLimit
+from service.server.streams import AHEAD_MAX_NS, StreamLimit
 from storage.clock.bounds import DISCIPLINE_RATE_LIMIT
 from storage.message_layout import MAX_MESSAGE_FRAMES
 from tests.builders.frames import make_frames

@@ -208,7 +208,7 @@ def test_what_was_deleted_because_nobody_needs_it_is_not_lost_even_after_a_resta
     told: Told, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("service.server.node.RING_DURATION_NS", 20 * PERIOD_NS)
-    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_DURATION_NS", 10 * PERIOD_NS)
+    monkeypatch.setattr("storage.journal.segment_writer.SEGMENT_DURATION_NS", 10 * PERIOD_NS)
     told.connect()
     for n in range(0, 100, 5):
         told.take(n, n + 4)

@@ -17,8 +17,8 @@ from devices.flags import TileFlag
 from devices.frames import FrameBatch
 from service.estimation.calibration import Calibration
 from service.estimation.estimate import Estimator
-from service.estimation.estimates import Estimates
 from service.estimation.pipeline.plan import make_plan
+from service.estimation.records import Estimates
 from service.estimation.tare.tare import Tare
 from service.sessions import pipeline
 from service.sessions.pipeline import EstimateStream, make_estimate_columns, make_estimate_metadata

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import service.sessions.checkpoints
 import service.sessions.preview
 import service.sessions.preview_frames
-import storage.journal.batch_reader
+import storage.journal.time_index
 from devices.errors import StorageError, UsageError
 from devices.frames import FrameBatch
 from service.estimation.tare.tare import Tare
@@ -25,14 +25,13 @@ from service.sessions.frames import iterate_raw_frames
 from service.sessions.inputs import SessionInputs
 from service.sessions.preview import SessionPreview, SessionPreviews
 from service.sessions.preview_frames import PreviewFrames
+from storage.durable_files import ScratchFile
 from storage.formats.export import Export, make_one_pass_frame_source
 from storage.formats.slice import Slice
 from storage.formats.writers.registry import FORMATS
 from storage.journal.journal import Journal
-from storage.scratch import ScratchFile
 from storage.sessions.folder import Part, Session
-from storage.sessions.preview import PreviewBins
-from storage.sessions.pyramid import required_frame_columns, shift_bins_to_axis
+from storage.sessions.pyramid import PreviewBins, required_frame_columns, shift_bins_to_axis
 from tests.builders.arrays import PERIOD_NS
 from tests.builders.frames import make_frames
 from tests.service.sessions.pieces import array, calibration, hopping
@@ -49,7 +48,7 @@ def _small() -> Iterator[None]:
         patch.setattr(service.sessions.checkpoints, "CHECKPOINTS_MAX", 6)
         patch.setattr(service.sessions.preview, "_REST_FACTOR", 0)
         patch.setattr(service.sessions.preview, "UPDATE_BUDGET_S", 1e9)
-        patch.setattr(storage.journal.batch_reader, "PIECE_FRAMES", 8)
+        patch.setattr(storage.journal.time_index, "PIECE_FRAMES", 8)
         yield
 
 

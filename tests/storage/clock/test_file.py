@@ -11,12 +11,11 @@ import pyarrow as pa
 import pytest
 
 from devices.errors import FileFormatError, UsageError
-from storage.clock.file import read_clock_file, write_clock_file
 from storage.clock.log import ClockOffset
-from storage.clock.table import StreamClockFacts
-from storage.hashed_table import write_hashed_table
+from storage.clock.table import StreamClockFacts, read_clock_file, write_clock_file
+from storage.parquet_hash import write_hashed_table
+from storage.sessions.metadata import load_clock_table
 from storage.sessions.reader import SealedFileReader
-from storage.sessions.sidecars import load_clock_table
 from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames

@@ -14,8 +14,7 @@ from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, NOT_READ, ArrayInfo, F
 from storage.clock.table import ClockTable
 from storage.formats.export import Export, FrameSource, make_one_pass_frame_source
 from storage.formats.markers import PlacedMarkers
-from storage.formats.options import FormatOptions
-from storage.formats.slice import Slice
+from storage.formats.slice import FormatOptions, Slice
 from storage.formats.writers.registry import get_format
 from storage.schema import CONTACT_UNKNOWN, Array
 from tests.builders.arrays import PERIOD_NS, make_array

@@ -19,8 +19,7 @@ from storage.clock.bounds import OffsetRows
 from storage.clock.table import ClockTable, StreamClockFacts
 from storage.formats.export import make_one_pass_frame_source
 from storage.formats.markers import DISTANCE_MAX_NS, PLACEMENT_COLUMNS, PlacedMarkers, place_markers
-from storage.formats.options import FormatOptions
-from storage.formats.slice import Slice
+from storage.formats.slice import FormatOptions, Slice
 from storage.schema import Array
 from storage.sessions.folder import Marker
 from storage.sessions.footer import NOTES_KEY

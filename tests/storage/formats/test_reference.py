@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError, FootTileError, UsageError
-from storage.formats.readers.sample_times import respace_rounded_times_evenly
+from storage.formats.readers.table import respace_rounded_times_evenly
 from storage.formats.reference import ReferenceData, ReferenceOptions, read_reference
-from storage.hashed_table import write_hashed_table
+from storage.parquet_hash import write_hashed_table
 
 LAB = ReferenceOptions(
     {"time_s": "Time", "grf_n": "Fz", "cop_x_m": "COPx", "cop_y_m": "COPy"},

@@ -17,19 +17,18 @@ from hypothesis import strategies as st
 
 from devices.errors import FileFormatError, FootTileError, UsageError
 from devices.frames import FrameBatch
-from storage.clock.file import write_clock_file
 from storage.clock.log import ClockOffset
-from storage.clock.table import StreamClockFacts
+from storage.clock.table import StreamClockFacts, write_clock_file
 from storage.formats.export import ClockName, make_one_pass_frame_source
 from storage.formats.markers import PLACEMENT_COLUMNS, place_markers
 from storage.formats.sealed_export import make_sealed_export, place_session_markers
 from storage.formats.slice import Slice
-from storage.formats.writers.arrow import ARROW
+from storage.formats.writers.tables import ARROW
 from storage.schema import Array
 from storage.sessions import writer
 from storage.sessions.folder import Marker
+from storage.sessions.metadata import load_clock_table
 from storage.sessions.reader import SealedFileReader
-from storage.sessions.sidecars import load_clock_table
 from storage.sessions.writer import SealedFileWriter, parquet_options
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames

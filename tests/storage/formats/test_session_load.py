@@ -14,9 +14,8 @@ from devices.emulation.ground.load_trace import LoadTrace
 from devices.errors import LoadTraceError
 from storage.formats.export import make_one_pass_frame_source
 from storage.formats.load_trace import read_load_trace
-from storage.formats.options import FormatOptions
 from storage.formats.readers.registry import read_table
-from storage.formats.slice import Slice
+from storage.formats.slice import FormatOptions, Slice
 from storage.schema import Array
 from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import PERIOD_NS, make_array, make_tile

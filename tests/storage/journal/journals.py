@@ -10,7 +10,7 @@ import numpy as np
 from devices.frames import FrameBatch
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
-from storage.journal.open_segments import SEGMENT_DURATION_NS
+from storage.journal.segment_writer import SEGMENT_DURATION_NS
 from storage.schema import wire_schema
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.frames import any_frames, assert_same_bits

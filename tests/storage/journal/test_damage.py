@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from devices.errors import DamagedFramesError, FileFormatError, StorageError
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
-from storage.journal.segment_format import RECORD_DTYPE
+from storage.journal.segment import RECORD_DTYPE
 from storage.schema import wire_schema
 from storage.verify.segment import verify_segment
 from storage.wire import encode_frames

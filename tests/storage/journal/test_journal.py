@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from devices.errors import FileFormatError, StorageError
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
-from storage.journal.open_segments import SEGMENT_DURATION_NS
+from storage.journal.segment_writer import SEGMENT_DURATION_NS
 from storage.schema import frames_from_record_batch
 from storage.wire import encode_frames
 from tests.builders.arrays import UTC_NS, make_array

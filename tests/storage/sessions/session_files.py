@@ -20,8 +20,7 @@ from storage.parquet_hash import (
     fill_hash_placeholders_and_sync,
 )
 from storage.schema import ARRAY_INFO_KEY
-from storage.sessions.content_hash import CONTENT_HASH_KEY, CONTENT_KEY, compute_content_hash
-from storage.sessions.footer import NOTES_KEY
+from storage.sessions.footer import CONTENT_HASH_KEY, CONTENT_KEY, NOTES_KEY, compute_content_hash
 from storage.sessions.reader import SealedFileReader
 from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import PERIOD_NS, make_array

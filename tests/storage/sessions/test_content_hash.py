@@ -115,7 +115,7 @@ def test_row_groups_and_encodings_do_not_change_the_hashes_of_columns(tmp_path: 
     said = content(path)
     other = tmp_path / "other.parquet"
     pq.write_table(pq.read_table(path), other, row_group_size=7, compression="snappy")
-    from storage.sessions.content_hash import ContentDigest
+    from storage.sessions.footer import ContentDigest
 
     digest = ContentDigest()
     for group in range(pq.ParquetFile(other).num_row_groups):

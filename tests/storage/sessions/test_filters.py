@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.errors import UsageError
-from storage.sessions.filters import SessionFilter, parse_completeness, parse_iso_or_t_ns
 from storage.sessions.folder import Completeness, Part, Session
+from storage.sessions.metadata import SessionFilter, parse_completeness, parse_iso_or_t_ns
 
 T_NS = 1_767_225_600_000_000_000
 """2026-01-01T00:00:00Z"""

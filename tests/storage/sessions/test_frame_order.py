@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from devices.errors import FileFormatError
 from devices.frames import FrameBatch
 from storage.intervals import Intervals
-from storage.sessions.frame_order import FrameOrderChecker, iterate_checking_order
+from storage.sessions.ledger import FrameOrderChecker, iterate_checking_order
 from tests.builders.frames import make_frames
 
 

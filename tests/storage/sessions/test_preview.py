@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from storage.schema import Array
-from storage.sessions.preview import PreviewBins, select_and_downsample_bins
-from storage.sessions.pyramid import make_single_frame_bins
+from storage.sessions.pyramid import PreviewBins, make_single_frame_bins, select_and_downsample_bins
 
 
 def frames(first: int, n: int, part: int = 0) -> dict[str, Array]:

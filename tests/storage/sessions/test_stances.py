@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from devices.errors import DamagedFileError, OtherVersionError
 from service.estimation.stances import STANCE_COLUMNS, Stance
-from storage.hashed_table import write_hashed_table
+from storage.parquet_hash import write_hashed_table
 from storage.sessions.stances import (
     STORED_STANCE_COLUMNS,
     make_stance_table,

@@ -10,10 +10,10 @@ import pytest
 
 from devices.errors import FileFormatError
 from storage.parquet_hash import read_stated_and_actual_hash
-from storage.sessions import footer, reader, verified_file_cache
+from storage.sessions import footer, reader
+from storage.sessions import reader as verified_file_cache
 from storage.sessions.footer import SealedFileFooter
-from storage.sessions.reader import SealedFileReader
-from storage.sessions.verified_file_cache import VerifiedFileCache
+from storage.sessions.reader import SealedFileReader, VerifiedFileCache
 from tests.storage.sessions.session_files import frames, write
 
 

@@ -17,7 +17,7 @@ from devices.frames import ArrayInfo, FrameBatch
 from storage.clock.log import ClockLog, ClockOffset
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
-from storage.journal.segment_format import INDEX_SUFFIX, RECORD_DTYPE, read_schema_and_first_offset
+from storage.journal.segment import INDEX_SUFFIX, RECORD_DTYPE, read_schema_and_first_offset
 from storage.journal.segment_writer import SegmentWriter
 from storage.journal.stream_notes import NOTES_FILE, StreamNotes
 from storage.schema import read_array_info, wire_schema

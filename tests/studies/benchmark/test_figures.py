@@ -11,7 +11,7 @@ import pytest
 
 from service.json_output import to_json_value
 from service.offline.accuracy import Accuracy, compute_accuracy
-from studies.benchmark.draws import DrawResult
+from studies.benchmark.draws import DrawResult, list_model_sets
 from studies.benchmark.figures import (
     Quantiles,
     find_pareto_front,
@@ -19,7 +19,6 @@ from studies.benchmark.figures import (
     summarize_accuracy,
     summarize_model_sets,
 )
-from studies.benchmark.model_sets import list_model_sets
 
 
 def accuracy(error_n: float, frames: int = 20) -> Accuracy:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from service.estimation.pipeline.model_set import MODEL_NAMES
-from studies.benchmark.model_sets import list_missing_models, list_model_sets
+from studies.benchmark.draws import list_missing_models, list_model_sets
 
 LADDER = (
     *("unwrap", "temperature", "ambient", "gas", "static"),

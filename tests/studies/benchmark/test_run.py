@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from devices.scene.scene_file import load_scene
-from studies.benchmark.draws import DrawTask, run_draw
-from studies.benchmark.model_sets import list_model_sets
+from studies.benchmark.draws import DrawTask, list_model_sets, run_draw
 from studies.benchmark.run import BenchmarkOptions, run_benchmark, run_draws
 
 

@@ -9,14 +9,15 @@ from devices.flags import EstimateFlag
 from devices.scene.scene_file import load_scene
 from service.estimation.estimate import Estimator
 from studies.benchmark.draws import (
+    ComparedModelSet,
     DrawRecording,
     RepeatedRecording,
     compute_recording_accuracy,
+    list_model_sets,
     make_recording_plan,
     record_draw,
     time_model_sets,
 )
-from studies.benchmark.model_sets import ComparedModelSet, list_model_sets
 
 
 @pytest.fixture(scope="module")

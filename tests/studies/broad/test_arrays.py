@@ -13,8 +13,7 @@ from devices.emulation.world import World
 from devices.flags import EstimateFlag
 from devices.scene.scene_file import Scene, load_scene
 from service.estimation.calibration import PRESETS
-from studies.broad.arrays import CLEAN, _evaluate_case, _iterate_cases
-from studies.broad.evaluation import evaluate_estimates
+from studies.broad.arrays import CLEAN, _evaluate_case, _iterate_cases, evaluate_estimates
 from studies.broad.results import make_case_key
 
 SEED = 1_000_003

@@ -7,15 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from studies.broad import run
-from studies.broad.arrays import ArrayTask, run_array
+from studies.broad import arrays as run
+from studies.broad.arrays import ArrayTask, BroadOptions, run_array, run_broad_benchmark
 from studies.broad.results import (
     get_result_path,
     hash_project_code,
     read_result,
     write_result,
 )
-from studies.broad.run import BroadOptions, run_broad_benchmark
 from tests.studies.broad.kept import made, result
 
 

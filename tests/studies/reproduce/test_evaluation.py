@@ -17,7 +17,7 @@ from service.offline.simulation import SimulationOptions, run_simulation
 from service.rig.emulated_foot import EmulatedFoot
 from service.rig.plate_files import PlateFiles
 from service.sessions.pipeline import EstimateOptions
-from studies.reproduce.evaluation import (
+from studies.reproduce.result import (
     InjectedValueCheck,
     TrialResult,
     evaluate_trial,

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from devices.scene.scene_file import load_scene
-from studies.reproduce.evaluation import compute_not_borne_n
+from studies.reproduce.result import compute_not_borne_n
 from studies.reproduce.trials import (
     POPPY,
     POPPY_RIM,

@@ -20,9 +20,9 @@ from service.api.routes.common import (
     problem_responses,
     require_file,
 )
-from service.api.routes.downloads.data_query import DataQuery
 from service.api.routes.downloads.exports import (
     Chunks,
+    DataQuery,
     compute_export_etag,
     export_response,
     make_file_stem,
@@ -37,8 +37,8 @@ from storage.formats.export import Export
 from storage.formats.markers import PLACEMENT_COLUMNS, PlacedMarkers, place_markers
 from storage.formats.sealed_export import make_sealed_export, place_session_markers
 from storage.formats.slice import Slice
-from storage.formats.writers.parquet import PARQUET
 from storage.formats.writers.registry import FORMATS
+from storage.formats.writers.tables import PARQUET
 from storage.sessions.folder import FRAMES_NAME, Session
 
 router = APIRouter(prefix="/sessions", tags=["data"])

@@ -12,9 +12,9 @@ from starlette.concurrency import run_in_threadpool
 
 from devices.errors import StateError
 from service.api.routes.common import ServerState, has_matching_etag, problem_responses
-from service.api.routes.downloads.data_query import TakeDataQuery
 from service.api.routes.downloads.exports import (
     Chunks,
+    TakeDataQuery,
     compute_export_etag,
     export_response,
     make_file_stem,

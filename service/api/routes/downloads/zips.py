@@ -1,7 +1,18 @@
-"""Several sealed sessions as one zip file."""
+"""Several sealed sessions as one zip file.
+
+Files are stored, not deflated: Parquet is compressed already. The directory of a zip file is its
+end. If a session is damaged or removed meanwhile, the directory is never sent, so that no program
+opens the incomplete archive.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import io
+import time
+import zipfile
+from collections.abc import Generator, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -9,11 +20,96 @@ from fastapi import APIRouter, Query, Response
 from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
-from devices.errors import StateError, UnknownError, UsageError
+from devices.errors import DamagedFileError, StateError, StorageError, UnknownError, UsageError
 from service.api.routes.common import ServerState, problem_responses, require_file
 from service.api.routes.downloads.exports import iterate_chunks
-from storage.formats.zip_stream import ZippedSession, stream_zip
+from storage.clock.table import CLOCK_NAME
 from storage.sessions.folder import FRAMES_NAME, Session
+from storage.sessions.metadata import MARKERS_NAME, SESSION_NAME
+from storage.sessions.stances import STANCES_NAME
+
+_CHUNK_BYTES = 1 << 20
+_ZIP_DATES_S = (315_619_200, 4_354_732_800)
+"""Range of dates of a zip file: 2 January 1980 to 30 December 2107, in any time zone.
+
+Files of 1970, from a machine without a clock, get the nearest date.
+"""
+_SIDECARS = (MARKERS_NAME, CLOCK_NAME, STANCES_NAME)
+"""Sidecars of a session. Each has its own checksum; without estimates there are no stances."""
+
+
+@dataclass(frozen=True)
+class ZippedSession:
+    """Sealed session to put into a zip file."""
+
+    folder: Path
+    frames_sha256: str
+    """SHA-256 of its frames' file."""
+
+
+def stream_zip(sessions: Iterable[ZippedSession]) -> Generator[bytes, None, None]:
+    """Yield a zip file in chunks: a folder for each session, which `foottile verify` accepts.
+
+    Raises:
+        DamagedFileError: a session's frames differ from the sealed ones.
+        StorageError: a file cannot be read, or was removed.
+    """
+    sink = _DrainedBuffer()
+    with zipfile.ZipFile(sink, "w", zipfile.ZIP_STORED, allowZip64=True) as file:
+        for session in sessions:
+            yield from _put(file, sink, session.folder / FRAMES_NAME, session.frames_sha256)
+            for name in _SIDECARS:
+                if (session.folder / name).is_file():
+                    yield from _put(file, sink, session.folder / name)
+            # Last: if the session is removed meanwhile, this file fails, whatever was sent before.
+            yield from _put(file, sink, session.folder / SESSION_NAME)
+    yield sink.drain()
+
+
+def _put(
+    file: zipfile.ZipFile, sink: _DrainedBuffer, path: Path, sha256: str | None = None
+) -> Generator[bytes, None, None]:
+    found = hashlib.sha256()
+    try:
+        dated_s = min(max(int(path.stat().st_mtime), _ZIP_DATES_S[0]), _ZIP_DATES_S[1])
+        about = zipfile.ZipInfo(f"{path.parent.name}/{path.name}", time.localtime(dated_s)[:6])
+        about.external_attr = 0o644 << 16
+        with path.open("rb") as source, file.open(about, "w", force_zip64=True) as entry:
+            while piece := source.read(_CHUNK_BYTES):
+                found.update(piece)
+                entry.write(piece)
+                yield sink.drain()
+    except OSError as error:
+        raise StorageError(
+            f"cannot be read: {error}", where=str(path), remedy="Leave this session out"
+        ) from error
+    if sha256 is not None and found.hexdigest() != sha256:
+        raise DamagedFileError("its bytes are not those that were sealed", where=str(path))
+    yield sink.drain()
+
+
+class _DrainedBuffer(io.RawIOBase):
+    """Buffer of written bytes until they are drained; not seekable, which zipfile detects."""
+
+    def __init__(self) -> None:
+        self._pieces: list[bytes] = []
+
+    def writable(self) -> bool:
+        """Return True."""
+        return True
+
+    def write(self, chunk: object) -> int:
+        """Append a chunk."""
+        content = bytes(chunk)  # type: ignore[call-overload]  # any object with a buffer
+        self._pieces.append(content)
+        return len(content)
+
+    def drain(self) -> bytes:
+        """Remove and return the bytes written since the last call."""
+        content = b"".join(self._pieces)
+        self._pieces.clear()
+        return content
+
 
 router = APIRouter(prefix="/sessions", tags=["data"])
 

@@ -13,11 +13,11 @@ from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 
 from devices.errors import FileFormatError, StateError, UnknownError, UsageError
-from service.api.compression import encode_columns_json
 from service.api.routes.common import SecondsQuery, ServerState, problem_responses
-from service.private_paths import PublicText
+from service.api.static_files import encode_columns_json
 from service.server.server import Server
 from service.sessions.overview import POINTS_MAX
+from service.user_folders import PublicText
 from storage.formats.slice import Slice
 from storage.sessions.comparisons import (
     SERIES_NAME,

@@ -13,18 +13,18 @@ from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import BaseModel, Field
 
 from devices.errors import UnknownError, UsageError
-from service.api.compression import (
-    ARROW_STREAM,
-    accepts_gzip,
-    compress_gzip,
-    encode_arrow_stream,
-    encode_columns_json,
-)
 from service.api.routes.common import (
     SecondsQuery,
     ServerState,
     has_matching_etag,
     problem_responses,
+)
+from service.api.static_files import (
+    ARROW_STREAM,
+    accepts_gzip,
+    compress_gzip,
+    encode_arrow_stream,
+    encode_columns_json,
 )
 from service.server.server import Server
 from service.sessions.overview import POINTS_MAX, BinnedSlice, bin_from_overview_or_rebuild

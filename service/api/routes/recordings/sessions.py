@@ -22,12 +22,16 @@ from service.api.routes.common import (
     problem_responses,
     stored_table_response,
 )
-from service.private_paths import PublicText
 from service.server.broadcast.views import MarkerView, Page, SessionView
-from storage.formats.writers.parquet import PARQUET
-from storage.sessions.filters import SessionFilter, parse_completeness, parse_iso_or_t_ns
+from service.user_folders import PublicText
+from storage.formats.writers.tables import PARQUET
 from storage.sessions.folder import Ledger
-from storage.sessions.sidecars import MARKERS_NAME
+from storage.sessions.metadata import (
+    MARKERS_NAME,
+    SessionFilter,
+    parse_completeness,
+    parse_iso_or_t_ns,
+)
 
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 

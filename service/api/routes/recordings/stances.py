@@ -16,11 +16,10 @@ from starlette.concurrency import run_in_threadpool
 
 from devices.arrays import Floats
 from devices.errors import StateError, UnknownError
-from service.api.compression import ARROW_STREAM, accepts_gzip, compress_gzip, encode_arrow_stream
 from service.api.routes.common import ServerState, has_matching_etag, problem_responses
+from service.api.static_files import ARROW_STREAM, accepts_gzip, compress_gzip, encode_arrow_stream
 from service.server.server import Server
-from service.sessions.stance_overlay import overlay_stances
-from service.sessions.stances import load_stances
+from service.sessions.stances import load_stances, overlay_stances
 from service.version import SOFTWARE_VERSION
 from storage.sessions.folder import Session
 

@@ -16,10 +16,10 @@ from service.api.routes.common import (
     problem_responses,
 )
 from service.api.routes.recordings import sessions as one
-from service.private_paths import PublicText
 from service.server.broadcast.views import SessionView, View
 from service.server.server import Server
 from service.server.takes import Take
+from service.user_folders import PublicText
 
 router = APIRouter(prefix="/takes", tags=["takes"])
 

@@ -19,24 +19,23 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from storage.formats.export import Export
-from storage.formats.writers.mcap.frame_chunks import (
+from storage.formats.writers.mcap.file import (
     ARROW_METRES_PER_NEWTON,
     TILE_HEIGHT_M,
     TILE_RADIUS_M,
     ChannelRegistry,
     FrameChunk,
     Message,
+    MessageTemplate,
     compute_tile_colour,
     get_foot_frame_id,
     to_floats_with_nan,
 )
-from storage.formats.writers.mcap.message_template import MessageTemplate
-from storage.formats.writers.row_place import NEEDED as POINT
-from storage.formats.writers.row_place import fill_cop_across_tile_row
+from storage.formats.writers.resampling import POINT_COLUMNS, fill_cop_across_tile_row
 from storage.schema import COLUMNS_BY_NAME, Array, Column
 
 _NS = 1_000_000_000
-_SCENE_COLUMNS = (*POINT, "force_n")
+_SCENE_COLUMNS = (*POINT_COLUMNS, "force_n")
 
 # Protobuf's types of fixed width: their number, wire type (of 32 or 64 bits), and numpy's name.
 _FLOAT = FieldDescriptorProto.TYPE_FLOAT, 5, "<f4"

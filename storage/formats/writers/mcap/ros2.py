@@ -19,26 +19,25 @@ from devices.chips.compensation import Compensation
 from devices.flags import TileFlag
 from devices.frames import NOT_READ
 from storage.formats.export import Export
-from storage.formats.writers.mcap.frame_chunks import (
+from storage.formats.writers.mcap.file import (
     ARROW_METRES_PER_NEWTON,
     TILE_HEIGHT_M,
     TILE_RADIUS_M,
     ChannelRegistry,
     FrameChunk,
     Message,
+    MessageTemplate,
     compute_tile_colour,
     get_foot_frame_id,
 )
-from storage.formats.writers.mcap.message_template import MessageTemplate
-from storage.formats.writers.row_place import NEEDED as POINT
-from storage.formats.writers.row_place import fill_cop_across_tile_row
+from storage.formats.writers.resampling import POINT_COLUMNS, fill_cop_across_tile_row
 from storage.schema import Array
 
 _NS = 1_000_000_000
 _STAMP = {"sec": ("<i4", 4), "nanosec": ("<u4", 8)}
 """Fields of a header's stamp, after four bytes that state the encoding."""
 _READINGS = ("pressure_raw", "temperature_raw", "tile_flags", "sample_offset_us")
-_FORCES = (*POINT, "force_n")
+_FORCES = (*POINT_COLUMNS, "force_n")
 _TEMPERATURE_HOLD_NS = _NS
 """Longest age of a chip's last temperature that is used for frames without one."""
 

@@ -11,9 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.chips.dynamixel.driver import DynamixelServo, ServoIdentity, open_servo
-from devices.chips.dynamixel.protocol import Instruction
-from devices.chips.dynamixel.protocol1 import PROTOCOL_1, ErrorFlag
-from devices.chips.dynamixel.protocol2 import PROTOCOL_2
+from devices.chips.dynamixel.protocol import PROTOCOL_1, PROTOCOL_2, ErrorFlag, Instruction
 from devices.clock import VirtualClock
 from devices.errors import ServoPacketError, ServoSetupError, ServoStatusError, ServoTimeoutError
 from tests.builders.servo import FaultyServo
@@ -208,7 +206,7 @@ def test_an_instant_answer_has_no_negative_uncertainty() -> None:
 
 # Protocol 1.0 against scripted bytes
 
-# hardware.md 5.1; three bytes are asked for, see devices.chips.dynamixel.protocol1
+# hardware.md 5.1; three bytes are asked for, see devices.chips.dynamixel.protocol
 READ_3_FROM_36 = bytes.fromhex("FFFF 01 04 02 24 03 D1")
 READ_3_FROM_0 = bytes.fromhex("FFFF 01 04 02 00 03 F5")
 STATUS_1_AT_548 = status_1(0, 0x24, 0x02, 0)

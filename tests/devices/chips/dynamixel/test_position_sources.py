@@ -13,8 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devices.chips.dynamixel.driver import open_servo
-from devices.chips.dynamixel.position_reading import PositionReading
+from devices.chips.dynamixel.driver import PositionReading, open_servo
 from devices.chips.dynamixel.position_sources import ThreadedServoSource, VirtualTimeServoSource
 from devices.chips.dynamixel.protocol import Instruction, Packet
 from devices.clock import SystemClock, VirtualClock

@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.chips.dynamixel.protocol import (
+    PROTOCOL_1,
+    PROTOCOL_2,
     DynamixelProtocol,
     Packet,
     PacketDecoder,
     compute_wire_time_ns,
 )
-from devices.chips.dynamixel.protocol1 import PROTOCOL_1
-from devices.chips.dynamixel.protocol2 import PROTOCOL_2
 
 # hardware.md 5.1
 STATUS_OF_1_AT_166 = bytes.fromhex("FFFFFD00 01 0800 55 00 A6000000 8CC0")

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from devices.chips.dynamixel.protocol import Instruction, Packet
-from devices.chips.dynamixel.protocol1 import PROTOCOL_1, ErrorFlag, compute_checksum
+from devices.chips.dynamixel.protocol import (
+    PROTOCOL_1,
+    ErrorFlag,
+    Instruction,
+    Packet,
+    compute_checksum,
+)
 
 # hardware.md 5.1
 READ_POSITION_OF_1 = bytes.fromhex("FFFF 01 04 02 24 02 D2")

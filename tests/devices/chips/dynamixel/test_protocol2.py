@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from devices.chips.dynamixel.protocol import Instruction, Packet
-from devices.chips.dynamixel.protocol2 import PROTOCOL_2, compute_crc16
+from devices.chips.dynamixel.protocol import PROTOCOL_2, Instruction, Packet, compute_crc16
 
 # hardware.md 5.1, from the e-manual
 PING_1 = bytes.fromhex("FFFFFD00 01 0300 01 194E")

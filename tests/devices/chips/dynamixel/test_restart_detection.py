@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devices.chips.dynamixel.restart_detection import TICK_PERIOD, RestartDetector
+from devices.chips.dynamixel.driver import TICK_PERIOD, RestartDetector
 
 MS = 1_000_000
 

@@ -6,7 +6,7 @@ import pytest
 
 from devices.chips.dynamixel.servo_search import FoundServo, find_servos
 from devices.clock import VirtualClock
-from devices.emulation.chips.dynamixel_firmware import FIRMWARE_VERSION
+from devices.emulation.chips.dynamixel import FIRMWARE_VERSION
 from devices.errors import ServoSetupError
 from tests.builders.servo import FaultyServo
 

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from devices.chips.dynamixel.driver import PositionReading
 from devices.chips.dynamixel.firmwares import CountRange
-from devices.chips.dynamixel.position_reading import PositionReading
-from devices.chips.dynamixel.turn_unwrapping import TurnUnwrapper
+from devices.chips.dynamixel.position_sources import TurnUnwrapper
 
 TURN = 4096
 MS = 1_000_000

@@ -8,9 +8,9 @@ import pytest
 from smbus2 import i2c_msg
 
 from devices.clock import VirtualClock
-from devices.emulation.buses.i2c import EmulatedI2cAdapter
 from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
+from devices.emulation.i2c_bus import EmulatedI2cAdapter
 from devices.scene.emulation_sections import ReadDuringConversion
 from tests.builders.arrays import DATA_SHEET_CHIP
 

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from smbus2 import i2c_msg
 
 from devices.clock import VirtualClock
-from devices.emulation.buses.i2c import EmulatedI2cAdapter
 from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2
+from devices.emulation.i2c_bus import EmulatedI2cAdapter
 from devices.scene.emulation_sections import ReadDuringConversion
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP
 from tests.devices.emulation.buses.readers import (

@@ -8,9 +8,7 @@ from typing import Any
 
 import serial
 
-from devices.chips.dynamixel.protocol import Instruction, PacketDecoder
-from devices.chips.dynamixel.protocol1 import PROTOCOL_1
-from devices.chips.dynamixel.protocol2 import PROTOCOL_2
+from devices.chips.dynamixel.protocol import PROTOCOL_1, PROTOCOL_2, Instruction, PacketDecoder
 from devices.clock import VirtualClock
 from tests.builders.servo import FaultyServo
 

@@ -9,8 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from devices.chips.dynamixel.protocol import Instruction
-from devices.chips.dynamixel.protocol2 import PROTOCOL_2
+from devices.chips.dynamixel.protocol import PROTOCOL_2, Instruction
 from devices.clock import VirtualClock
 from devices.errors import UsageError
 from tests.builders.servo import FaultyServo

@@ -6,8 +6,7 @@ import struct
 
 import pytest
 
-from devices.chips.dynamixel.protocol import Instruction
-from devices.chips.dynamixel.protocol1 import PROTOCOL_1, ErrorFlag
+from devices.chips.dynamixel.protocol import PROTOCOL_1, ErrorFlag, Instruction
 from devices.clock import VirtualClock
 from devices.errors import UsageError
 from tests.builders.servo import FaultyServo

@@ -14,7 +14,7 @@ import numpy.typing as npt
 import pytest
 
 from devices.chips.mpl115a2 import Coefficients, compensate_kpa
-from devices.emulation.chips.front_end import FrontEnd
+from devices.emulation.chips.mpl115a2 import FrontEnd
 from devices.emulation.fault_timing import FaultTiming
 from devices.emulation.parts import ChipProperties, DomeProperties
 from devices.emulation.surroundings import Surroundings

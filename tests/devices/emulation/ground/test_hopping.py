@@ -13,8 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from devices.clock import VirtualClock
-from devices.emulation.ground.hopping import HOPS, Hopping
-from devices.emulation.ground.hopping_leg import STEP_S
+from devices.emulation.ground.hopping import HOPS, STEP_S, Hopping
 from devices.emulation.world import GroundTruth, World
 from devices.errors import SceneError
 from devices.scene.scene_file import Scene, load_scene

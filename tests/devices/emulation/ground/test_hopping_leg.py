@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from devices.emulation.ground import hopping_leg
-from devices.emulation.ground.hopping_leg import LEG_M, LegProperties, LegSimulation, Strip
-from devices.emulation.ground.soft_ground import GRAVITY_M_S2, SoftGround
+from devices.emulation.ground import hopping as hopping_leg
+from devices.emulation.ground.ground import GRAVITY_M_S2, SoftGround
+from devices.emulation.ground.hopping import LEG_M, LegProperties, LegSimulation, Strip
 from devices.errors import SceneError
 from devices.scene.emulation_sections import MudGround, PoppyGround
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devices.emulation.ground.soft_ground import SoftGround
+from devices.emulation.ground.ground import SoftGround
 from devices.scene.emulation_sections import MudGround, PoppyGround
 
 POPPY = SoftGround.from_scene(PoppyGround(kind="poppy"))

@@ -11,7 +11,7 @@ import pytest
 from devices.emulation.parts import make_rng
 from devices.emulation.plates import force_plate as plates
 from devices.emulation.plates.force_plate import ForcePlate
-from devices.emulation.plates.plate_clock import PlateClock
+from devices.emulation.plates.plate import PlateClock
 
 Array = npt.NDArray[np.float64]
 STEP = plates.RANGE / 2 ** (plates.BITS - 1)

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from devices.emulation.ground.ground import Ground
 from devices.emulation.parts import make_rng
 from devices.emulation.plates import pressure_plate as plates
-from devices.emulation.plates.plate_clock import PlateClock
-from devices.emulation.plates.plate_load import PlateLoad
+from devices.emulation.plates.plate import PlateClock, PlateLoad
 from devices.emulation.plates.pressure_plate import PressurePlate, compute_patch_radius_m
 
 Array = npt.NDArray[np.float64]

@@ -15,7 +15,7 @@ from typing import Any, Union, get_args, get_origin
 
 import pytest
 
-from service.cli.command_table import SUMMARIES, get_command_function
+from service.cli.main import SUMMARIES, get_command_function
 from service.cli.options import FootOptions
 from tests.service.cli.outcome import Outcome, Run
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from studies.broad import run
+from studies.broad import arrays as run
 from studies.broad.arrays import ArrayTask
 from studies.broad.results import ArrayResult, RefusedItem
 from tests.service.cli.outcome import Run
@@ -45,7 +45,7 @@ def test_seeds_of_judgement_have_to_be_asked_for(run: Run, tmp_path: Path, quick
 def test_what_gave_no_result_is_named_and_code_3(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from studies.broad import run as broad_run
+    from studies.broad import arrays as broad_run
 
     def refused(task: ArrayTask) -> ArrayResult:
         refusal = RefusedItem(what="calibration of T02", why="it drifts")

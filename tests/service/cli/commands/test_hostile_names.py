@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from service.cli.command_table import SUMMARIES
+from service.cli.main import SUMMARIES
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
 from storage.sessions.folder import Marker, Part, Session, SessionsFolder

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from devices.errors import StorageError
-from service.cli.command_table import SUMMARIES
+from service.cli.main import SUMMARIES
 from storage.permissions import set_umask_and_restrict_folder
 from tests.service.cli.commands.test_any_value import COMMANDS
 from tests.service.cli.outcome import Run

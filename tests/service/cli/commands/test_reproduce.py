@@ -9,7 +9,7 @@ import pytest
 
 from devices.errors import FootTileError
 from studies.reproduce import run as reproduction
-from studies.reproduce.laboratory import Laboratory, RecordingJob
+from studies.reproduce.run import Laboratory, RecordingJob
 from tests.service.cli.outcome import Run
 
 pytestmark = pytest.mark.slow

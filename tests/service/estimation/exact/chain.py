@@ -12,7 +12,7 @@ from mpmath import mp, mpf
 
 from devices.frames import NOT_READ, FrameBatch
 from service.estimation.calibration import TileCalibration
-from service.estimation.models.outliers import OUTLIER_SIGMAS
+from service.estimation.models.denoise import OUTLIER_SIGMAS
 from service.estimation.pipeline.plan import EstimationPlan
 from service.estimation.pipeline.smoothing_stage import BOUND_SIGMAS
 from tests.service.estimation.exact import sample_stage, smoothing_stage

@@ -19,9 +19,9 @@ from mpmath import mp, mpf
 from devices.flags import TileFlag
 from devices.frames import NOT_READ, FrameBatch
 from service.estimation.calibration import TileCalibration, make_paper_shape_preset
-from service.estimation.estimates import Estimates
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from service.estimation.pipeline.smoothing_stage import BOUND_SIGMAS
+from service.estimation.records import Estimates
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP, array_at
 from tests.builders.calibrations import make_calibration, make_tare, newton_tile
 from tests.builders.estimates import estimate

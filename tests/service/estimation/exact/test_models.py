@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mpmath import mpf
 
 from service.estimation.models import ambient, denoise, flow, gas, hysteresis, rubber, temperature
-from service.estimation.tare.correlated_noise import compute_variance_inflation
+from service.estimation.tare.unloaded_windows import compute_variance_inflation
 from tests.builders.averages import denoised
 from tests.builders.readings import through
 from tests.service.estimation.exact import digits, sample_stage, smoothing_stage

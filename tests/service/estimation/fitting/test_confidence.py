@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.estimation.fitting.confidence import (
+from service.estimation.fitting.least_squares import (
     compute_curve_n,
     compute_mean_half_width_95_n,
     compute_new_loading_half_width_95_n,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from service.estimation.effects import WALL_PER_KPA, Effects
-from service.estimation.fitting.dome_model import DomeModel
+from service.estimation.fitting.dome_model import DomeModel, FittedEffects
 from service.estimation.fitting.effects_fit import (
     collect_loadings,
     convert_centred_cubic_to_unit,
@@ -19,7 +19,6 @@ from service.estimation.fitting.effects_fit import (
 )
 from service.estimation.fitting.output_error import OutputErrorProblem
 from service.estimation.fitting.static_fit import fit_static_curve
-from service.estimation.fitting.unknowns import FittedEffects
 from tests.builders.calibrations import make_calibration
 from tests.service.estimation.fitting.recordings import (
     CREEP_S,

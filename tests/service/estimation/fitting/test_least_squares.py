@@ -9,7 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.estimation.effects import WALL_PER_KPA
-from service.estimation.fitting.dome_model import DomeModel
+from service.estimation.fitting.dome_model import (
+    DomeModel,
+    FittedEffects,
+    compute_creep_range_s,
+    list_unknowns,
+)
 from service.estimation.fitting.effects_fit import (
     collect_loadings,
     convert_centred_cubic_to_unit,
@@ -17,7 +22,6 @@ from service.estimation.fitting.effects_fit import (
 from service.estimation.fitting.least_squares import minimize_squares
 from service.estimation.fitting.output_error import OutputErrorProblem
 from service.estimation.fitting.static_fit import fit_static_curve
-from service.estimation.fitting.unknowns import FittedEffects, compute_creep_range_s, list_unknowns
 from tests.service.estimation.fitting.recordings import recorded
 
 _WIDE = np.full(3, 100.0)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from service.estimation.effects import Effects, Parameter
+from service.estimation.fitting.dome_model import SAMPLE_DELAY_SIGMA_S
 from service.estimation.fitting.sample_delay import DEFAULT_REFERENCE_DELAY, separate_delays
-from service.estimation.fitting.unknowns import SAMPLE_DELAY_SIGMA_S
 
 SEEN_S = (1.4e-3, 1.6e-3, 1.5e-3)
 

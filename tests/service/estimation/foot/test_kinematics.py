@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from devices.flags import FrameFlag
 from devices.frames import NO_SERVO_COUNTS, FrameBatch
 from service.estimation.estimate import Estimator
-from service.estimation.foot.kinematics import (
+from service.estimation.foot.geometry import (
     ServoReading,
     interpolate_servo_counts,
     store_servo_reading,

@@ -17,7 +17,7 @@ from service.estimation.models.denoise import (
     estimate_smoothing_errors,
 )
 from service.estimation.pipeline.smoothing_stage import TILE_FORCE
-from service.estimation.tare.correlated_noise import compute_variance_inflation
+from service.estimation.tare.unloaded_windows import compute_variance_inflation
 from tests.builders.averages import denoised
 
 SIGMA_N, PERIOD_NS = 0.3, 1_838_235

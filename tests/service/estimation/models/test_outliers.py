@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.estimation.models.outliers import find_outliers
+from service.estimation.models.denoise import find_outliers
 
 NOISE_KPA = 0.165
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.chips.mpl115a2 import Coefficients, compensate_kpa, compute_kpa_per_padc
-from service.estimation.models.unwrap import unwrap_pressure as taken_back
+from service.estimation.pipeline.sample_stage import unwrap_pressure
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP
 
 DATA_SHEET_PART = Coefficients.from_words(DATA_SHEET_CHIP)
@@ -27,7 +27,7 @@ def kpa(counts: float, temperature_raw: int, c: Coefficients) -> float:
 def unwrapped(pressure_raw: int, temperature_raw: int, c: Coefficients) -> float:
     at_face_value = float(compensate_kpa(pressure_raw, temperature_raw, c.a0, c.b1, c.b2, c.c12))
     return float(
-        taken_back(at_face_value, float(compute_kpa_per_padc(temperature_raw, c.b1, c.c12)))
+        unwrap_pressure(at_face_value, float(compute_kpa_per_padc(temperature_raw, c.b1, c.c12)))
     )
 
 
@@ -71,9 +71,9 @@ def test_one_count_past_zero_is_wrapped_already() -> None:
 
 def test_exactly_50_kpa_is_a_pressure_and_a_hair_less_is_none() -> None:
     less = float(np.nextafter(50.0, 0.0))
-    assert taken_back(50.0, -0.125) == 50.0
-    assert taken_back(less, -0.125) == less + 128.0
+    assert unwrap_pressure(50.0, -0.125) == 50.0
+    assert unwrap_pressure(less, -0.125) == less + 128.0
 
 
 def test_nan_stays_nan() -> None:
-    assert math.isnan(taken_back(math.nan, -0.1))
+    assert math.isnan(unwrap_pressure(math.nan, -0.1))

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 
 from devices.flags import EstimateFlag, TileFlag
 from devices.frames import NOT_READ, FrameBatch
-from service.estimation.estimates import Estimates
 from service.estimation.pipeline.model_set import MODEL_NAMES
 from service.estimation.pipeline.plan import EstimationPlan
+from service.estimation.records import Estimates
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP, array_at, make_servo
 from tests.builders.calibrations import make_effects, newton_tile
 from tests.builders.estimates import estimate, newton_plan

@@ -11,7 +11,7 @@ import pytest
 from devices.flags import EstimateFlag, FrameFlag
 from devices.frames import NO_SERVO_COUNTS
 from service.estimation.calibration import make_paper_shape_preset
-from service.estimation.estimates import Estimates
+from service.estimation.records import Estimates
 from tests.builders.arrays import COUNT_KPA, array_at, make_servo
 from tests.builders.calibrations import newton_tile
 from tests.builders.estimates import estimate, newton_plan

@@ -9,11 +9,10 @@ import pytest
 
 from devices.flags import EstimateFlag
 from devices.frames import NO_SERVO_COUNTS, ArrayInfo
-from service.estimation.calibration import Calibration, make_paper_shape_preset
+from service.estimation.calibration import Calibration, MountCalibration, make_paper_shape_preset
 from service.estimation.effects import Parameter
-from service.estimation.estimates import Estimates
-from service.estimation.mounting import MountCalibration
 from service.estimation.pipeline.plan import make_plan
+from service.estimation.records import Estimates
 from tests.builders.arrays import array_at, make_servo
 from tests.builders.calibrations import newton_tile
 from tests.builders.estimates import estimate, newton_plan

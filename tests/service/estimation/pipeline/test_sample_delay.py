@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from devices.arrays import Floats
 from devices.frames import FrameBatch
 from service.estimation.effects import Effects, Parameter
-from service.estimation.estimates import Estimates
 from service.estimation.pipeline.plan import EstimationPlan
+from service.estimation.records import Estimates
 from tests.builders.arrays import array_at
 from tests.builders.calibrations import newton_tile
 from tests.builders.estimates import estimate, newton_plan

@@ -20,9 +20,9 @@ from devices.errors import CalibrationError
 from devices.flags import EstimateFlag
 from service.estimation.calibration import TileCalibration
 from service.estimation.effects import Effects, GasEffect, Parameter
-from service.estimation.estimates import Estimates
 from service.estimation.fitting.dome_model import DomeModel
 from service.estimation.models.gas import GasModel, compute_isothermal_lower_bound_kpa
+from service.estimation.records import Estimates
 from tests.builders.arrays import COUNT_KPA, PERIOD_NS, UNLOADED_KPA, make_array
 from tests.builders.calibrations import make_effects, newton_tile
 from tests.builders.estimates import estimate, newton_plan

@@ -19,11 +19,11 @@ from devices.arrays import Bools, Floats
 from devices.flags import EstimateFlag, TileFlag
 from devices.frames import FrameBatch
 from service.estimation.effects import GasEffect, HysteresisEffect, Parameter, RubberEffect
-from service.estimation.estimates import Estimates
 from service.estimation.fitting.dome_model import DomeModel
 from service.estimation.pipeline.model_set import MODEL_NAMES
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from service.estimation.pipeline.saturation import is_after_long_gap, select_farther_bound
+from service.estimation.records import Estimates
 from tests.builders.arrays import UNLOADED_KPA, make_array
 from tests.builders.calibrations import make_calibration, make_effects, make_tare, newton_tile
 from tests.builders.estimates import estimate

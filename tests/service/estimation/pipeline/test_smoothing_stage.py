@@ -10,9 +10,9 @@ import numpy as np
 from devices.arrays import Floats
 from devices.jit import jit_cached
 from service.estimation.models import denoise
-from service.estimation.pipeline.frame_buffer import FrameBuffer, make_frame_buffer
 from service.estimation.pipeline.params import KernelParams, make_kernel_params
 from service.estimation.pipeline.smoothing_stage import TILE_FORCE, TileForce, denoise_forces
+from service.estimation.pipeline.state import FrameBuffer, make_frame_buffer
 from service.estimation.records import RecordArray
 from tests.builders.arrays import array_at
 from tests.builders.estimates import newton_plan

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from devices.chips.compensation import Compensation
 from devices.errors import TareError
 from service.estimation.pipeline.plan import make_plan
-from service.estimation.tare.correlated_noise import (
+from service.estimation.tare.tare import Tare
+from service.estimation.tare.unloaded_windows import (
+    compute_recording_tare,
     compute_variance_inflation,
     fit_correlated_noise,
 )
-from service.estimation.tare.tare import Tare
-from service.estimation.tare.unloaded_windows import compute_recording_tare
 from tests.builders.arrays import COUNT_KPA, PERIOD_NS, make_array
 from tests.builders.calibrations import make_calibration, newton_tile
 from tests.builders.frames import loaded_frames

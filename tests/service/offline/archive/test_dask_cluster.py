@@ -12,8 +12,7 @@ import pytest
 
 from devices.errors import LinkError, UsageError, WorkerLostError
 from service.offline.archive.dask_cluster import map_on_cluster
-from service.offline.archive.job_runner import run_jobs
-from service.offline.archive.jobs import Job, run_job
+from service.offline.archive.jobs import Job, run_job, run_jobs
 from service.offline.archive.locations import find_session_locations
 from service.offline.archive.result_store import ResultStore
 from service.offline.archive.tasks import EstimateTask

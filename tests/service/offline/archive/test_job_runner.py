@@ -11,12 +11,17 @@ from typing import Any
 import pytest
 
 from devices.errors import UsageError
-from service.offline.archive.job_runner import MAX_LISTED_FAILURES, OutcomeCounts, run_jobs
-from service.offline.archive.jobs import Job, Outcome, run_job
+from service.offline.archive.jobs import (
+    MAX_LISTED_FAILURES,
+    Job,
+    Outcome,
+    OutcomeCounts,
+    run_job,
+    run_jobs,
+)
 from service.offline.archive.locations import find_session_locations
-from service.offline.archive.query import run_query
+from service.offline.archive.query import find_sessions, run_query
 from service.offline.archive.result_store import ResultStore
-from service.offline.archive.session_search import find_sessions
 from service.offline.archive.tasks import EstimateTask, ExportTask, SessionTask, VerifyTask
 from service.offline.export import ExportOptions
 from service.offline.process_pool import Unfinished, map_in_processes
@@ -230,7 +235,7 @@ def test_a_worker_of_another_version_refuses(archive: Path, tmp_path: Path) -> N
 
 
 def test_what_a_killed_worker_has_left_is_taken_away_and_others_work_is_not(tmp_path: Path) -> None:
-    from service.offline.archive.temporary_folders import _MACHINE, create_workspace
+    from service.offline.archive.local_copies import _MACHINE, create_workspace
 
     work = tmp_path / "out" / ".work"
     with create_workspace(work) as ours:

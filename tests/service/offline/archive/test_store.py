@@ -14,11 +14,9 @@ import pytest
 
 from devices.errors import FileFormatError
 from service.offline.archive import locations
-from service.offline.archive.job_runner import run_jobs
-from service.offline.archive.jobs import Job, Outcome, run_job
+from service.offline.archive.jobs import Job, Outcome, run_job, run_jobs
 from service.offline.archive.locations import find_session_locations
-from service.offline.archive.query import run_query
-from service.offline.archive.session_search import find_sessions
+from service.offline.archive.query import find_sessions, run_query
 from service.offline.archive.tasks import EstimateTask, SessionTask, VerifyTask
 from service.offline.process_pool import Unfinished, map_in_processes
 from tests.service.offline.archive.stores import BUCKET, BadWay, Store

@@ -11,11 +11,12 @@ import pytest
 from devices.arrays import Floats
 from devices.errors import ComparisonError
 from service.offline.compare.error_figures import ComparisonErrors, TrialErrors, compute_errors
-from service.offline.compare.paired_frames import PairedFrames, pair_frames
-from service.offline.compare.trials import (
+from service.offline.compare.paired_frames import (
+    PairedFrames,
     Trial,
     TrialMarker,
     average_over_trials,
+    pair_frames,
     split_into_trials,
 )
 from tests.service.offline.compare.sessions import (

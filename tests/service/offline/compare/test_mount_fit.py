@@ -9,8 +9,8 @@ import pytest
 
 from devices.arrays import Floats
 from devices.errors import CalibrationError
-from service.offline.compare.mount_fit import MountFit, fit_mount
 from service.offline.compare.paired_frames import pair_frames
+from service.offline.mount_calibration import MountFit, fit_mount
 from tests.service.offline.compare.sessions import HZ, columns, half_sines, reference, same_clock
 
 SERIALS = ("T01", "T02", "T03", "T04")

@@ -15,9 +15,13 @@ from hypothesis import strategies as st
 from devices.errors import DamagedFileError, FileFormatError, TareError
 from devices.frames import FrameBatch
 from service.estimation.pipeline.model_set import MODEL_NAMES
-from service.offline.estimate.chunks import estimate_next_chunk, join_chunks, needs_chunks
-from service.offline.estimate.request import EstimateRequest
-from service.offline.estimate.session import estimate_session
+from service.offline.estimate.preparation import EstimateRequest
+from service.offline.estimate.session import (
+    estimate_next_chunk,
+    estimate_session,
+    join_chunks,
+    needs_chunks,
+)
 from storage.checksummed_json import append_json_checksum
 from storage.formats.slice import Slice
 from storage.parquet_hash import compute_sha256

@@ -14,8 +14,7 @@ from service.estimation.pipeline.plan import (
     SETTLING_TIME_CONSTANTS,
     compute_settling_time_s,
 )
-from service.offline.estimate.estimation_range import select_tares_in_force
-from service.offline.estimate.request import EstimateRequest
+from service.offline.estimate.preparation import EstimateRequest, select_tares_in_force
 from service.offline.estimate.session import EstimateResult, estimate_session
 from storage.formats.slice import Slice
 from storage.schema import ESTIMATE_COLUMNS

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from service.offline.estimate.request import EstimateRequest
+from service.offline.estimate.preparation import EstimateRequest
 from service.offline.estimate.session import estimate_session
 from service.sessions.pipeline import EstimateStream
 from service.sessions.stances import load_stances

@@ -12,8 +12,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.server.broadcast.force_history import SECONDS_MAX, SPAN_PERIOD_NS, ForceHistory
-from service.server.broadcast.force_span import ForceSpan, nan_max, nan_min, summarize_force
+from service.server.broadcast.history import (
+    SECONDS_MAX,
+    SPAN_PERIOD_NS,
+    ForceHistory,
+    ForceSpan,
+    nan_max,
+    nan_min,
+    summarize_force,
+)
 from tests.builders.arrays import PERIOD_NS
 from tests.builders.frames import make_frames
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.server.broadcast.force_span import summarize_force
-from service.server.broadcast.tile_history import SPAN_PERIOD_NS, UNITS, TileHistory
+from service.server.broadcast.broadcaster import SPAN_PERIOD_NS, UNITS, TileHistory
+from service.server.broadcast.history import summarize_force
 from tests.builders.arrays import PERIOD_NS
 from tests.builders.frames import make_frames
 

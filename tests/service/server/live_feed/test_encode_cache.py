@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.server.live_feed.encode_cache import EncodeCache
+from service.server.live_feed.encoder import EncodeCache
 
 
 def test_what_was_used_least_lately_goes_and_no_more_is_kept_than_is_allowed() -> None:

@@ -18,8 +18,8 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from devices.errors import FileFormatError, FootTileError, UsageError
-from storage.formats.options import FormatOptions
 from storage.formats.reference import ReferenceOptions, read_reference
+from storage.formats.slice import FormatOptions
 from tests.storage.formats.exports import frames
 from tests.storage.formats.writers.test_mcap import estimates, written
 

@@ -14,12 +14,11 @@ import pytest
 
 from devices.errors import StorageError, UsageError
 from service.offline.export import ExportOptions, export_session
-from storage.clock.file import CLOCK_NAME, write_clock_file
 from storage.clock.log import ClockOffset
-from storage.clock.table import StreamClockFacts
+from storage.clock.table import CLOCK_NAME, StreamClockFacts, write_clock_file
 from storage.formats.export import Export, FlatColumns
 from storage.formats.markers import PlacedMarker, PlacedMarkers
-from storage.formats.options import FormatOptions
+from storage.formats.slice import FormatOptions
 from storage.formats.writers.registry import FORMATS
 from storage.schema import Array
 from storage.sessions.folder import FRAMES_NAME, Marker

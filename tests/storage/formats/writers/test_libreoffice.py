@@ -13,8 +13,7 @@ import pytest
 
 from storage.formats.export import make_one_pass_frame_source
 from storage.formats.markers import PlacedMarker, PlacedMarkers
-from storage.formats.options import NO_OPTIONS, FormatOptions
-from storage.formats.slice import Slice
+from storage.formats.slice import NO_OPTIONS, FormatOptions, Slice
 from storage.sessions.folder import Marker
 from tests.builders.arrays import make_array
 from tests.storage.formats.exports import NOTES, cut, export, extra, frames, read

@@ -15,11 +15,10 @@ from scipy.io import loadmat
 
 from devices.errors import UsageError
 from devices.frames import NO_SERVO_COUNTS, NOT_READ
-from storage.formats.options import NO_OPTIONS
 from storage.formats.sealed_export import make_sealed_export
-from storage.formats.slice import Slice
-from storage.formats.writers.matlab import file as matlab
-from storage.formats.writers.matlab.file import MATLAB
+from storage.formats.slice import NO_OPTIONS, Slice
+from storage.formats.writers import matlab
+from storage.formats.writers.matlab import MATLAB
 from storage.schema import CONTACT_UNKNOWN
 from storage.sessions import reader as reader_module
 from storage.sessions.reader import SealedFileReader

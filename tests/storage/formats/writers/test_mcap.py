@@ -25,8 +25,7 @@ from storage.clock.bounds import OffsetRows
 from storage.clock.table import ClockTable, StreamClockFacts
 from storage.formats.export import make_one_pass_frame_source
 from storage.formats.markers import PLACEMENT_COLUMNS, PlacedMarkers, place_markers
-from storage.formats.options import NO_OPTIONS, FormatOptions
-from storage.formats.slice import Slice
+from storage.formats.slice import NO_OPTIONS, FormatOptions, Slice
 from storage.formats.writers.mcap.ros2 import make_ros2_name
 from storage.schema import CONTACT_UNKNOWN, Array
 from storage.sessions.folder import Marker

@@ -25,10 +25,9 @@ from devices.arrays import Floats
 from devices.errors import UsageError
 from storage.clock.table import ClockTable, StreamClockFacts
 from storage.formats.export import Export
-from storage.formats.options import NO_OPTIONS, FormatOptions
-from storage.formats.slice import Slice
-from storage.formats.writers.matlab import file as matlab
-from storage.formats.writers.multi_session import make_names_unique
+from storage.formats.slice import NO_OPTIONS, FormatOptions, Slice
+from storage.formats.writers import matlab
+from storage.formats.writers.format import make_names_unique
 from storage.formats.writers.registry import FORMATS, get_multi_session_format
 from tests.storage.formats.walks import (
     ARRAY,

@@ -19,11 +19,10 @@ from pydantic import ValidationError
 from devices.errors import UsageError
 from storage.formats.export import Export
 from storage.formats.markers import PlacedMarker, PlacedMarkers
-from storage.formats.options import FormatOptions
 from storage.formats.reference import ReferenceOptions, read_reference
-from storage.formats.writers.opensim import file as written_opensim
-from storage.formats.writers.opensim.file import OPENSIM
-from storage.formats.writers.opensim.loads import LOAD_COLUMNS
+from storage.formats.slice import FormatOptions
+from storage.formats.writers import opensim as written_opensim
+from storage.formats.writers.opensim import LOAD_COLUMNS, OPENSIM
 from storage.schema import Array
 from storage.sessions.folder import Marker
 from tests.builders.arrays import make_array

@@ -12,8 +12,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from storage.formats.options import NO_OPTIONS, FormatOptions
-from storage.formats.slice import Slice
+from storage.formats.slice import NO_OPTIONS, FormatOptions, Slice
 from tests.storage.formats.exports import ROWS, exported, extra, frames
 
 COLUMNS = ("time_s", "time_utc", "t_ns", "grf_n", "phase")

@@ -10,8 +10,7 @@ import pyarrow.csv as pacsv
 import pytest
 
 from devices.errors import UsageError
-from storage.formats.options import NO_OPTIONS, FormatOptions
-from storage.formats.slice import Slice
+from storage.formats.slice import NO_OPTIONS, FormatOptions, Slice
 from storage.formats.writers.registry import FORMATS, get_format
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.storage.formats.exports import BEGIN_NS, ROWS, TABLES, exported, extra, frames, read

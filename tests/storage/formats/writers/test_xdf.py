@@ -16,8 +16,7 @@ from devices.frames import NO_SERVO_COUNTS, NOT_READ
 from storage.clock.bounds import OffsetRows
 from storage.clock.table import ClockTable, StreamClockFacts
 from storage.formats.export import make_one_pass_frame_source
-from storage.formats.options import NO_OPTIONS, FormatOptions
-from storage.formats.slice import Slice
+from storage.formats.slice import NO_OPTIONS, FormatOptions, Slice
 from storage.schema import Array
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.storage.formats.exports import NOTES, ROWS, cut, export, extra, frames

@@ -51,7 +51,7 @@ def test_the_ring_drops_what_no_session_needs_and_counts_what_no_server_has(
     journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(retention, "RING_DURATION_NS", 200_000_000)
-    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_DURATION_NS", 20_000_000)
+    monkeypatch.setattr("storage.journal.segment_writer.SEGMENT_DURATION_NS", 20_000_000)
     journal.update_retention_request("laptop", wants((200, 249)))
     fill(journal, stream, 0, 599)
     stream.record_acknowledgement("laptop", 100, 149)
@@ -68,7 +68,7 @@ def test_if_it_is_not_known_what_servers_need_nothing_is_dropped_but_for_want_of
 ) -> None:
     monkeypatch.setattr(retention, "RING_DURATION_NS", 200_000_000)
     monkeypatch.setattr(node_journal, "_CLEANUP_INTERVAL_S", 0.0)
-    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_DURATION_NS", 20_000_000)
+    monkeypatch.setattr("storage.journal.segment_writer.SEGMENT_DURATION_NS", 20_000_000)
     folder = tmp_path / "journal" / "leg"
     folder.mkdir(parents=True)
     (folder / "retention.json").write_bytes(b"damaged")
@@ -88,7 +88,7 @@ def test_if_it_is_not_known_what_servers_need_nothing_is_dropped_but_for_want_of
 def test_over_its_budget_it_drops_the_ring_first_and_then_stops_and_counts(
     start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_DURATION_NS", 20_000_000)
+    monkeypatch.setattr("storage.journal.segment_writer.SEGMENT_DURATION_NS", 20_000_000)
     monkeypatch.setattr(node_journal, "MAX_WAITING_BYTES", 20_000)
     journal = start(budget_bytes=60_000)
     stream = journal.switch_to_new_stream(make_array())
@@ -128,7 +128,7 @@ def test_what_the_nodes_own_session_needs_stays_whoever_has_it_besides(
     journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(retention, "RING_DURATION_NS", 100_000_000)
-    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_DURATION_NS", 20_000_000)
+    monkeypatch.setattr("storage.journal.segment_writer.SEGMENT_DURATION_NS", 20_000_000)
     journal.retention_requests.set_node_session_numbers(
         {stream.stream_id: Intervals([(0, NO_END)])}
     )
@@ -143,7 +143,7 @@ def test_what_one_server_has_another_still_gets(
     journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(retention, "RING_DURATION_NS", 100_000_000)
-    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_DURATION_NS", 20_000_000)
+    monkeypatch.setattr("storage.journal.segment_writer.SEGMENT_DURATION_NS", 20_000_000)
     journal.update_retention_request("laptop", wants((0, 199)))
     store(journal, stream, 0, 399)
     stream.record_acknowledgement("other", 0, 399)

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from devices.errors import CalibrationError
-from service.estimation.fitting.rig.checks import check_baseline_drift_kpa
+from service.estimation.fitting.rig.checks import check_baseline_drift_kpa, fit_unloaded_recovery
 from service.estimation.fitting.rig.indentation import Indentation
-from service.estimation.fitting.rig.recovery import fit_unloaded_recovery
 
 STEP_S = 0.01
 STROKES, REST_S, STROKE_S, ALONE_S = 4, 0.3, 8.0, 15.0

@@ -1,1 +1,0 @@
-"""Emulated bus at bit level, with its faults."""

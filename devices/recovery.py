@@ -1,0 +1,269 @@
+"""Recovery of an I2C bus that a chip holds: clocks on its wires, the multiplexers' RESET.
+
+Sources: UM10204 3.1.16, TCA9548A data sheet 6.7, hardware.md 2 and 8. A chip that lost count in
+the middle of a byte waits for clocks with its bit on the line. A Raspberry Pi's adapter cannot send
+them itself: it takes the low line for an acknowledge.
+
+SDA and SCL belong to the I2C controller. Requesting them as GPIO disconnects it, and releasing them
+leaves them inputs: libgpiod has no alternate functions. So Raspberry Pi OS's `pinctrl` (before
+2023: `raspi-gpio`) restores the pins' function in every case.
+
+This module has not been run on a Raspberry Pi by this project. Tests cover the calls of libgpiod
+with the library's own types, and those of `pinctrl` by their command line.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from typing import TYPE_CHECKING, Protocol
+
+from devices.clock import Clock
+from devices.errors import BusSetupError, require_extra
+from devices.scene.hardware_sections import RecoverySection
+
+if TYPE_CHECKING:
+    from gpiod import LineRequest
+
+_TOOLS = ("pinctrl", "raspi-gpio")
+_TOOL_TIMEOUT_S = 5.0
+
+
+class GpioLine:
+    """Requested open-drain line: a released output is an input."""
+
+    def __init__(self, request: LineRequest, line: int) -> None:
+        self._request = request
+        self._line = line
+
+    def drive(self, *, low: bool) -> None:
+        """Pull the line low, or release it."""
+        from gpiod.line import Value
+
+        self._request.set_value(self._line, Value.INACTIVE if low else Value.ACTIVE)
+
+    def is_high(self) -> bool:
+        """Return the level on the pin, whatever drives it."""
+        return bool(self._request.get_value(self._line))
+
+
+class GpioLines:
+    """SCL, SDA and RESET of one bus.
+
+    Raises:
+        MissingExtraError: gpiod is not installed.
+        BusSetupError: the tool that restores the pins is not installed.
+    """
+
+    def __init__(self, scene: RecoverySection) -> None:
+        self._scene = scene
+        with require_extra("gpio", "recovery of the bus"):
+            import gpiod  # noqa: F401  # a later import must not be the first to fail
+        tool = next(filter(None, map(shutil.which, _TOOLS)), None)
+        if tool is None:
+            raise BusSetupError(
+                "no tool to give SDA and SCL back to the I2C controller, so they are not taken",
+                where=scene.gpiochip,
+                expected=f"{' or '.join(_TOOLS)}, as on Raspberry Pi OS",
+                remedy="Install raspi-utils, or remove [recovery]",
+            )
+        self._restore_command = [
+            tool,
+            "set",
+            f"{scene.sda_line},{scene.scl_line}",
+            scene.i2c_function,
+        ]
+
+    @contextmanager
+    def request_scl_sda(self) -> Iterator[tuple[GpioLine, GpioLine]]:
+        """Request SCL and SDA from the I2C controller while the block runs, then restore them.
+
+        Raises:
+            BusSetupError: the lines cannot be requested, driven, or restored.
+        """
+        scl, sda = self._scene.scl_line, self._scene.sda_line
+        try:
+            with self._request_lines(scl, sda) as request:
+                yield GpioLine(request, scl), GpioLine(request, sda)
+        finally:
+            self._restore_pin_function()
+
+    def request_reset(self) -> AbstractContextManager[GpioLine] | None:
+        """Request the multiplexers' RESET; None if the scene names no line for it."""
+        line = self._scene.reset_line
+        return None if line is None else self._request_reset_line(line)
+
+    @contextmanager
+    def _request_reset_line(self, line: int) -> Iterator[GpioLine]:
+        with self._request_lines(line) as request:
+            yield GpioLine(request, line)
+
+    @contextmanager
+    def _request_lines(self, *lines: int) -> Iterator[LineRequest]:
+        import gpiod
+        from gpiod.line import Direction, Drive, Value
+
+        # Released from the first moment: the request must not pull a line low.
+        open_drain = gpiod.LineSettings(
+            direction=Direction.OUTPUT, drive=Drive.OPEN_DRAIN, output_value=Value.ACTIVE
+        )
+        try:
+            with gpiod.request_lines(
+                self._scene.gpiochip, consumer="foottile", config={lines: open_drain}
+            ) as request:
+                yield request
+        except OSError as error:
+            raise BusSetupError(
+                f"GPIO lines cannot be used ({error.strerror or error})",
+                where=f"{self._scene.gpiochip}, lines {', '.join(map(str, lines))}",
+                remedy="Check [recovery], that this user is in the group gpio, and that no other "
+                "program holds the lines (gpioinfo)",
+                errno=error.errno,
+            ) from error
+
+    def _restore_pin_function(self) -> None:
+        try:
+            subprocess.run(  # noqa: S603  # found on the path, numbers from the scene
+                self._restore_command,
+                check=True,
+                capture_output=True,
+                text=True,
+                timeout=_TOOL_TIMEOUT_S,
+            )
+        except (OSError, subprocess.SubprocessError) as error:
+            reason = (getattr(error, "stderr", None) or str(error)).strip()
+            raise BusSetupError(
+                "SDA and SCL are still GPIO, the I2C controller is disconnected from them: "
+                + reason,
+                where=self._scene.gpiochip,
+                remedy=f"Run: sudo {' '.join(self._restore_command)}; or reboot",
+            ) from error
+
+
+RECOVERY_CLOCKS = 9
+"""Clocks for the rest of any interrupted byte and its acknowledge."""
+
+HALF_PERIOD_NS = 5_000
+"""Half a clock period at 100 kHz, which every chip supports."""
+
+RESET_NS = 10_000
+"""Length of the RESET pulse: at least 6 ns (TCA9548A 6.7); long leads and a weak pull-up need more.
+"""
+
+
+class BusRecovery(Protocol):
+    """Recovery steps for a stuck bus. Never call them during a transfer."""
+
+    def send_recovery_clocks(self) -> bool:
+        """Clock the chip that holds SDA through its byte, and send a STOP.
+
+        Returns:
+            True if SDA and SCL are high in the end, so that the bus can be used.
+
+        Raises:
+            BusSetupError: the lines cannot be requested or released.
+        """
+
+    def reset_muxes(self) -> bool:
+        """Pulse the multiplexers' RESET line, which closes all channels.
+
+        Returns:
+            False if the line is not wired.
+
+        Raises:
+            BusSetupError: the line cannot be requested.
+        """
+
+
+class OpenDrainLine(Protocol):
+    """Open-drain wire: every device may pull it low, none can pull it high."""
+
+    def drive(self, *, low: bool) -> None:
+        """Pull the line low, or release it."""
+
+    def is_high(self) -> bool:
+        """Return whether the line is high: no device pulls it low."""
+
+
+class GpioBusLines(Protocol):
+    """Wires of a bus as GPIO, requested while a block runs; released, so high, at first."""
+
+    def request_scl_sda(self) -> AbstractContextManager[tuple[OpenDrainLine, OpenDrainLine]]:
+        """Request SCL and SDA."""
+
+    def request_reset(self) -> AbstractContextManager[OpenDrainLine] | None:
+        """Request RESET of all multiplexers; None if it is not wired."""
+
+
+class GpioRecovery:
+    """Recovery by GPIO, one edge at a time."""
+
+    def __init__(self, lines: GpioBusLines, clock: Clock) -> None:
+        self._lines = lines
+        self._clock = clock
+
+    def send_recovery_clocks(self) -> bool:
+        """Send clocks as `BusRecovery` does; fail on a held SCL, or on SDA after nine clocks."""
+        with self._lines.request_scl_sda() as (scl, sda):
+            self._wait(HALF_PERIOD_NS)
+            for _ in range(RECOVERY_CLOCKS):
+                if not scl.is_high():
+                    return False  # no chip here stretches clocks (hardware.md 3.2): it is stuck
+                if not sda.is_high():
+                    self._drive(scl, low=True)
+                    self._drive(scl, low=False)
+                elif self._send_stop(scl, sda):
+                    return True
+                # Else a high bit preceded a low one. The failed STOP was a clock, too.
+            return scl.is_high() and sda.is_high() and self._send_stop(scl, sda)
+
+    def reset_muxes(self) -> bool:
+        """Pulse RESET as `BusRecovery.reset_muxes`."""
+        line = self._lines.request_reset()
+        if line is None:
+            return False
+        with line as reset:
+            reset.drive(low=True)
+            self._wait(RESET_NS)
+            reset.drive(low=False)
+            self._wait(RESET_NS)
+        return True
+
+    def _send_stop(self, scl: OpenDrainLine, sda: OpenDrainLine) -> bool:
+        """Send a STOP (SDA rises while SCL is high); return False if a line is held low."""
+        self._drive(scl, low=True)
+        self._drive(sda, low=True)
+        self._drive(scl, low=False)
+        self._drive(sda, low=False)
+        return scl.is_high() and sda.is_high()
+
+    def _drive(self, line: OpenDrainLine, *, low: bool) -> None:
+        line.drive(low=low)
+        self._wait(HALF_PERIOD_NS)
+
+    def _wait(self, duration_ns: int) -> None:
+        self._clock.sleep_until_ns(self._clock.now_ns() + duration_ns)
+
+
+def open_gpio_recovery(scene: RecoverySection | None, clock: Clock) -> BusRecovery | None:
+    """Open the recovery through the GPIO lines of `scene`; None without such a section.
+
+    Requests and releases every line once, so that a fault shows at the start and not in the field.
+    The bus must be idle meanwhile.
+
+    Raises:
+        MissingExtraError: gpiod is not installed.
+        BusSetupError: the tool that restores pins is not installed, or a line is in use.
+    """
+    if scene is None:
+        return None
+    lines = GpioLines(scene)
+    with lines.request_scl_sda():
+        pass
+    reset = lines.request_reset()
+    if reset is not None:
+        with reset:
+            pass
+    return GpioRecovery(lines, clock)

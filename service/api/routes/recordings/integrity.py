@@ -1,0 +1,213 @@
+"""Routes of a session's array and clocks, and the verification of its files."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, Literal
+
+from anyio import CapacityLimiter, to_thread
+from fastapi import APIRouter, Response
+from pydantic import Field
+from starlette.concurrency import run_in_threadpool
+
+from devices.errors import FileFormatError, FootTileError, StateError, UnknownError
+from devices.frames import ArrayInfo, ServoInfo
+from service.api.routes.common import (
+    ServerState,
+    problem_responses,
+    require_file,
+    stored_table_response,
+)
+from service.estimation import LIVE_LAG_MS
+from service.estimation.calibration import Calibration
+from service.server.broadcast.views import (
+    CalibrationView,
+    TileView,
+    View,
+    absolute_scale,
+    make_tile_views,
+)
+from service.server.estimates.live_estimator import TileRanges
+from service.server.server import Server
+from service.user_folders import PublicText
+from storage.clock.table import CLOCK_NAME, ClockSummary
+from storage.formats.writers.tables import PARQUET
+from storage.sessions.folder import FRAMES_NAME, Ledger
+from storage.sessions.metadata import load_clock_table
+from storage.verify.session import verify_session
+
+router = APIRouter(prefix="/sessions", tags=["sessions"])
+
+
+class ArrayView(View):
+    """Array of a session, and facts of its estimates."""
+
+    session_id: str
+    node: str
+    tiles: list[TileView]
+    servo: ServoInfo | None
+    nominal_rate_hz: float
+    calibration: CalibrationView | None
+    lag_ms: float | None = Field(
+        description="Look-ahead of the estimates: each uses readings up to this time after its "
+        "frame; null: no estimates."
+    )
+    estimates_problem: PublicText | None = Field(description="Reason why there are no estimates.")
+
+
+@router.get(
+    "/{session_id}/tiles",
+    operation_id="listTiles",
+    summary="Tiles",
+    responses=problem_responses(
+        _404="No such session, or nothing was recorded.", _409="It is damaged."
+    ),
+)
+async def list_tiles(session_id: str, server: ServerState) -> ArrayView:
+    """Return the tiles' positions and ranges, and the look-ahead of the estimates."""
+    session = server.sessions.get_session(session_id)
+    if session.state == "sealed" and session.sha256 is None:
+        raise UnknownError(f"session {session_id}: {session.problem}")
+    if session.state == "sealed":
+        return await run_in_threadpool(_read_sealed_array, session_id, server)
+    sources = server.recorder.collect_inputs(session_id)
+    content = sources.calibration
+    lag_ms = None if content is None else LIVE_LAG_MS
+    return _make_view(session_id, sources.info, content, lag_ms, sources.problem)
+
+
+def _read_sealed_array(session_id: str, server: Server) -> ArrayView:
+    with server.sessions.open_frames(session_id, only_slices=True) as reader:
+        info, notes, estimated = reader.info, reader.notes, reader.has_columns("grf_n")
+    if not estimated:
+        reason = str(notes.get("estimates", "no estimates")).removeprefix("no estimates: ")
+        return _make_view(session_id, info, _parse_calibration(notes), None, reason)
+    lag_ms = notes.get("lag_ms")
+    known_ms = float(lag_ms) if isinstance(lag_ms, int | float) else None
+    return _make_view(session_id, info, _parse_calibration(notes), known_ms, None)
+
+
+def _parse_calibration(notes: dict[str, Any]) -> Calibration | None:
+    try:
+        return Calibration.model_validate(notes["calibration"])
+    except (KeyError, FootTileError, ValueError):  # none, or of another version
+        return None
+
+
+def _make_view(
+    session_id: str,
+    info: ArrayInfo,
+    calibration: Calibration | None,
+    lag_ms: float | None,
+    problem: str | None,
+) -> ArrayView:
+    try:
+        ranges = None if calibration is None else TileRanges.from_calibration(info, calibration)
+    except FootTileError:  # it is of other tiles
+        ranges = None
+    calibration_view = None
+    if calibration is not None and ranges is not None:
+        scale = absolute_scale(ranges)
+        calibration_view = CalibrationView(
+            id=calibration.id, name=calibration.name, absolute_scale=scale
+        )
+    return ArrayView(
+        session_id=session_id,
+        node=info.node,
+        tiles=make_tile_views(info, ranges),
+        servo=info.servo,
+        nominal_rate_hz=info.nominal_rate_hz,
+        calibration=calibration_view,
+        lag_ms=lag_ms,
+        estimates_problem=problem,
+    )
+
+
+_PARQUET = PARQUET.media_type
+
+
+@router.get(
+    "/{session_id}/clock",
+    operation_id="getClock",
+    summary="Clocks",
+    response_model=ClockSummary,
+    responses={
+        200: {"description": "Summary, or the stored table.", "content": {_PARQUET: {}}},
+        **problem_responses(
+            _404="No such session, or its clock table is missing.",
+            _409="The table is written when the session is sealed.",
+        ),
+    },
+)
+async def get_clock(
+    session_id: str,
+    server: ServerState,
+    format: Literal["json", "parquet"] = "json",  # noqa: A002  # the query's name
+) -> ClockSummary | Response:
+    """Return offset and drift of every stream between steps; up to now while recording.
+
+    `format=parquet` is `clock.parquet`, the stored measurements.
+    """
+    session = server.sessions.get_session(session_id)
+    if format == "parquet":
+        return stored_table_response(
+            session, server.sessions.folder.get_path(session_id) / CLOCK_NAME
+        )
+    if session.sha256 is None:
+        table = server.recorder.collect_inputs(session_id).make_clock_table()
+        return await run_in_threadpool(table.summarize_streams)
+    return await run_in_threadpool(_read_sealed_clock, session_id, server)
+
+
+def _read_sealed_clock(session_id: str, server: Server) -> ClockSummary:
+    for name in (CLOCK_NAME, FRAMES_NAME):
+        require_file(server.sessions.folder.get_path(session_id) / name)
+    with server.sessions.open_frames(session_id) as reader:
+        return load_clock_table(reader).summarize_streams()
+
+
+_ONE_AT_A_TIME = CapacityLimiter(1)
+"""One thread: verification reads every frame."""
+
+
+class VerificationView(Ledger):
+    """Result of the verification: the ledger, and the problems found."""
+
+    id: str | None
+    problems: list[PublicText] = Field(description="Problems found; none: the files are intact.")
+    sha256: str | None = Field(
+        description="Present hash of the file of frames; null: there is none."
+    )
+
+
+@router.get(
+    "/{session_id}/verification",
+    operation_id="getVerification",
+    summary="Verify files",
+    response_model=VerificationView,
+    responses=problem_responses(
+        _404="No such session.",
+        _409="The session is not sealed.",
+    ),
+)
+async def verify_session_files(session_id: str, server: ServerState) -> dict[str, Any]:
+    """Read all files of a sealed session, and compare them with one another and their hashes.
+
+    Errors are in `problems`; no file is changed. A million frames take about a second; requests run
+    one after the other. This proves nothing about the server itself: `foottile pull` and `foottile
+    verify` do the same on another machine.
+    """
+    session = server.sessions.get_session(session_id)
+    if session.state != "sealed":
+        raise StateError(
+            f"session {session_id} is {session.state}, and can be verified when it is sealed",
+            remedy="Stop it",
+        )
+    read = partial(verify_session, server.sessions.folder.get_path(session_id))
+    try:
+        report = await to_thread.run_sync(read, limiter=_ONE_AT_A_TIME)
+    except FileFormatError as error:  # it was deleted meanwhile
+        raise UnknownError(f"session {session_id}: {error.what}", where=error.where) from error
+    content = report.to_json_dict()
+    del content["unproven"]  # a server has all of a session's files
+    return content

@@ -1,0 +1,392 @@
+"""MATLAB writer: .mat of version 5, a variable for each quantity; Octave and scipy read it too.
+
+scipy writes a struct at once. Here its fields are encoded one after the other, so that one field is
+in memory at a time. The head of the struct is scipy's head of a struct with empty fields, with the
+length replaced (MAT-File Format, "Level 5 MAT-File Format", mxSTRUCT_CLASS).
+
+Variables follow one another in the file: `load("session.mat", "t_ns", "grf_n")` reads only these.
+A matrix is written while it is read, a chunk of a column at a time; scipy writes all else. Several
+sessions are an array of structs, `sessions`, with the same names in each; one field is in memory at
+a time.
+
+A quantity of all tiles is a matrix of frames by tiles. Numbers that may be unknown are NaN, in a
+float class that holds all of their values. An unknown `t_server_ns`, which no float holds, is
+intmin("int64").
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from devices.errors import UsageError
+from storage.formats.export import Export
+from storage.formats.writers.format import ExportFormat, get_instants_on_export_clock_ns
+from storage.schema import COLUMNS_BY_NAME, SERVER_TIME_COLUMNS, Array, Column, numpy_dtype_of
+
+_NUMBER_TYPES: Mapping[str, tuple[int, int]] = {
+    "f8": (6, 9),
+    "f4": (7, 7),
+    "i1": (8, 1),
+    "u1": (9, 2),
+    "i2": (10, 3),
+    "u2": (11, 4),
+    "i4": (12, 5),
+    "u4": (13, 6),
+    "i8": (14, 12),
+    "u8": (15, 13),
+}
+"""Class of array and type of data by numpy type, from MathWorks' "MAT-File Format"."""
+_MATRIX, _FLAGS, _SIZE, _NAME = 14, 6, 5, 1
+"""Types of elements, from the same tables."""
+HEADER_BYTES = 128
+"""Length of a file's header; variables follow."""
+BYTES_MAX = 2**31 - 1
+"""Limit of a variable's length in MATLAB."""
+_MATRIX_HEAD_BYTES = 56
+"""Length of the head of a matrix without a name: tag, flags, size, name, tag of the numbers."""
+_EMPTY = np.empty((0, 0))
+
+
+def encode_mat_file(variables: Mapping[str, object]) -> bytes:
+    """Return a file of these variables, encoded by scipy."""
+    from scipy.io import savemat
+
+    file: Any = io.BytesIO()  # its stubs know names of files only
+    savemat(file, dict(variables), long_field_names=True, oned_as="column")
+    content: bytes = file.getvalue()
+    return content
+
+
+def encode_mat_variable(name: str, value: object) -> bytes:
+    """Return an encoded variable, without the file's header."""
+    return encode_mat_file({name: value})[HEADER_BYTES:]
+
+
+def encode_mat_matrix(
+    name: str, shape: tuple[int, int], number_type: npt.DTypeLike, chunks: Iterable[Array]
+) -> Iterator[bytes]:
+    """Yield an encoded variable of numbers while `pieces` is read.
+
+    Args:
+        name: name of the variable.
+        shape: numbers of rows and columns.
+        number_type: numpy type of the numbers.
+        chunks: arrays of this type, column after column.
+    """
+    kind = np.dtype(number_type)
+    of_class, of_data = _NUMBER_TYPES[kind.str[1:]]
+    size = shape[0] * shape[1] * kind.itemsize
+    text = name.encode("ascii")
+    head = b"".join(
+        (
+            struct.pack("<IIII", _FLAGS, 8, of_class, 0),
+            struct.pack("<IIii", _SIZE, 8, *shape),
+            struct.pack("<II", _NAME, len(text)) + text + bytes(-len(text) % 8),
+            struct.pack("<II", of_data, size),
+        )
+    )
+    yield struct.pack("<II", _MATRIX, len(head) + size + -size % 8) + head
+    for piece in chunks:
+        yield piece.tobytes()
+    yield bytes(-size % 8)
+
+
+@dataclass(frozen=True)
+class StructField:
+    """Field of a struct.
+
+    Attributes:
+        size_bytes: length of its element in bytes.
+        encode: function that encodes the element.
+    """
+
+    size_bytes: int
+    encode: Callable[[], bytes]
+
+    @classmethod
+    def from_value(cls, value: object) -> StructField:
+        """Return a field whose small value is encoded now."""
+        content = _encode_element(value)
+        return cls(len(content), lambda: content)
+
+    @classmethod
+    def from_matrix_function(
+        cls,
+        shape: tuple[int, int],
+        number_type: npt.DTypeLike,
+        compute_matrix: Callable[[], object],
+    ) -> StructField:
+        """Return a field of numbers of this shape and class, computed by `make` when written."""
+        size = shape[0] * shape[1] * np.dtype(number_type).itemsize
+        in_tag = size <= 4  # up to 4 bytes are stored in the tag of the numbers
+        return cls(
+            _MATRIX_HEAD_BYTES + (0 if in_tag else -(-size // 8) * 8),
+            lambda: _encode_element(compute_matrix()),
+        )
+
+
+def encode_mat_struct_array(
+    name: str, structs: Sequence[Mapping[str, StructField]]
+) -> Iterator[bytes]:
+    """Yield an encoded array of structs; each has the fields of all, missing ones are empty.
+
+    Args:
+        name: name of the variable.
+        structs: fields of each struct by name.
+    """
+    names = list(dict.fromkeys(key for element in structs for key in element))
+    plain = np.empty((1, len(structs)), dtype=[(key, object) for key in names])
+    for key in names:
+        for i in range(len(structs)):
+            plain[key][0, i] = _EMPTY
+    head = bytearray(encode_mat_variable(name, plain))
+    del head[len(head) - _MATRIX_HEAD_BYTES * plain.size * len(names) :]
+    nothing = StructField.from_value(_EMPTY)
+    fields = [element.get(key, nothing) for element in structs for key in names]
+    struct.pack_into("<I", head, 4, len(head) - 8 + sum(field.size_bytes for field in fields))
+    yield bytes(head)
+    for field in fields:
+        content = field.encode()
+        if len(content) != field.size_bytes:
+            raise RuntimeError(f"{len(content)} bytes of a field, and not {field.size_bytes}")
+        yield content
+
+
+def estimate_struct_array_bytes(structs: Sequence[Mapping[str, StructField]]) -> int:
+    """Return the approximate length of an array of these structs in bytes."""
+    return sum(field.size_bytes for element in structs for field in element.values())
+
+
+def _encode_element(value: object) -> bytes:
+    """Return a value encoded as in a struct, without a name."""
+    empty = len(encode_mat_variable("s", {"f": _EMPTY})) - _MATRIX_HEAD_BYTES
+    return encode_mat_variable("s", {"f": value})[empty:]
+
+
+def list_mat_quantities(export: Export) -> list[Column]:
+    """Return the selected quantities in column order, without `marker` and `time_utc`."""
+    chosen = dict.fromkeys(export.map_columns_to_quantities().values())
+    return [COLUMNS_BY_NAME[of] for of in chosen if of not in ("time_utc", "marker")]
+
+
+def list_selected_columns_or_name(export: Export, quantity: Column) -> list[str]:
+    """Return the selected columns of a quantity; its own name if no column is selected."""
+    return [
+        name for name, of in export.map_columns_to_quantities().items() if of == quantity.name
+    ] or [quantity.name]
+
+
+def choose_mat_number_type(quantity: Column) -> npt.DTypeLike:
+    """Return the class of a quantity's numbers; for a text, of the codes of its kinds."""
+    kind = quantity.type
+    if pa.types.is_string(kind):
+        return np.uint16
+    plain = numpy_dtype_of(kind)
+    if pa.types.is_floating(kind) or quantity.missing_value is None or kind.bit_width == 64:
+        return plain
+    return np.float32 if kind.bit_width <= 16 else np.float64
+
+
+def read_mat_variables(export: Export, quantity: Column) -> Mapping[str, Array]:
+    """Read a quantity as a variable by name, (frames, columns); for a text with its kinds."""
+    names = list_selected_columns_or_name(export, quantity)
+    pieces = list(_minimal_export(export, quantity).read_chunks(names))
+    flat = [np.concatenate([piece[name] for piece in pieces]) for name in names]
+    if pa.types.is_string(quantity.type):
+        kinds, codes = np.unique(flat[0].astype(str), return_inverse=True)
+        numbers = (codes + 1).astype(choose_mat_number_type(quantity))[:, None]
+        return {quantity.name: numbers, f"{quantity.name}_kinds": np.array(kinds, dtype=object)}
+    return {quantity.name: np.stack([_to_number_type(quantity, values) for values in flat], axis=1)}
+
+
+def read_chunks_column_by_column(export: Export, quantity: Column) -> Iterator[Array]:
+    """Read the numbers of a quantity in chunks, column after column."""
+    for name in list_selected_columns_or_name(export, quantity):
+        for piece in _minimal_export(export, quantity).read_chunks([name]):
+            yield _to_number_type(quantity, piece[name])
+
+
+def _minimal_export(export: Export, column: Column) -> Export:
+    """Return the export without markers, and without a clock unless the quantity needs it."""
+    is_server = column.name.startswith("t_server")
+    return replace(export, markers=None, clock=export.clock if is_server else None)
+
+
+def _to_number_type(column: Column, values: Array) -> Array:
+    """Return the numbers in the quantity's class, NaN where unknown."""
+    found = values.astype(choose_mat_number_type(column))
+    if column.missing_value is not None and found.dtype.kind == "f":
+        found[values == column.missing_value] = np.nan
+    return found
+
+
+def make_about_struct(export: Export) -> dict[str, Any]:
+    """Return the file's metadata; values that are no text are JSON."""
+    facts = {
+        **export.metadata,
+        "array_info": export.array_info.model_dump(mode="json"),
+        "notes": export.notes_with_clock_and_markers,
+        "begin_t_ns": np.int64(export.frame_source.begin_t_ns),
+        "software": export.array_info.software,
+    }
+    return {name: _to_text(value) for name, value in facts.items()}
+
+
+def _to_text(value: object) -> object:
+    if value is None or isinstance(value, bool | dict | list):
+        return json.dumps(value)
+    return value
+
+
+def make_tile_struct(export: Export) -> dict[str, Any]:
+    """Return serials and positions of the tiles."""
+    tiles = export.array_info.tiles
+    places = np.array([(t.x_m, t.y_m, t.z_m) for t in tiles], dtype=np.float64)
+    return {
+        "serial": np.array([tile.serial for tile in tiles], dtype=object),
+        "position_m": places.reshape(len(tiles), 3),
+    }
+
+
+def make_marker_struct(export: Export) -> dict[str, Any]:
+    """Return labels, instants in the server's UTC, and rows of the markers.
+
+    Rows count from 1; NaN: no frame of this file.
+    """
+    markers = export.markers.markers if export.markers is not None else ()
+    keys = ["seq", "part"] if "part" in export.frame_source.quantity_names else ["seq"]
+    pieces = list(replace(export, markers=None, clock=None).read_chunks(keys))
+    seq = np.concatenate([piece["seq"] for piece in pieces])
+    part = np.concatenate([piece.get("part", np.zeros(len(piece["seq"]))) for piece in pieces])
+    rows = []
+    for marker in markers:
+        of_part, number = marker.frame or (-1, 0)
+        at = np.flatnonzero((part == of_part) & (seq == number))
+        rows.append(float(at[0] + 1) if len(at) else np.nan)
+    return {
+        "label": np.array([marker.marker.label for marker in markers], dtype=object),
+        "t_ns": np.array([marker.marker.t_ns for marker in markers], dtype=np.int64),
+        "row": np.array(rows, dtype=np.float64),
+    }
+
+
+FRAMES_MAX = 6_000_000
+"""Limit of frames: three hours at 544 Hz; with four tiles, a variable has 24 million numbers."""
+_VALUES_MAX = 4 * FRAMES_MAX
+_HEADER_TEXT_BYTES = 116
+"""Length of the header's descriptive text in bytes."""
+
+
+def _encode(export: Export) -> Iterator[bytes]:
+    quantities = list_mat_quantities(export)
+    # Refuses too many frames before the first chunk.
+    frames = len(_read_instants(export)["t_ns"])
+    yield _encode_header(export) + encode_mat_variable("about", make_about_struct(export))
+    yield from _encode_meanings(quantities)
+    yield encode_mat_variable("tiles", make_tile_struct(export))
+    if export.markers is not None:
+        yield encode_mat_variable("markers", make_marker_struct(export))
+    for column in quantities:
+        if pa.types.is_string(column.type):
+            for name, values in read_mat_variables(export, column).items():
+                yield encode_mat_variable(name, values)
+            continue
+        shape = frames, len(list_selected_columns_or_name(export, column))
+        yield from encode_mat_matrix(
+            column.name,
+            shape,
+            choose_mat_number_type(column),
+            read_chunks_column_by_column(export, column),
+        )
+
+
+def _encode_together(exports: Sequence[Export]) -> Iterator[bytes]:
+    found = [_make_struct_fields(export) for export in exports]
+    if (size := estimate_struct_array_bytes(found)) > BYTES_MAX:
+        raise UsageError(
+            f"there are {size} bytes in these sessions, and {BYTES_MAX} in a variable at most",
+            expected="fewer columns, or a slice",
+        )
+    yield _encode_header(exports[0])
+    yield from _encode_meanings(
+        [column for export in exports for column in _quantities_with_server_time(export)]
+    )
+    yield from encode_mat_struct_array("sessions", found)
+
+
+def _make_struct_fields(export: Export) -> dict[str, StructField]:
+    rows = len(get_instants_on_export_clock_ns(export, _read_instants(export)))
+    fields = {
+        "node": StructField.from_value(export.array_info.node),
+        "about": StructField.from_value(make_about_struct(export)),
+    }
+    fields["tiles"] = StructField.from_value(make_tile_struct(export))
+    if export.markers is not None:
+        fields["markers"] = StructField.from_value(make_marker_struct(export))
+    for column in _quantities_with_server_time(export):
+        if pa.types.is_string(column.type):
+            fields |= {
+                name: StructField.from_value(v)
+                for name, v in read_mat_variables(export, column).items()
+            }
+            continue
+        width = len(list_selected_columns_or_name(export, column))
+        make = partial(_read_values, export, column)
+        fields[column.name] = StructField.from_matrix_function(
+            (rows, width), choose_mat_number_type(column), make
+        )
+    return fields
+
+
+def _quantities_with_server_time(export: Export) -> list[Column]:
+    """Return the selected quantities, and always the server's time, the sessions' common axis."""
+    return list(dict.fromkeys([*list_mat_quantities(export), *SERVER_TIME_COLUMNS]))
+
+
+def _read_values(export: Export, column: Column) -> Array:
+    return read_mat_variables(export, column)[column.name]
+
+
+def _read_instants(export: Export) -> dict[str, Array]:
+    """Return the instants of the frames by each requested clock."""
+    limit = min(FRAMES_MAX, _VALUES_MAX // max(len(export.array_info.tiles), 1))
+    requested = ["t_ns", *(["part"] if "part" in export.frame_source.quantity_names else [])]
+    requested += [] if export.clock is None else ["t_server_ns"]
+    return export.read_all(requested, frames_max=limit)
+
+
+def _encode_meanings(quantities: Sequence[Column]) -> Iterator[bytes]:
+    yield encode_mat_variable("units", {column.name: column.unit for column in quantities})
+    yield encode_mat_variable("meaning", {column.name: column.description for column in quantities})
+
+
+def _encode_header(export: Export) -> bytes:
+    """Return scipy's header without the time of day in its text: equal exports are equal files."""
+    text = f"MATLAB 5.0 MAT-file, written by {export.array_info.software}"
+    shown = text.encode("ascii", "replace")[:_HEADER_TEXT_BYTES].ljust(_HEADER_TEXT_BYTES)
+    return shown + encode_mat_file({})[_HEADER_TEXT_BYTES:HEADER_BYTES]
+
+
+MATLAB = ExportFormat(
+    "mat",
+    "MATLAB",
+    "MATLAB, Octave, scipy",
+    "application/x-matlab-data",
+    _encode,
+    group_encoder=_encode_together,
+    options=("times",),
+    needs_sealed=True,
+    frames_max=FRAMES_MAX,
+    extra="server",
+    packages=("scipy",),
+)

@@ -1,0 +1,415 @@
+"""OpenSim writer: loads of each foot as rows without gaps, and their files.
+
+The zip file also has tables of filled stretches and of events, and metadata as text. Each of
+several sessions is a separate force on a separate body, over one time.
+
+OpenSim's axes: x forward, y up, z to the right. Points are in the ground's frame if the session
+has it; else force and point are in the frame of the foot's body, which moves them. The ground frame
+of each foot lies under its ankle, and relative positions of feet are unknown: for several feet, all
+are in the frames of their bodies.
+
+A `.mot` file has no value for unknown numbers, so they are filled. A table lists every filled
+stretch, to distinguish it from measured values.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import zipfile
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from xml.sax.saxutils import escape
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.csv as pacsv
+
+from devices.arrays import Floats
+from devices.errors import UsageError
+from storage.formats.export import Export
+from storage.formats.writers.format import DrainedBuffer, ExportFormat, make_names_unique
+from storage.formats.writers.resampling import COP, GroundReaction, read_reactions_on_common_axis
+from storage.formats.writers.tables import write_spreadsheet_safe_csv
+from storage.formats.writers.text_metadata import (
+    escape_xml_invalid_characters,
+    format_largest_clock_bound,
+    format_metadata,
+    to_ascii_line,
+)
+
+INTERPOLATED_MAX_S = 0.02
+"""Longest interpolated stretch of unknown GRF; longer stretches are 0."""
+
+LOAD_COLUMNS = (
+    *(f"ground_force_v{axis}" for axis in "xyz"),
+    *(f"ground_force_p{axis}" for axis in "xyz"),
+    *(f"ground_torque_{axis}" for axis in "xyz"),
+)
+"""Columns of one foot, after `time`."""
+GROUND_X = "cop_ground_x_m"
+"""Ground x; the foot rolls about its y axis, so y is the same in both frames."""
+
+
+_FILL_REASONS = {
+    1: (
+        "force and point",
+        "force 0, point on a line between those before and behind",
+        "no contact",
+    ),
+    2: ("force", "line between the forces before and behind", "GRF not known"),
+    3: ("force", "0", "GRF not known"),
+    4: ("force", "line between the forces before and behind", "no frame: lost or not taken"),
+    5: ("force", "0", "no frame: lost or not taken"),
+    6: ("point", "line between the points before and behind", "no centre of pressure stated"),
+}
+_NOT_FILLED = 0
+_UNLOADED, _LINE, _ZERO, _LINE_EMPTY, _ZERO_EMPTY, _POINT = _FILL_REASONS
+
+
+@dataclass(frozen=True)
+class FootLoads:
+    """Loads on one foot in n rows of a `.mot` file, with a code for filled rows.
+
+    Attributes:
+        time_s: (n,), times since the first row.
+        table: (n, 9), loads in the order of `LOAD_COLUMNS`; no NaN.
+        fill_code: (n,), reason for filling: a key of `_FILL_REASONS`; 0 if the row is not filled.
+        estimate_flags: (n,), `estimate_flags`, NaN without a frame.
+        frame: frame of forces and points, "ground" or "foot".
+    """
+
+    time_s: Floats
+    table: Floats
+    fill_code: npt.NDArray[np.uint8]
+    estimate_flags: Floats
+    frame: str
+
+    def list_filled_stretches(self) -> pa.Table:
+        """Return the table of filled stretches: from, to, what, by what, why, and flags."""
+        edges = np.flatnonzero(np.diff(self.fill_code)) + 1
+        begins, ends = np.append(0, edges), np.append(edges, len(self.fill_code))
+        is_filled = self.fill_code[begins] != _NOT_FILLED
+        begins, ends = begins[is_filled], ends[is_filled]
+        reasons = [_FILL_REASONS[int(self.fill_code[begin])] for begin in begins]
+        flags = [
+            _combined_flags(self.estimate_flags[a:b]) for a, b in zip(begins, ends, strict=True)
+        ]
+        columns = {
+            "from_s": self.time_s[begins],
+            "to_s": self.time_s[ends - 1],
+            "rows": ends - begins,
+            "filled": [what for what, _, _ in reasons],
+            "with": [how for _, how, _ in reasons],
+            "because": [why for _, _, why in reasons],
+            "estimate_flags": flags,
+        }
+        types = [pa.float64(), pa.float64(), pa.int64(), *[pa.string()] * 3, pa.int64()]
+        return pa.table(
+            [
+                pa.array(values, type_)
+                for values, type_ in zip(columns.values(), types, strict=True)
+            ],
+            names=list(columns),
+        )
+
+
+def compute_gapless_foot_loads(
+    reaction: GroundReaction, export: Export, *, is_only_foot: bool
+) -> FootLoads:
+    """Compute the loads on the foot at each sample, with unknown numbers filled.
+
+    Args:
+        reaction: ground reaction of the session.
+        export: export of the session.
+        is_only_foot: True for a single foot; only then loads may be in the ground's frame.
+
+    Raises:
+        UsageError: no sample has a centre of pressure.
+    """
+    places = [tile.z_m for tile in export.array_info.tiles if not tile.reference]
+    points = [reaction.resample_column(name) for name in COP]
+    is_ground = False
+    if is_only_foot and GROUND_X in reaction.columns:
+        ground_x_m = reaction.resample_column(GROUND_X)
+        is_ground = bool(np.isfinite(ground_x_m).any())
+        points[0] = ground_x_m if is_ground else points[0]
+    stated = np.isfinite(points).all(axis=0)
+    if not stated.any():
+        raise UsageError(
+            "no centre of pressure is stated in it, and a force without a point is no load",
+            where=export.display_name,
+            remedy="Ask for C3D, Parquet, Arrow or CSV",
+        )
+    contact = reaction.resample_column("contact")
+    unloaded = contact == 0.0
+    known_n = reaction.resampling.interpolate(reaction.frame_contact_grf_n)
+    known_n[unloaded] = 0.0
+    known = np.isfinite(known_n)
+    empty = ~reaction.resampling.has_frames
+    time_s = reaction.resampling.elapsed_s
+    force_n, bridged = _fill_force_gaps(time_s, known_n, known)
+    at = np.flatnonzero(stated)
+    x_m, left_m = (np.interp(time_s, time_s[at], values[at]) for values in points)
+    code = np.zeros(len(time_s), dtype=np.uint8)
+    code[~stated] = _POINT
+    code[~known] = np.where(bridged, _LINE, _ZERO)[~known]
+    code[empty] = np.where(bridged, _LINE_EMPTY, _ZERO_EMPTY)[empty]
+    code[unloaded] = _UNLOADED
+    nothing = np.zeros(len(time_s))
+    up_m = nothing if is_ground else np.full(len(time_s), float(np.mean(places)))
+    columns = [nothing, force_n, nothing, x_m, up_m, -left_m, nothing, nothing, nothing]
+    return FootLoads(
+        time_s,
+        np.stack(columns, axis=1),
+        code,
+        reaction.resample_column("estimate_flags"),
+        "ground" if is_ground else "foot",
+    )
+
+
+def _fill_force_gaps(
+    time_s: Floats, force_n: Floats, known: npt.NDArray[np.bool_]
+) -> tuple[Floats, npt.NDArray[np.bool_]]:
+    """Return forces without NaN, and the mask of the interpolated samples."""
+    at = np.flatnonzero(known)
+    after = np.searchsorted(at, np.arange(len(time_s)))
+    inside = (after > 0) & (after < len(at)) & ~known
+    before_at, after_at = at[np.maximum(after - 1, 0)], at[np.minimum(after, len(at) - 1)]
+    bridged = inside & (time_s[after_at] - time_s[before_at] <= INTERPOLATED_MAX_S)
+    line_n = np.interp(time_s, time_s[at], force_n[at])
+    return np.where(known, force_n, np.where(bridged, line_n, 0.0)), bridged
+
+
+def _combined_flags(flags: Floats) -> int | None:
+    there = flags[np.isfinite(flags)].astype(np.int64)
+    return int(np.bitwise_or.reduce(there)) if len(there) else None
+
+
+FRAMES_MAX = 2_000_000
+"""Limit of frames of all sessions: an hour at 544 Hz."""
+DEFAULT_BODY = "foot"
+"""Default body of the model; for several sessions with the node's name as prefix."""
+
+_INVALID_IN_NAMES = re.compile(r"[^0-9A-Za-z._-]")
+_CHUNK_ROWS = 1 << 15
+_ZIP_TIME = (1980, 1, 1, 0, 0, 0)
+"""Constant date: the same session gives the same bytes."""
+
+
+@dataclass(frozen=True)
+class ExportedFoot:
+    """One foot of the export, with its session.
+
+    Attributes:
+        export: export of the session.
+        reaction: ground reaction of the session.
+        loads: loads on the foot.
+        name: name of the node in characters valid for files and models; empty for a single foot.
+        body: body of the model.
+    """
+
+    export: Export
+    reaction: GroundReaction
+    loads: FootLoads
+    name: str
+    body: str
+
+    @property
+    def column_prefix(self) -> str:
+        """Prefix of the foot's columns."""
+        return f"{self.name}_" if self.name else ""
+
+    @property
+    def frame_body(self) -> str:
+        """Name of the body in whose frame force and point are expressed."""
+        return "ground" if self.loads.frame == "ground" else self.body
+
+
+def _encode(export: Export) -> Iterator[bytes]:
+    return _encode_together([export])
+
+
+def _encode_together(exports: Sequence[Export]) -> Iterator[bytes]:
+    feet = _make_feet(exports)
+    named = to_ascii_line(str(exports[0].metadata.get("session") or "session"))
+    stem = _INVALID_IN_NAMES.sub(
+        "_", named if len(feet) == 1 else f"{named}-and-{len(feet) - 1}-more"
+    )
+    filled = [foot.loads.list_filled_stretches() for foot in feet]
+    foot_notes = [_make_notes(foot, table) for foot, table in zip(feet, filled, strict=True)]
+    events = [_make_event_table(foot.reaction) for foot in feet]
+    time_s = feet[0].reaction.resampling.elapsed_s
+    table = np.concatenate([time_s[:, None], *(foot.loads.table for foot in feet)], axis=1)
+    sink = DrainedBuffer()
+    with zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
+        file.writestr(_make_zip_entry(f"{stem}.xml"), make_external_loads_xml(f"{stem}.mot", feet))
+        file.writestr(
+            _make_zip_entry(f"{stem}_filled.csv"), _encode_csv(_join_tables(filled, feet))
+        )
+        file.writestr(
+            _make_zip_entry(f"{stem}_events.csv"), _encode_csv(_join_tables(events, feet))
+        )
+        notes = foot_notes[0] if len(foot_notes) == 1 else {"SESSIONS": foot_notes}
+        file.writestr(_make_zip_entry(f"{stem}_notes.json"), json.dumps(notes, indent=1))
+        with file.open(_make_zip_entry(f"{stem}.mot"), "w", force_zip64=True) as entry:
+            names = ["time", *(foot.column_prefix + name for foot in feet for name in LOAD_COLUMNS)]
+            entry.write(_encode_mot_head(stem, len(table), names))
+            for begin in range(0, len(table), _CHUNK_ROWS):
+                entry.write(_encode_mot_rows(table[begin : begin + _CHUNK_ROWS], names))
+                yield sink.drain()
+    yield sink.drain()
+
+
+def _make_feet(exports: Sequence[Export]) -> list[ExportedFoot]:
+    is_alone = len(exports) == 1
+    nodes = make_names_unique(
+        [_INVALID_IN_NAMES.sub("_", to_ascii_line(each.array_info.node)) for each in exports]
+    )
+    names = [""] if is_alone else nodes
+    bodies = [DEFAULT_BODY] if is_alone else [f"{node}_{DEFAULT_BODY}" for node in nodes]
+    if (requested := exports[0].options.body) is not None:
+        bodies = requested.split(",")
+        if len(bodies) != len(exports):
+            raise UsageError(
+                f"{len(bodies)} bodies for {len(exports)} sessions",
+                expected="one for each, in their order, with commas between: "
+                + ", ".join(each.display_name for each in exports),
+            )
+    found = read_reactions_on_common_axis(exports, [GROUND_X], FRAMES_MAX // len(exports))
+    loads = [
+        compute_gapless_foot_loads(each, export, is_only_foot=is_alone)
+        for each, export in zip(found, exports, strict=True)
+    ]
+    return [
+        ExportedFoot(*of_foot) for of_foot in zip(exports, found, loads, names, bodies, strict=True)
+    ]
+
+
+def make_external_loads_xml(mot_name: str, feet: Sequence[ExportedFoot]) -> str:
+    """Return the XML that maps the columns of a `.mot` file to forces on bodies."""
+    forces = "".join(_make_external_force_xml(foot) for foot in feet)
+    return (
+        '<?xml version="1.0" encoding="UTF-8" ?>\n'
+        '<OpenSimDocument Version="40000">\n'
+        '\t<ExternalLoads name="foottile">\n'
+        f"\t\t<objects>\n{forces}\t\t</objects>\n"
+        f"\t\t<datafile>{escape(mot_name)}</datafile>\n"
+        "\t</ExternalLoads>\n"
+        "</OpenSimDocument>\n"
+    )
+
+
+def _make_external_force_xml(foot: ExportedFoot) -> str:
+    tags = {
+        "applied_to_body": foot.body,
+        "force_expressed_in_body": foot.frame_body,
+        "point_expressed_in_body": foot.frame_body,
+        "force_identifier": f"{foot.column_prefix}ground_force_v",
+        "point_identifier": f"{foot.column_prefix}ground_force_p",
+        "torque_identifier": f"{foot.column_prefix}ground_torque_",
+    }
+    inside = "".join(
+        f"\t\t\t\t<{tag}>{escape(escape_xml_invalid_characters(text))}</{tag}>\n"
+        for tag, text in tags.items()
+    )
+    name = f"foottile_{foot.column_prefix}grf"
+    return f'\t\t\t<ExternalForce name="{name}">\n{inside}\t\t\t</ExternalForce>\n'
+
+
+def _make_notes(foot: ExportedFoot, filled: pa.Table) -> dict[str, object]:
+    by_reason = Counter[str]()
+    for row in filled.to_pylist():
+        by_reason[row["because"]] += row["rows"]
+    axes = (
+        "x forward, y up, z to the right; force and point in the ground's frame, the force "
+        "upright, points at y = 0"
+        if foot.frame_body == "ground"
+        else "x forward, y up the segment, z to the right, origin at the ankle: the foot's own "
+        f"frame, as the body {foot.body!r}; where the ground is in the model is not known"
+    )
+    steady = foot.reaction.resampling
+    bound = (
+        {}
+        if foot.reaction.server_time_bound_s is None
+        else format_largest_clock_bound(foot.reaction.server_time_bound_s)
+    )
+    return {
+        **format_metadata(foot.export, steady.begin_ns),
+        "AXES": to_ascii_line(axes),
+        "RESAMPLED": steady.describe(),
+        "FILLED": "unknown numbers, as the format has no number for them: every stretch is in the "
+        "table of filled stretches",
+        "BODY": foot.body,
+        "COLUMNS": f"{foot.column_prefix}ground_force_vx and the eight behind it",
+        "NOT_MEASURED": "shear and free moment: 0",
+        "ROWS": len(foot.loads.table),
+        "FILLED_ROWS": dict(by_reason),
+        "MARKS": foot.reaction.marker_count,
+        **bound,
+    }
+
+
+def _encode_mot_head(name: str, rows: int, columns: Sequence[str]) -> bytes:
+    head = f"{name}\nversion=1\nnRows={rows}\nnColumns={len(columns)}\ninDegrees=no\nendheader\n"
+    return (head + "\t".join(columns) + "\n").encode()
+
+
+def _encode_mot_rows(rows: Floats, columns: Sequence[str]) -> bytes:
+    digits = [9, *([6] * (len(columns) - 1))]
+    arrays = [np.round(rows[:, i], digits[i]) + 0.0 for i in range(len(columns))]
+    table = pa.table(arrays, names=list(columns))
+    sink = BytesIO()
+    options = pacsv.WriteOptions(include_header=False, delimiter="\t", quoting_style="none")
+    pacsv.write_csv(table, sink, options)
+    return sink.getvalue()
+
+
+def _make_event_table(reaction: GroundReaction) -> pa.Table:
+    times = pa.array([at_s for at_s, _ in reaction.events], pa.float64())
+    labels = pa.array([label for _, label in reaction.events], pa.string())
+    kinds = ["marker"] * reaction.marker_count + ["contact"] * (
+        len(reaction.events) - reaction.marker_count
+    )
+    return pa.table([times, labels, pa.array(kinds, pa.string())], names=["time", "event", "kind"])
+
+
+def _join_tables(tables: Sequence[pa.Table], feet: Sequence[ExportedFoot]) -> pa.Table:
+    """Return one table; for several feet, a column `foot` tells the foot of each row."""
+    if len(feet) == 1:
+        return tables[0]
+    return pa.concat_tables(
+        table.append_column("foot", pa.array([foot.name] * len(table), pa.string()))
+        for table, foot in zip(tables, feet, strict=True)
+    )
+
+
+def _encode_csv(table: pa.Table) -> bytes:
+    sink = BytesIO()
+    write_spreadsheet_safe_csv(sink, table)
+    return sink.getvalue()
+
+
+def _make_zip_entry(name: str) -> zipfile.ZipInfo:
+    entry = zipfile.ZipInfo(name, _ZIP_TIME)
+    entry.compress_type = zipfile.ZIP_DEFLATED
+    entry.external_attr = 0o644 << 16
+    return entry
+
+
+OPENSIM = ExportFormat(
+    "opensim",
+    "OpenSim",
+    "OpenSim: .mot and ExternalLoads",
+    "application/zip",
+    _encode,
+    group_encoder=_encode_together,
+    suffix="opensim.zip",
+    options=("body",),
+    takes_columns=False,
+    needs_forces=True,
+    frames_max=FRAMES_MAX,
+)

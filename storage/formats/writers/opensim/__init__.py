@@ -1,1 +1,0 @@
-"""OpenSim writer: loads of each foot as rows without gaps, and their files."""
