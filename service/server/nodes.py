@@ -8,6 +8,8 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from pydantic import ValidationError
+
 from devices.errors import (
     DamagedFileError,
     FileFormatError,
@@ -150,9 +152,15 @@ def _read_hello(path: Path) -> Hello:
         if hello is not None:
             _check_hello(hello)
     except (ValueError, KeyError, TypeError, RecursionError, LinkError) as error:
-        what = " ".join(str(error).split())[:200]
+        what = str(error)
+        if isinstance(error, ValidationError):
+            first = error.errors()[0]
+            field = ".".join(map(str, first["loc"]))
+            what = f"written by another version, or edited ({field}: {first['msg']})"
         raise DamagedFileError(
-            f"not this node's last hello: {what}", where=str(path), remedy=again.capitalize()
+            f"not this node's last hello: {' '.join(what.split())[:200]}",
+            where=str(path),
+            remedy=again.capitalize(),
         ) from error
     if hello is None:
         raise FileFormatError(

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Hashable, Iterator
+from difflib import get_close_matches
 from typing import Any, NamedTuple
 
 import pyarrow as pa
@@ -154,8 +155,10 @@ def _select_columns(
         elif name in by_name:
             chosen[name] = None
         else:
+            near = get_close_matches(name, [*by_quantity, *by_name], 1)
             raise UsageError(
-                f"no column {name[:40]!r} in a live stream of {tiles} tiles",
+                f"no column {name[:40]!r} in a live stream of {tiles} tile{'s'[: tiles != 1]}"
+                + (f"; did you mean {near[0]!r}?" if near else ""),
                 expected=f"some of {', '.join(_COLUMNS)}",
             )
     return [by_name[name] for name in chosen]

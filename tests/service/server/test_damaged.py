@@ -211,3 +211,17 @@ def test_whatever_a_file_is_called_everybody_can_be_told_of_it(
     assert said.isprintable()
     with running.socket("/api/v1/live") as live:
         assert json.loads(live.recv(timeout=PATIENCE_S))["problems"]
+
+
+def test_a_hello_of_another_version_is_told_in_one_sentence(
+    running: Running, tared: FakeNode
+) -> None:
+    running.stop()
+    path = running.data / "nodes" / "bench" / "hello.json"
+    content = read_checksummed_json(path)
+    hello = json.loads(content) | {"older": 1}
+    write_checksummed_json(path, json.dumps(hello).encode())
+    running.start()
+    said = problems(running)
+    assert "written by another version, or edited (older: Extra inputs are not permitted)" in said
+    assert "validation error" not in said

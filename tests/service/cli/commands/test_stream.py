@@ -70,6 +70,7 @@ def test_it_ends_without_a_word_when_its_reader_goes_away(
     ("arguments", "code", "said"),
     [
         (("nobody",), 2, "no node 'nobody'"),
+        (("bench", "--columns", "grf_n_sigma"), 2, "did you mean 'grf_sigma_n'?"),
         (("bench", "--format", "xml"), 2, "expected csv or jsonl"),
         (("--server", "http://127.0.0.1:1"), 1, "no answer"),
     ],
