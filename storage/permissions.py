@@ -1,7 +1,7 @@
 """Permissions of the files that a process writes, and files of secrets.
 
-A server keeps one in the folder of each node, a node one in its own folder. No other user may read
-it.
+A server keeps a file of secrets in the folder of each node, a node one in its own folder. No other
+user may read them.
 """
 
 from __future__ import annotations

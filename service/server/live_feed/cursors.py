@@ -1,12 +1,12 @@
 """Positions of readers of the live feed: every frame once, or new frames first; no I/O.
 
-The reader waits for frames that may still come; lost ones are reported. A reader too slow for the
-buffer is disconnected with the position to resume from.
+A lossless reader waits for frames that may still come; lost ones are reported. If it is too slow
+for the buffer, it is disconnected with the position to resume from. A lossy reader has a policy:
 
-- policy `drop_oldest`: frames older than `QUEUE_NS` at their turn are dropped.
-- policy `latest`: of the buffered batches, only the newest is sent.
+- `drop_oldest`: frames older than `QUEUE_NS` at their turn are dropped.
+- `latest`: of the buffered batches, only the newest is sent.
 
-The reader waits for nothing, and every dropped frame is reported: from a reader's first frame on,
+It waits for nothing, and every dropped frame is reported: from a reader's first frame on,
 frames sent and frames reported add up to every known frame.
 """
 
