@@ -87,7 +87,7 @@ def test_no_other_place_reads_a_variable_of_ours() -> None:
         ROOT / "foottile" / "environment.py",
         # It passes its whole environment on, and names the token for the node that it starts.
         ROOT / "service" / "cli" / "commands" / "demo.py",
-        ROOT / "studies" / "reproduce" / "laboratory.py",
+        ROOT / "studies" / "reproduce" / "run.py",
         # Read or set for a library.
         ROOT / "devices" / "jit.py",
         ROOT / "service" / "memory.py",

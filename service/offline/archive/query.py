@@ -164,7 +164,7 @@ def find_sessions(locations: Sequence[str], download_folder: Path | None = None)
     """Find all sealed sessions at some locations.
 
     Args:
-        locations: paths, globs or URIs; see `service.offline.archive.places`.
+        locations: paths, globs or URIs; see `service.offline.archive.locations`.
         download_folder: empty folder for metadata copied from object stores; required for
             remote sessions.
 

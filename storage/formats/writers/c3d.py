@@ -148,7 +148,7 @@ def build_c3d_content(reactions: Sequence[GroundReaction], exports: Sequence[Exp
         row[:samples] = values
     rate_hz = reactions[0].resampling.rate_hz
     groups: dict[str, dict[str, Any]] = {
-        "POINT_COLUMNS": {
+        "POINT": {
             "RATE": [rate_hz / per_frame],
             "UNITS": ["mm"],
             "X_SCREEN": ["+X"],
