@@ -10,6 +10,7 @@ const WHEEL_STEP = 0.0018;
 /**
  * @typedef {object} GestureActions
  * @property {(px: number, hovering?: boolean) => void} point move the cursor
+ * @property {(px: number) => void} tap move the cursor and select what is there
  * @property {(fromPx: number, toPx: number) => void} choosing a range is being selected
  * @property {(fromPx: number, toPx: number) => void} choose select the range; equal: cancel
  * @property {(factor: number, px: number) => void} zoom
@@ -91,6 +92,7 @@ export function bindGestures(box, actions) {
       if (!down.size) pinch = null; // the remaining finger is no cursor
       return;
     }
+    const still = fromPx !== null || touchedPx !== null; // neither panned nor moved the cursor
     const dragged = fromPx !== null && Math.abs(px - fromPx) > CLICK_PX;
     if (fromPx !== null) actions.choose(fromPx, dragged && event.type === "pointerup" ? px : fromPx);
     fromPx = null;
@@ -98,6 +100,7 @@ export function bindGestures(box, actions) {
     const twice = event.timeStamp - lastTap.atMs < DOUBLE_MS && Math.abs(px - lastTap.px) < 24;
     lastTap = { atMs: twice ? -Infinity : event.timeStamp, px };
     if (twice) actions.all();
+    else if (still) actions.tap(px);
     else actions.point(px);
   };
   box.addEventListener("pointerup", up);

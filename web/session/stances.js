@@ -1,4 +1,4 @@
-// Stances: table, and figures of the one at the cursor.
+// Stances: table, and figures of the selected one.
 
 import { byId, el, number, setData, setText } from "../common/text.js";
 import { estimateTexts } from "./flags.js";
@@ -80,22 +80,26 @@ export function medianOf(stances) {
 
 /** Table of stances. */
 export class Stances {
-  /** @param {(index: number) => void} onGo */
-  constructor(onGo) {
+  /** @param {(index: number) => void} onGo @param {number | null} selected number of a stance; null: none */
+  constructor(onGo, selected = null) {
     this.onGo = onGo;
+    this.selected = selected;
     this.body = byId("stances-rows");
     this.stances = [];
-    this.current = -1;
+    this.drawn = -1; // index of the highlighted row
     this.line = byId("stance-text");
     this.figures = new Map(FIGURES.map(({ key }) => [key, el("dd")]));
     byId("stance-figures").replaceChildren(...FIGURES.map(({ key, label }) => el("div", { "data-figure": key }, el("dt", { text: label }), this.figures.get(key))));
     byId("stances-more").addEventListener("click", () => this.add());
   }
 
+  /** Return the index of the selected stance; -1: none. */
+  get current() { return this.stances.findIndex((stance) => stance.number === this.selected); }
+
   show(stances) {
     this.stances = stances;
     this.body.replaceChildren();
-    this.current = -1;
+    this.drawn = -1;
     for (const id of ["stances-card", "stance-line"]) byId(id).hidden = !stances.length;
     this.add();
   }
@@ -120,16 +124,17 @@ export class Stances {
   }
 
   step(by, cursorS, view) {
-    const next = neighbour(this.stances, by, cursorS, view);
+    const { current } = this;
+    const next = current >= 0 ? current + by : neighbour(this.stances, by, cursorS, view);
     if (next in this.stances) this.onGo(next);
   }
 
-  /** Show the stance at the cursor, and highlight it in the table. */
-  follow(timeS, isPlaying) {
-    const index = stanceAt(this.stances, timeS);
-    this.showFigures(this.stances[index], isPlaying);
-    if (index === this.current) return;
-    this.current = index;
+  /** Show the selected stance, and highlight it in the table. */
+  draw() {
+    const index = this.current;
+    this.showFigures(this.stances[index]);
+    if (index === this.drawn) return;
+    this.drawn = index;
     while (index >= this.body.children.length) this.add();
     for (const row of this.body.querySelectorAll("[aria-current]")) row.removeAttribute("aria-current");
     const row = /** @type {HTMLElement | undefined} */ (this.body.children[index]);
@@ -142,8 +147,7 @@ export class Stances {
     else if (bottom > box.scrollTop + box.clientHeight) box.scrollTop = bottom - box.clientHeight;
   }
 
-  showFigures(stance, isPlaying) {
-    this.line.setAttribute("aria-live", isPlaying ? "off" : "polite"); // too fast for a screen reader
+  showFigures(stance) {
     const many = this.stances.length.toLocaleString("en-GB");
     const whole = this.stances.filter((one) => one.is_whole);
     const all = `${many} stance${many === "1" ? "" : "s"}`;
