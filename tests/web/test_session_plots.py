@@ -71,6 +71,41 @@ def test_what_is_shown_is_in_the_link_and_comes_back_with_it(
     assert seen(again) == all_s
 
 
+def test_a_peak_is_written_once_and_the_cursor_leaves_it_legible(
+    walk: Recording, open_page: OpenPage
+) -> None:
+    page = open_page(
+        url_of(walk),
+        first="""const { fillText } = CanvasRenderingContext2D.prototype;
+        window.written = [];
+        CanvasRenderingContext2D.prototype.fillText = function (text, ...place) {
+          window.written.push([this.canvas.id, text, ...place]);
+          fillText.call(this, text, ...place);
+        };""",
+    )
+    settled(page)
+    page.locator("#stances-rows tr").nth(1).click()  # the cursor is at its peak
+    expect(page.locator("#plots")).to_have_attribute("data-whole", "false")
+    settled(page)
+    peak = f"{walk.running.http.get(f'{walk.url}/stances').json()[1]['peak_grf_n']:.1f}"
+    ink = page.evaluate(
+        """(peak) => {
+          const [, , x, y] = window.written.findLast(([, text]) => text === peak);
+          const over = document.getElementById("cursor-canvas");
+          const ratio = over.width / over.clientWidth;
+          const { data, width } = over.getContext("2d")
+            .getImageData((x - 20) * ratio, (y - 40) * ratio, 40 * ratio, 92 * ratio);
+          const inkOf = (fromPx, toPx) => data // from the value's foot
+            .slice(...[fromPx, toPx].map((px) => 4 * width * Math.round((px + 40) * ratio)))
+            .some((value) => value > 0);
+          return { above: inkOf(-40, -28), value: inkOf(-14, 0), below: inkOf(40, 52) };
+        }""",
+        peak,
+    )
+    assert ink == {"above": True, "value": False, "below": True}
+    assert "cursor-canvas" not in page.evaluate("window.written.map(([canvas]) => canvas)")
+
+
 def test_keys_zoom_move_the_cursor_and_show_all(walk: Recording, open_page: OpenPage) -> None:
     page = open_page(url_of(walk))
     all_s = seen(page)
