@@ -12,6 +12,7 @@ from playwright.sync_api import Page, expect
 from storage.formats.writers.registry import FORMATS
 from tests.service.recording import Recording
 from tests.service.running import Running
+from tests.waiting import until
 from tests.web.session_page import grf, recorded_walk, seen, settled, summary, url_of
 
 pytestmark = pytest.mark.real_time
@@ -62,7 +63,14 @@ def test_what_is_shown_is_in_the_link_and_comes_back_with_it(
     again = open_page(page.url)
     assert seen(again) == pytest.approx(chosen, abs=1e-3)
     again.mouse.move(box["x"] + 400, box["y"] + 100)
+    again.mouse.wheel(0, 300)
+    until(lambda: again.evaluate("scrollY") > 100)  # the page, and nothing else
+    assert seen(again) == pytest.approx(chosen, abs=1e-3)
+    again.mouse.wheel(0, -600)
+    until(lambda: again.evaluate("scrollY") == 0)
+    again.keyboard.down("Control")
     again.mouse.wheel(0, -300)
+    again.keyboard.up("Control")
     expect(again.locator("#plots")).not_to_have_attribute("data-from", f"{chosen[0]:.4f}")
     closer = seen(again)
     assert chosen[0] < closer[0] < closer[1] < chosen[1]

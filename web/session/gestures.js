@@ -107,12 +107,11 @@ export function bindGestures(box, actions) {
   box.addEventListener("pointercancel", up);
 
   box.addEventListener("wheel", (event) => {
-    if (event.ctrlKey || Math.abs(event.deltaY) >= Math.abs(event.deltaX)) {
+    if (event.ctrlKey || event.metaKey) { // a trackpad's pinch has ctrlKey
       const lines = event.deltaMode === WheelEvent.DOM_DELTA_LINE ? 30 : 1;
-      // Whole session visible: the wheel scrolls the page.
-      if (event.deltaY > 0 && box.dataset.whole === "true" && !event.ctrlKey) return;
       actions.zoom(Math.exp(event.deltaY * lines * WHEEL_STEP), place(event));
-    } else actions.move(event.deltaX);
+    } else if (Math.abs(event.deltaX) > Math.abs(event.deltaY)) actions.move(event.deltaX);
+    else return; // scrolls the page
     event.preventDefault();
   }, { passive: false });
 
