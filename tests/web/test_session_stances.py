@@ -173,6 +173,13 @@ def test_where_the_plots_are_touched_the_stance_is_said_and_the_next_one_follows
     page.tap("#zoom-all")
     page.touchscreen.tap(*middle_of(page, stances[6], hops))
     says(page, stances[6])
+    # Its force is in the bar at the foot of the screen: that beside the foot is out of sight.
+    expect(page.locator("#replay-force")).to_be_in_viewport(ratio=1)
+    expect(page.locator("#replay-force")).to_have_text(re.compile(r"^, [0-9.]+ ± [0-9.]+ N$"))
+    force_n = float((page.locator("#grf").text_content() or "").strip())
+    assert f" {force_n:.1f} ±" in (page.locator("#replay-force").text_content() or "")
+    expect(page.locator("#replay-frame")).to_be_hidden()
+    assert page.evaluate("document.documentElement.scrollWidth") == PHONE["width"]
     page.tap("#stance-next")
     says(page, stances[7])
 
