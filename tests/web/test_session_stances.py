@@ -239,11 +239,18 @@ def test_of_a_stance_that_was_not_seen_whole_the_line_says_so(
     page.tap("#stance-next")
     expect(page.locator("#stance-text")).to_contain_text("start not recorded")
     row = page.locator("#stances-rows tr").first
-    expect(row.get_by_text("⚠ cut")).to_be_visible()
+    expect(row.get_by_text("⚠ cut at start")).to_be_visible()
+    first = session.running.http.get(f"{session.url}/stances").json()[0]
+    at_least = re.compile(rf"^≥\s{1e3 * first['duration_s']:.0f}\s")  # it began before
+    expect(row.get_by_role("cell").nth(2)).to_have_text(at_least)
+    expect(page.locator("#stance-figures [data-figure=duration] dd")).to_have_text(at_least)
+    for figure in ("peak", "impulse", "travel"):
+        expect(page.locator(f"#stance-figures [data-figure={figure}] dd")).to_contain_text("≥")
     expect(row.locator(".why")).to_have_attribute("title", "start not recorded")
     page.tap("#stance-next")
     expect(page.locator("#stance-which")).to_have_text("Stance 2 of 2")
     expect(page.locator("#stance-flags")).to_be_empty()
+    expect(page.locator("#stance-figures")).not_to_contain_text("≥")
     assert page.evaluate("document.documentElement.scrollWidth") == PHONE["width"]
     assert complaints(page) == []
 
