@@ -156,7 +156,9 @@ def test_whole_stances_lie_one_upon_another_and_a_click_on_one_goes_there(
     box = canvas.bounding_box()
     assert box is not None
     at = page.locator("#overlay-at")
-    expect(at).to_contain_text("Mean has its maximum")
+    expect(at).to_have_text(
+        re.compile(r"Mean has its maximum at \d+ %: [0-9.]+ N \(SD [0-9.]+ N\)")
+    )
     overlay = walk.running.http.get(f"{walk.url}/stances/overlay").json()
     half = overlay["points"] // 2
     for down in range(0, int(box["height"]), 6):  # from above: some curve is met

@@ -189,11 +189,11 @@ export class StanceOverlay {
     const { answer, chosen, hover } = this;
     const { mean, sd, count } = answer.spread.grf_n;
     const at = hover?.at ?? mean.reduce((best, value, i) => (value > (mean[best] ?? -Infinity) ? i : best), 0);
-    const spread = sd[at] === null ? "" : ` ± ${number(sd[at])}`;
+    const spread = sd[at] === null ? "" : ` (SD ${number(sd[at])} N)`;
     const where = `at ${number(this.percent[at], 0)} %`;
     const text = hover
-      ? `${hover.curve ? `Stance ${hover.curve.number}: ${number(hover.curve.grf_n[at] ?? NaN)} N ${where}; mean` : `Mean ${where}:`} ${number(mean[at] ?? NaN)}${spread} N (n = ${count[at].toLocaleString("en-GB")})`
-      : `Mean has its maximum ${where}: ${number(mean[at] ?? NaN)}${spread} N`;
+      ? `${hover.curve ? `Stance ${hover.curve.number}: ${number(hover.curve.grf_n[at] ?? NaN)} N ${where}; mean` : `Mean ${where}:`} ${number(mean[at] ?? NaN)} N${spread}, n = ${count[at].toLocaleString("en-GB")}`
+      : `Mean has its maximum ${where}: ${number(mean[at] ?? NaN)} N${spread}`;
     setText(byId("overlay-at"), text);
     const items = [["single", "single stances"], ["mean", "mean"]];
     if (answer.overlaid > 1) items.push(["spread", "± 1 SD over stances"]);
