@@ -176,7 +176,7 @@ def test_the_difference_of_two_sessions_has_the_interval_of_a_welch_test(
     compared: Recording, other: Recording, open_page: OpenPage
 ) -> None:
     page = open_page(url_of(compared, **{"with": other.id}))
-    expect(page.locator("#beside-summary")).to_contain_text("each session from its own first frame")
+    expect(page.locator("#beside-summary")).to_contain_text("same first contact")
     expect(page.locator("#beside-summary")).to_contain_text(re.compile(r"\(recorded \d+ s later\)"))
     expect(page.locator("#differences-rows tr")).to_have_count(4)
     head = page.locator("#differences-card thead")
@@ -193,8 +193,11 @@ def test_the_difference_of_two_sessions_has_the_interval_of_a_welch_test(
           const cell = document.querySelector("[data-figure=peak] td:last-child").textContent;
           const moments = (values) => module.momentsOf(stances(values), "peak_grf_n");
           const { mean, half } = module.differenceOf(moments(own), moments(other));
+          const near = [[22.12, 22.14, 22.16], [22.15, 22.17, 22.19]].map(stances);
+          module.drawDifferences(...near, "other");
+          const fine = document.querySelector("[data-figure=peak]").textContent;
           const same = module.differenceOf(moments([9, 9, 9]), moments([8, 8, 8])).half;
-          return { textContent, cell, mean, half, same };
+          return { textContent, cell, mean, half, same, fine };
         })""",
         values,
     )
@@ -203,6 +206,8 @@ def test_the_difference_of_two_sessions_has_the_interval_of_a_welch_test(
     assert found["half"] == pytest.approx((welch.high - welch.low) / 2, rel=0.03)
     assert np.isnan(found["same"]), "no scatter is no certainty"
     assert f"0.8 ± {found['half']:.1f}" in found["textContent"]
+    # 22.1 and 22.2 with a difference of 0.0 contradict each other.
+    assert re.search(r"22\.14 ± 0\.02.*22\.17 ± 0\.02.*0\.03 ± ", found["fine"])
     assert not re.search(r"[0-9]", found["cell"])  # two stances do not bound their scatter
 
 

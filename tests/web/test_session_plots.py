@@ -12,6 +12,7 @@ from playwright.sync_api import Page, expect
 from storage.formats.writers.registry import FORMATS
 from tests.service.recording import Recording
 from tests.service.running import Running
+from tests.waiting import until
 from tests.web.session_page import grf, recorded_walk, seen, settled, summary, url_of
 
 pytestmark = pytest.mark.real_time
@@ -62,13 +63,55 @@ def test_what_is_shown_is_in_the_link_and_comes_back_with_it(
     again = open_page(page.url)
     assert seen(again) == pytest.approx(chosen, abs=1e-3)
     again.mouse.move(box["x"] + 400, box["y"] + 100)
+    again.mouse.wheel(0, 300)
+    until(lambda: again.evaluate("scrollY") > 100)  # the page, and nothing else
+    assert seen(again) == pytest.approx(chosen, abs=1e-3)
+    again.mouse.wheel(0, -600)
+    until(lambda: again.evaluate("scrollY") == 0)
+    again.keyboard.down("Control")
     again.mouse.wheel(0, -300)
+    again.keyboard.up("Control")
     expect(again.locator("#plots")).not_to_have_attribute("data-from", f"{chosen[0]:.4f}")
     closer = seen(again)
     assert chosen[0] < closer[0] < closer[1] < chosen[1]
     again.mouse.dblclick(box["x"] + 400, box["y"] + 100)
     expect(again).not_to_have_url(re.compile("from="))
     assert seen(again) == all_s
+
+
+def test_a_peak_is_written_once_and_the_cursor_leaves_it_legible(
+    walk: Recording, open_page: OpenPage
+) -> None:
+    page = open_page(
+        url_of(walk),
+        first="""const { fillText } = CanvasRenderingContext2D.prototype;
+        window.written = [];
+        CanvasRenderingContext2D.prototype.fillText = function (text, ...place) {
+          window.written.push([this.canvas.id, text, ...place]);
+          fillText.call(this, text, ...place);
+        };""",
+    )
+    settled(page)
+    page.locator("#stances-rows tr").nth(1).click()  # the cursor is at its peak
+    expect(page.locator("#plots")).to_have_attribute("data-whole", "false")
+    settled(page)
+    peak = f"{walk.running.http.get(f'{walk.url}/stances').json()[1]['peak_grf_n']:.1f}"
+    ink = page.evaluate(
+        """(peak) => {
+          const [, , x, y] = window.written.findLast(([, text]) => text === peak);
+          const over = document.getElementById("cursor-canvas");
+          const ratio = over.width / over.clientWidth;
+          const { data, width } = over.getContext("2d")
+            .getImageData((x - 20) * ratio, (y - 40) * ratio, 40 * ratio, 92 * ratio);
+          const inkOf = (fromPx, toPx) => data // from the value's foot
+            .slice(...[fromPx, toPx].map((px) => 4 * width * Math.round((px + 40) * ratio)))
+            .some((value) => value > 0);
+          return { above: inkOf(-40, -28), value: inkOf(-14, 0), below: inkOf(40, 52) };
+        }""",
+        peak,
+    )
+    assert ink == {"above": True, "value": False, "below": True}
+    assert "cursor-canvas" not in page.evaluate("window.written.map(([canvas]) => canvas)")
 
 
 def test_keys_zoom_move_the_cursor_and_show_all(walk: Recording, open_page: OpenPage) -> None:
@@ -113,7 +156,9 @@ def test_whole_stances_lie_one_upon_another_and_a_click_on_one_goes_there(
     box = canvas.bounding_box()
     assert box is not None
     at = page.locator("#overlay-at")
-    expect(at).to_contain_text("Mean has its maximum")
+    expect(at).to_have_text(
+        re.compile(r"Mean has its maximum at \d+ %: [0-9.]+ N \(SD [0-9.]+ N\)")
+    )
     overlay = walk.running.http.get(f"{walk.url}/stances/overlay").json()
     half = overlay["points"] // 2
     for down in range(0, int(box["height"]), 6):  # from above: some curve is met

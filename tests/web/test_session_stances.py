@@ -65,8 +65,8 @@ def stances(hops: Recording) -> list[dict[str, Any]]:
     return found
 
 
-def opened(open_page: OpenPage, session: Recording, **options: Any) -> Page:
-    page = open_page(f"{session.running.url}/sessions/{session.id}", **options)
+def opened(open_page: OpenPage, session: Recording, query: str = "", **options: Any) -> Page:
+    page = open_page(f"{session.running.url}/sessions/{session.id}{query}", **options)
     expect(page.locator("#stance-line")).to_be_visible()
     settled(page)
     return page
@@ -96,12 +96,14 @@ def in_view(page: Page, stance: dict[str, Any], begin_ns: int) -> None:
     assert end_s - begin_s < 2 * stance["duration_s"]
 
 
-def middle_of(page: Page, stance: dict[str, Any], hops: Recording) -> tuple[float, float]:
-    """Where it is in the plots of a narrow screen, which show everything."""
+def middle_of(
+    page: Page, stance: dict[str, Any], hops: Recording, left: float = 40
+) -> tuple[float, float]:
+    """Where it is in the plots, which show everything; `left`: axis, of a narrow screen."""
     page.evaluate("scrollTo(0, 0)")  # the buttons that zoom are below the plots
     box = settled(page).bounding_box()
     duration_s = float(page.locator("#plots").get_attribute("data-to") or "nan")
-    left, right = 40, 12  # axis, and air
+    right = 12  # air
     begin_ns = int(hops.column("t_ns")[0])
     middle_s = (0.5 * (stance["begin_t_ns"] + stance["end_t_ns"]) - begin_ns) * 1e-9
     at = left + (box["width"] - left - right) * middle_s / duration_s
@@ -171,6 +173,13 @@ def test_where_the_plots_are_touched_the_stance_is_said_and_the_next_one_follows
     page.tap("#zoom-all")
     page.touchscreen.tap(*middle_of(page, stances[6], hops))
     says(page, stances[6])
+    # Its force is in the bar at the foot of the screen: that beside the foot is out of sight.
+    expect(page.locator("#replay-force")).to_be_in_viewport(ratio=1)
+    expect(page.locator("#replay-force")).to_have_text(re.compile(r"^, [0-9.]+ ± [0-9.]+ N$"))
+    force_n = float((page.locator("#grf").text_content() or "").strip())
+    assert f" {force_n:.1f} ±" in (page.locator("#replay-force").text_content() or "")
+    expect(page.locator("#replay-frame")).to_be_hidden()
+    assert page.evaluate("document.documentElement.scrollWidth") == PHONE["width"]
     page.tap("#stance-next")
     says(page, stances[7])
 
@@ -198,6 +207,7 @@ def test_a_finger_that_scrolls_the_page_leaves_the_cursor_where_it_was(
     says(page, stances[2])
     page.tap("#zoom-all")
     x, y = middle_of(page, stances[8], hops)
+    cursor_s = page.locator("#readout").get_attribute("data-time-s") or ""
     finger = page.context.new_cdp_session(page)
 
     def touch(kind: str, *points: dict[str, float]) -> None:
@@ -208,7 +218,8 @@ def test_a_finger_that_scrolls_the_page_leaves_the_cursor_where_it_was(
         touch("touchMove", {"x": x, "y": y - up})
     touch("touchEnd")
     until(lambda: page.evaluate("scrollY") > 100)
-    says(page, stances[2])
+    expect(page.locator("#stance-which")).to_contain_text("median")
+    expect(page.locator("#readout")).to_have_attribute("data-time-s", cursor_s)
 
 
 def test_of_a_stance_that_was_not_seen_whole_the_line_says_so(
@@ -228,11 +239,18 @@ def test_of_a_stance_that_was_not_seen_whole_the_line_says_so(
     page.tap("#stance-next")
     expect(page.locator("#stance-text")).to_contain_text("start not recorded")
     row = page.locator("#stances-rows tr").first
-    expect(row.get_by_text("⚠ cut")).to_be_visible()
+    expect(row.get_by_text("⚠ cut at start")).to_be_visible()
+    first = session.running.http.get(f"{session.url}/stances").json()[0]
+    at_least = re.compile(rf"^≥\s{1e3 * first['duration_s']:.0f}\s")  # it began before
+    expect(row.get_by_role("cell").nth(2)).to_have_text(at_least)
+    expect(page.locator("#stance-figures [data-figure=duration] dd")).to_have_text(at_least)
+    for figure in ("peak", "impulse", "travel"):
+        expect(page.locator(f"#stance-figures [data-figure={figure}] dd")).to_contain_text("≥")
     expect(row.locator(".why")).to_have_attribute("title", "start not recorded")
     page.tap("#stance-next")
     expect(page.locator("#stance-which")).to_have_text("Stance 2 of 2")
     expect(page.locator("#stance-flags")).to_be_empty()
+    expect(page.locator("#stance-figures")).not_to_contain_text("≥")
     assert page.evaluate("document.documentElement.scrollWidth") == PHONE["width"]
     assert complaints(page) == []
 
@@ -292,6 +310,38 @@ def test_the_neighbour_is_that_of_the_cursor_or_the_first_in_view(
     })"""
     found = open_page(f"{server.url}/nodes").evaluate(asked)
     assert found == [[2, 1], [0, 1], [0, 2], [2, -1]]  # before it and after it; -1: there is none
+
+
+def test_a_selected_stance_stays_selected_until_all_or_escape_is_pressed(
+    hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
+) -> None:
+    page = opened(open_page, hops)
+    medians = f"{STANCES} stances, median of {STANCES} whole"
+    which = page.locator("#stance-which")
+    box = page.locator("#plots").bounding_box()
+    assert box is not None
+
+    def point(share: float) -> None:
+        """Point there; wait until the values are read."""
+        read = page.locator("#readout").get_attribute("data-time-s") or ""
+        page.mouse.move(box["x"] + share * box["width"], box["y"] + 100)
+        expect(page.locator("#readout")).not_to_have_attribute("data-time-s", read)
+
+    point(0.5)
+    expect(which).to_have_text(medians)  # pointing reads
+    for deselect in (lambda: page.keyboard.press("Escape"), lambda: page.click("#zoom-all")):
+        page.locator("#stances-rows tr").nth(2).click()
+        says(page, stances[2])
+        for share in (0.2, 0.95):  # within it, and in the pause behind it
+            point(share)
+            says(page, stances[2])
+        expect(page).to_have_url(re.compile("&stance=3$"))
+        says(opened(open_page, hops, query="?stance=3"), stances[2])
+        deselect()
+        expect(which).to_have_text(medians)
+        expect(page).not_to_have_url(re.compile("stance="))
+    page.mouse.click(*middle_of(page, stances[6], hops, left=56))
+    says(page, stances[6])
 
 
 def test_a_link_that_was_copied_leads_to_the_same_stance_and_cursor(

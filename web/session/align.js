@@ -3,7 +3,7 @@
 import { offsetAt } from "./clock.js";
 
 /**
- * Return the possible alignments, start first.
+ * Return the possible alignments, the default first: first contact, else start.
  * @param {{beginNs: number, durationS: number, stances: {from: number, begun: boolean}[],
  *   markers: {label: string, timeS: number}[], offset: (tNs: number, ofServer: boolean) => number | null}} own
  * @param {{beginNs: number, durationS: number, stances: {begin_t_ns: number, begun: boolean}[],
@@ -15,7 +15,7 @@ export function alignments(own, other) {
   const mine = own.stances.find((stance) => stance.begun);
   const theirs = other.stances.find((stance) => stance.begun);
   if (mine && theirs) {
-    found.push({
+    found.unshift({
       key: "contact", label: "first contact", meaning: "same first contact",
       shiftS: mine.from - (theirs.begin_t_ns - other.beginNs) * 1e-9,
     });

@@ -26,6 +26,15 @@ export function differenceOf(own, other) {
   return { mean: other.mean - own.mean, half: quantileOf(freedom) * Math.sqrt(a + b) };
 }
 
+/** Return decimals, `least` or more, with which a difference is that of the values as shown. */
+function decimalsFor(own, other, least) {
+  const isTrue = (decimals) => {
+    const shown = (value) => Number(value.toFixed(decimals));
+    return Math.abs(shown(other) - shown(own) - shown(other - own)) < 0.5 * 10 ** -decimals;
+  };
+  return [0, 1, 2].map((more) => least + more).find(isTrue) ?? least + 2;
+}
+
 /** Fill the table with whole stances of this and another session. @param {string} name of the other */
 export function drawDifferences(stances, others, name) {
   const [own, other] = [stances, others].map((all) => all.filter((stance) => stance.is_whole));
@@ -36,9 +45,10 @@ export function drawDifferences(stances, others, name) {
   setText(byId("differences-own"), `This (${own.length}), ±\u00a0sd`);
   setText(byId("differences-other"), `Other (${other.length}), ±\u00a0sd`);
   byId("differences-rows").replaceChildren(...FIGURES.map(({ key, label, value, unit, factor, decimals }) => {
-    const text = (mean, spread) => (Number.isFinite(mean) ? `${number(mean * factor, decimals)}${Number.isFinite(spread) ? ` ± ${number(spread * factor, decimals)}` : ""}` : "–");
     const both = [own, other].map((all) => momentsOf(all, value));
     const difference = differenceOf(both[0], both[1]);
+    const places = difference ? decimalsFor(both[0].mean * factor, both[1].mean * factor, decimals) : decimals;
+    const text = (mean, spread) => (Number.isFinite(mean) ? `${number(mean * factor, places)}${Number.isFinite(spread) ? ` ± ${number(spread * factor, places)}` : ""}` : "–");
     return el("tr", { "data-figure": key }, el("th", { scope: "row", text: `${label}, ${unit}` }),
       ...both.map(({ mean, variance }) => el("td", { text: text(mean, Math.sqrt(variance)) })),
       el("td", { text: difference ? text(difference.mean, difference.half) : "–" }));

@@ -10,6 +10,7 @@ const WHEEL_STEP = 0.0018;
 /**
  * @typedef {object} GestureActions
  * @property {(px: number, hovering?: boolean) => void} point move the cursor
+ * @property {(px: number) => void} tap move the cursor and select what is there
  * @property {(fromPx: number, toPx: number) => void} choosing a range is being selected
  * @property {(fromPx: number, toPx: number) => void} choose select the range; equal: cancel
  * @property {(factor: number, px: number) => void} zoom
@@ -91,6 +92,7 @@ export function bindGestures(box, actions) {
       if (!down.size) pinch = null; // the remaining finger is no cursor
       return;
     }
+    const still = fromPx !== null || touchedPx !== null; // neither panned nor moved the cursor
     const dragged = fromPx !== null && Math.abs(px - fromPx) > CLICK_PX;
     if (fromPx !== null) actions.choose(fromPx, dragged && event.type === "pointerup" ? px : fromPx);
     fromPx = null;
@@ -98,18 +100,18 @@ export function bindGestures(box, actions) {
     const twice = event.timeStamp - lastTap.atMs < DOUBLE_MS && Math.abs(px - lastTap.px) < 24;
     lastTap = { atMs: twice ? -Infinity : event.timeStamp, px };
     if (twice) actions.all();
+    else if (still) actions.tap(px);
     else actions.point(px);
   };
   box.addEventListener("pointerup", up);
   box.addEventListener("pointercancel", up);
 
   box.addEventListener("wheel", (event) => {
-    if (event.ctrlKey || Math.abs(event.deltaY) >= Math.abs(event.deltaX)) {
+    if (event.ctrlKey || event.metaKey) { // a trackpad's pinch has ctrlKey
       const lines = event.deltaMode === WheelEvent.DOM_DELTA_LINE ? 30 : 1;
-      // Whole session visible: the wheel scrolls the page.
-      if (event.deltaY > 0 && box.dataset.whole === "true" && !event.ctrlKey) return;
       actions.zoom(Math.exp(event.deltaY * lines * WHEEL_STEP), place(event));
-    } else actions.move(event.deltaX);
+    } else if (Math.abs(event.deltaX) > Math.abs(event.deltaY)) actions.move(event.deltaX);
+    else return; // scrolls the page
     event.preventDefault();
   }, { passive: false });
 

@@ -47,14 +47,16 @@ export function drawStances(plots, context, view, x, bottom, current) {
 }
 
 /**
- * Draw a triangle at the peak of each stance, with its value if there is room.
+ * Draw a triangle at the peak of each stance, with its value if there is room; return the boxes they fill.
  * @param {Plots} plots @param {{left: number, right: number, top: number}} box @param {(value: number) => number} y
+ * @returns {{left: number, right: number, top: number, bottom: number}[]}
  */
 export function drawPeaks(plots, context, view, x, box, y) {
   const { colours } = plots;
   context.textAlign = "center";
   context.textBaseline = "bottom";
   context.lineJoin = "round";
+  const filled = [];
   for (const { from, to, peakS, peak_grf_n: peak } of plots.stances) {
     if (peakS === null || peakS < view.from || peakS > view.to) continue;
     const [at, tip] = [x(peakS), y(peak) - 2];
@@ -66,13 +68,16 @@ export function drawPeaks(plots, context, view, x, box, y) {
     context.fill();
     const text = number(peak);
     const width = context.measureText(text).width;
+    filled.push({ left: at - 5, right: at + 5, top: tip - 7, bottom: tip });
     if (x(to) - x(from) < width + 4) continue;
     const middle = Math.min(box.right - width / 2, Math.max(box.left + width / 2, at));
     context.lineWidth = 3;
     context.strokeStyle = colours.page;
     context.strokeText(text, middle, tip - 6);
     context.fillText(text, middle, tip - 6);
+    filled.push({ left: middle - width / 2 - 2, right: middle + width / 2 + 2, top: tip - 22, bottom: tip - 6 });
   }
+  return filled;
 }
 
 /** @param {Plots} plots */

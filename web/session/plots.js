@@ -40,6 +40,7 @@ export class Plots {
     this.name = ""; // of the session, with an overlay
     this.asHeat = null;
     this.heat = null; // range of the colours
+    this.peaks = []; // boxes of the peaks' signs and values
     this.flags = []; // positions of the markers' flags
     this.panels = [];
     /** @type {Record<string, string> | null} */
@@ -118,16 +119,12 @@ export class Plots {
       return { panel, box, y: this.drawPanel(context, panel, box, view, x, scales.get(panel.group ?? panel.key)) };
     });
     this.drawFlags(context, view, x);
-    this.drawPeaks(context, view, x);
+    const force = this.drawn.find(({ panel }) => panel.key === "grf");
+    this.peaks = force ? drawPeaks(this, context, view, x, force.box, force.y) : [];
     drawTime(this, context, view, x, bottom);
     drawMarkers(this, context, view, x, bottom);
     setData(this.box, "framesInBin", String(this.best(view).framesInBin));
     setData(this.box, "kinds", this.shownKinds.map(({ key }) => key).join(" "));
-  }
-
-  drawPeaks(context, view, x) {
-    const force = this.drawn.find(({ panel }) => panel.key === "grf");
-    if (force) drawPeaks(this, context, view, x, force.box, force.y);
   }
 
   drawPanel(context, panel, box, view, x, scale) {
@@ -289,7 +286,8 @@ export class Plots {
     context.moveTo(x(timeS), HEAD_PX - 6);
     context.lineTo(x(timeS), bottom + 5);
     context.stroke();
-    this.drawPeaks(context, view, x); // again, as the line hides them
+    // The line has a gap at a peak and its value: it would hide them.
+    for (const { left, right, top, bottom: foot } of this.peaks) context.clearRect(left, top, right - left, foot - top);
     if (i < 0) return;
     for (const { panel, y } of this.drawn) {
       const value = y && bins.columns[panel.columns[1]]?.[i];

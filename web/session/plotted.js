@@ -18,7 +18,7 @@ import { savePicture } from "./picture.js";
 import { Plots } from "./plots.js";
 import { Readout, drawSummary } from "./readout.js";
 import { Replay } from "./replay.js";
-import { Stances, withSeconds } from "./stances.js";
+import { Stances, stanceAt, withSeconds } from "./stances.js";
 import * as views from "./view.js";
 
 const KEY_ZOOM = 1.5;
@@ -39,7 +39,7 @@ export class Plotted {
     this.other = null; // session of the overlay
     this.readout = new Readout();
     this.numbers = new Numbers(session.id);
-    this.stances = new Stances((index) => { this.goTo(index); this.stances.bringIntoView(); });
+    this.stances = new Stances((index) => { this.goTo(index); this.stances.bringIntoView(); }, views.stanceFromLink(location.search));
     this.markers = new Markers(session.id, {
       go: (timeS) => this.goToMarker(timeS), cursor: () => this.cursorS,
       changed: () => { this.plots.markers = this.markers.placed; this.draw(); },
@@ -153,6 +153,7 @@ export class Plotted {
     const scale = () => (this.view.to - this.view.from) / plots.plotWidth;
     bindGestures(byId("plots"), {
       point: (px, hovering = false) => { if (!hovering || !this.replay.playing.going) this.point(time(px)); },
+      tap: (px) => { this.selectStance(stanceAt(plots.stances, time(px))); this.point(time(px)); },
       grab: (px, py) => { const id = flagAt(plots, px, py); return id !== null && isOperator() && this.markers.grab(id); },
       drag: (px) => this.markers.drag(time(px)),
       drop: (px) => this.markers.drop(px === null ? null : time(px)),
@@ -204,19 +205,34 @@ export class Plotted {
     this.linking = setTimeout(() => this.updateUrl(), SETTLED_MS);
   }
 
-  /** Write range and cursor to the URL. */
+  /** Write range, cursor and selected stance to the URL. */
   updateUrl() {
     clearTimeout(this.linking);
-    history.replaceState(null, "", location.pathname + views.toLink(this.view, this.durationS, location.search, this.cursorS));
+    history.replaceState(null, "", location.pathname + views.toLink(this.view, this.durationS, location.search, this.cursorS, this.stances.selected));
   }
 
   copyLink() {
     this.updateUrl();
     const copied = copyText(location.href);
-    notice(copied ? "Link copied (range, stance, cursor)." : `copying is blocked. Link: ${location.href}`, { bad: !copied });
+    notice(copied ? "Link copied (range, cursor, selected stance)." : `copying is blocked. Link: ${location.href}`, { bad: !copied });
   }
 
-  showAll() { this.show(views.whole(this.durationS)); }
+  showAll() {
+    this.deselect();
+    this.show(views.whole(this.durationS));
+  }
+
+  /** Select a stance until another is selected; -1: none is there, the selected one stays. */
+  selectStance(index) {
+    if (index < 0) return;
+    this.stances.selected = this.plots.stances[index].number;
+  }
+
+  deselect() {
+    this.stances.selected = null;
+    this.updateUrlSoon();
+    this.draw();
+  }
 
   /** Zoom about the cursor, if visible. */
   zoom(factor) {
@@ -249,7 +265,7 @@ export class Plotted {
 
   goTo(index) {
     const stance = this.plots.stances[index];
-    this.overlay?.choose(index);
+    this.selectStance(index);
     this.cursorS = stance.peakS ?? stance.from;
     this.show(views.around(stance.from, stance.to, this.durationS));
   }
@@ -272,6 +288,7 @@ export class Plotted {
     const acts = {
       "+": () => this.zoom(1 / KEY_ZOOM), "=": () => this.zoom(1 / KEY_ZOOM), "-": () => this.zoom(KEY_ZOOM),
       "[": () => this.step(-1), "]": () => this.step(1),
+      Escape: () => this.deselect(),
       ArrowLeft: () => this.replay.walk(-1, event.shiftKey), ArrowRight: () => this.replay.walk(1, event.shiftKey),
     };
     if (!onButton) acts[" "] = () => this.replay.toggle();
@@ -312,8 +329,8 @@ export class Plotted {
     box.dataset.whole = String(views.isWhole(view, this.durationS));
     box.dataset.from = view.from.toFixed(4);
     box.dataset.to = view.to.toFixed(4);
-    this.stances.follow(this.cursorS, this.replay.playing.going);
-    this.overlay?.follow(this.replay.playing.going ? -1 : this.stances.current);
+    this.stances.draw();
+    this.overlay?.choose(this.stances.current);
     const drawnKey = [view.from, view.to, plots.width, plots.whole, plots.detail, this.markers.version, plots.stances.length, plots.asHeat,
       this.stances.current, plots.colours, devicePixelRatio];
     if (drawnKey.some((one, i) => one !== this.drawnKey?.[i])) {

@@ -13,6 +13,12 @@ const AHEAD_S = 1.5; // prefetch, in time of the display
 const SPEED_TEXTS = { 0.1: "0.1×", 0.25: "0.25×", 1: "1×", 4: "4×" };
 const JUMP_S = 0.1;
 
+/** Return the GRF of a frame with its 95 % interval, such as "22.1 ± 0.3 N". */
+function forceText({ grf_n: grf, grf_sigma_n: sigma, grf_lower_bound_n: bound }) {
+  if (Number.isFinite(grf)) return `${number(grf)}${Number.isFinite(sigma) ? ` ± ${number(1.96 * sigma)}` : ""} N`;
+  return bound > 0 ? `≥ ${number(Math.floor(bound * 10) / 10)} N` : "force unknown";
+}
+
 /** Foot at the cursor, and the player. */
 export class Replay {
   /**
@@ -117,7 +123,9 @@ export class Replay {
     setData(panel, "none", String(!frame));
     setData(panel, "timeS", frame ? String(frame.timeS) : "");
     setData(panel, "seq", frame ? String(frame.seq) : "");
-    setText(byId("replay-at"), frame ? `${timeText(frame.timeS, 0.001)}, frame ${frame.seq.toLocaleString("en-GB")}` : "No frame here");
+    setText(byId("replay-time"), frame ? timeText(frame.timeS, 0.001) : "No frame here");
+    setText(byId("replay-force"), frame && samples.whole.estimated ? `, ${forceText(frame)}` : "");
+    setText(byId("replay-frame"), frame ? `, frame ${frame.seq.toLocaleString("en-GB")}` : "");
     if (!this.node) return;
     this.foot.draw(this.node, frame);
     this.bars.draw(this.node, frame, performance.now());

@@ -10,7 +10,6 @@ import { CopPaths } from "./cop_paths.js";
 const HIT_PX = 18;
 const FRAMES_MAX = 4000; // of the selected stance; a longer one is binned
 const HEIGHT_PX = 320;
-const RESTS_MS = 250; // of the cursor, before its stance is loaded
 
 /** @typedef {{number: number, grf_n: (number | null)[], cop_x_m: (number | null)[], cop_y_m: (number | null)[]}} Curve */
 
@@ -26,7 +25,6 @@ export class StanceOverlay {
     this.stances = stances;
     this.onGo = onGo;
     this.canvas = byId("overlay-canvas", HTMLCanvasElement);
-    this.resting = 0;
     this.other = null; // other session
     this.beside = null; // its mean and spread
     this.chosen = null; // selected stance and its frames
@@ -98,19 +96,13 @@ export class StanceOverlay {
     if (index >= 0) this.onGo(index);
   }
 
-  /** Select the stance at the cursor once it rests; -1: none. */
-  follow(index) {
-    clearTimeout(this.resting);
-    if (index < 0 || this.stances[index].number === this.chosen?.number) return;
-    this.resting = setTimeout(() => this.choose(index), RESTS_MS);
-  }
-
-  /** Select a stance: drawn frame by frame over all others. */
+  /** Select a stance: drawn frame by frame over all others; -1: none. */
   async choose(index) {
     const stance = this.stances[index];
-    this.chosen = { number: stance.number, whole: stance.is_whole, bins: null };
+    if (stance?.number === this.chosen?.number) return;
+    const chosen = this.chosen = stance ? { number: stance.number, whole: stance.is_whole, bins: null } : null;
     this.draw();
-    const { chosen } = this;
+    if (!chosen) return;
     try {
       const answer = await api.overview(this.id, {
         points: FRAMES_MAX, start_s: Math.max(0, stance.from - 1e-7), end_s: stance.to + 1e-6, columns: "grf_n,cop_x_m,cop_y_m",
@@ -197,11 +189,11 @@ export class StanceOverlay {
     const { answer, chosen, hover } = this;
     const { mean, sd, count } = answer.spread.grf_n;
     const at = hover?.at ?? mean.reduce((best, value, i) => (value > (mean[best] ?? -Infinity) ? i : best), 0);
-    const spread = sd[at] === null ? "" : ` ± ${number(sd[at])}`;
+    const spread = sd[at] === null ? "" : ` (SD ${number(sd[at])} N)`;
     const where = `at ${number(this.percent[at], 0)} %`;
     const text = hover
-      ? `${hover.curve ? `Stance ${hover.curve.number}: ${number(hover.curve.grf_n[at] ?? NaN)} N ${where}; mean` : `Mean ${where}:`} ${number(mean[at] ?? NaN)}${spread} N (n = ${count[at].toLocaleString("en-GB")})`
-      : `Mean has its maximum ${where}: ${number(mean[at] ?? NaN)}${spread} N`;
+      ? `${hover.curve ? `Stance ${hover.curve.number}: ${number(hover.curve.grf_n[at] ?? NaN)} N ${where}; mean` : `Mean ${where}:`} ${number(mean[at] ?? NaN)} N${spread}, n = ${count[at].toLocaleString("en-GB")}`
+      : `Mean has its maximum ${where}: ${number(mean[at] ?? NaN)} N${spread}`;
     setText(byId("overlay-at"), text);
     const items = [["single", "single stances"], ["mean", "mean"]];
     if (answer.overlaid > 1) items.push(["spread", "± 1 SD over stances"]);

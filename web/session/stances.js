@@ -1,4 +1,4 @@
-// Stances: table, and figures of the one at the cursor.
+// Stances: table, and figures of the selected one.
 
 import { byId, el, number, setData, setText } from "../common/text.js";
 import { estimateTexts } from "./flags.js";
@@ -17,7 +17,9 @@ export function withSeconds(stances, beginNs) {
   }));
 }
 
-/** Return the faults of a stance as text. */
+const isCut = (stance) => stance.begun === false || stance.ended === false;
+
+/** Return the faults of a stance as texts. */
 function flagsOf(stance) {
   const texts = estimateTexts(stance.estimate_flags & ORDINARY);
   if (!stance.begun) texts.push("start not recorded");
@@ -25,15 +27,17 @@ function flagsOf(stance) {
   if (stance.begun && stance.ended && stance.duration_sigma_s === null) texts.push("touchdown or lift-off not sampled: contact time has no interval");
   if (stance.missing_frames) texts.push(`${stance.missing_frames} frames missing`);
   if (stance.unknown_frames) texts.push(`${stance.unknown_frames} frames without a GRF`);
-  return texts.join(", ");
+  return texts;
 }
 
-/** Make the sign of a stance's faults: one word in the table; all of them in its title and to screen readers. */
+/** Make the sign of a stance's faults: the worst in a few words; all of them in its title and to screen readers. */
 function faultSign(stance) {
-  const text = flagsOf(stance);
-  if (!text) return "";
-  const word = !stance.begun || !stance.ended ? " cut" : stance.missing_frames || stance.unknown_frames ? " gaps" : "";
-  return el("small", { cls: "why", title: text }, el("span", { "aria-hidden": "true", text: `⚠${word}` }), el("span", { cls: "unseen", text }));
+  const texts = flagsOf(stance);
+  if (!texts.length) return "";
+  const ends = [stance.begun ? "" : "start", stance.ended ? "" : "end"].filter(Boolean).join(" and ");
+  const words = ends ? `cut at ${ends}` : stance.missing_frames || stance.unknown_frames ? "gaps" : texts[0].split(/:| \(/)[0];
+  const text = texts.join(", ");
+  return el("small", { cls: "why", title: text }, el("span", { "aria-hidden": "true", text: `⚠ ${words}` }), el("span", { cls: "unseen", text }));
 }
 
 /** Return the index of the stance at an instant; -1: none. Stances are sorted by time. */
@@ -59,11 +63,11 @@ export const FIGURES = [
   { key: "travel", label: "COP travel", value: "cop_x_range_m", sigma: "cop_x_range_sigma_m", unit: "mm", factor: 1e3, decimals: 1 },
 ];
 
-/** Return value and half width of the 95 % interval, such as "25.6" and "± 1.0". */
+/** Return value and half width of the 95 % interval, such as "25.6" and "± 1.0"; "≥ 25.6" of a part of a stance. */
 function figureOf(stance, { value, sigma, factor, decimals }) {
   const [of, sigmaOf] = [stance[value] ?? null, stance[sigma] ?? null];
   return [
-    of === null ? "–" : number(of * factor, decimals),
+    of === null ? "–" : `${isCut(stance) ? "≥\u00a0" : ""}${number(of * factor, decimals)}`,
     of === null || sigmaOf === null ? "" : `±\u00a0${number(Z95 * sigmaOf * factor, decimals)}`,
   ];
 }
@@ -80,22 +84,26 @@ export function medianOf(stances) {
 
 /** Table of stances. */
 export class Stances {
-  /** @param {(index: number) => void} onGo */
-  constructor(onGo) {
+  /** @param {(index: number) => void} onGo @param {number | null} selected number of a stance; null: none */
+  constructor(onGo, selected = null) {
     this.onGo = onGo;
+    this.selected = selected;
     this.body = byId("stances-rows");
     this.stances = [];
-    this.current = -1;
+    this.drawn = -1; // index of the highlighted row
     this.line = byId("stance-text");
     this.figures = new Map(FIGURES.map(({ key }) => [key, el("dd")]));
     byId("stance-figures").replaceChildren(...FIGURES.map(({ key, label }) => el("div", { "data-figure": key }, el("dt", { text: label }), this.figures.get(key))));
     byId("stances-more").addEventListener("click", () => this.add());
   }
 
+  /** Return the index of the selected stance; -1: none. */
+  get current() { return this.stances.findIndex((stance) => stance.number === this.selected); }
+
   show(stances) {
     this.stances = stances;
     this.body.replaceChildren();
-    this.current = -1;
+    this.drawn = -1;
     for (const id of ["stances-card", "stance-line"]) byId(id).hidden = !stances.length;
     this.add();
   }
@@ -120,16 +128,17 @@ export class Stances {
   }
 
   step(by, cursorS, view) {
-    const next = neighbour(this.stances, by, cursorS, view);
+    const { current } = this;
+    const next = current >= 0 ? current + by : neighbour(this.stances, by, cursorS, view);
     if (next in this.stances) this.onGo(next);
   }
 
-  /** Show the stance at the cursor, and highlight it in the table. */
-  follow(timeS, isPlaying) {
-    const index = stanceAt(this.stances, timeS);
-    this.showFigures(this.stances[index], isPlaying);
-    if (index === this.current) return;
-    this.current = index;
+  /** Show the selected stance, and highlight it in the table. */
+  draw() {
+    const index = this.current;
+    this.showFigures(this.stances[index]);
+    if (index === this.drawn) return;
+    this.drawn = index;
     while (index >= this.body.children.length) this.add();
     for (const row of this.body.querySelectorAll("[aria-current]")) row.removeAttribute("aria-current");
     const row = /** @type {HTMLElement | undefined} */ (this.body.children[index]);
@@ -142,8 +151,7 @@ export class Stances {
     else if (bottom > box.scrollTop + box.clientHeight) box.scrollTop = bottom - box.clientHeight;
   }
 
-  showFigures(stance, isPlaying) {
-    this.line.setAttribute("aria-live", isPlaying ? "off" : "polite"); // too fast for a screen reader
+  showFigures(stance) {
     const many = this.stances.length.toLocaleString("en-GB");
     const whole = this.stances.filter((one) => one.is_whole);
     const all = `${many} stance${many === "1" ? "" : "s"}`;
@@ -154,7 +162,7 @@ export class Stances {
       const [value, interval] = figureOf(shown, figure);
       setText(this.figures.get(figure.key), [value, interval && `${interval}`, figure.unit].filter(Boolean).join("\u00a0"));
     }
-    setText(byId("stance-flags"), stance ? flagsOf(stance) : "");
+    setText(byId("stance-flags"), stance ? flagsOf(stance).join(", ") : "");
     setData(this.line, "stance", stance ? String(stance.number) : "");
   }
 

@@ -49,20 +49,22 @@ export function cursorFromLink(search, durationS) {
   return timeS >= 0 && timeS <= durationS ? timeS : null;
 }
 
-/**
- * Return the query of a view, such as "?from=1.25&to=2.5&at=1.5"; other fields of `search` stay.
- * The selected stance is the one at the cursor.
- */
-export function toLink(view, durationS, search = "", cursorS = null) {
+/** Return the number of the selected stance of a URL; null: none. */
+export function stanceFromLink(search) {
+  const number = Number(new URLSearchParams(search).get("stance"));
+  return Number.isInteger(number) && number > 0 ? number : null;
+}
+
+/** Return the query of a view, such as "?from=1.25&to=2.5&at=1.5&stance=3"; other fields of `search` stay. */
+export function toLink(view, durationS, search = "", cursorS = null, stance = null) {
   const fields = new URLSearchParams(search);
-  fields.delete("from");
-  fields.delete("to");
-  fields.delete("at");
+  for (const name of ["from", "to", "at", "stance"]) fields.delete(name);
   const text = (value) => String(Number(value.toFixed(4)));
   if (!isWhole(view, durationS)) {
     fields.set("from", text(view.from));
     fields.set("to", text(view.to));
   }
   if (cursorS !== null) fields.set("at", text(cursorS));
+  if (stance !== null) fields.set("stance", String(stance));
   return String(fields) && `?${fields}`;
 }
