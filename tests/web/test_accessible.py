@@ -110,6 +110,6 @@ def test_dialogs_and_refusals(scripted: Scripted, open_page: OpenPage, dialog: s
         page.evaluate("import('/static/common/login.js').then((login) => void login.askToLogIn())")
     else:
         page.keyboard.press("m")
-        page.click("#stop", force=True)
+        page.keyboard.press("s")
     time.sleep(0.3)
     assert complaints(page) == []

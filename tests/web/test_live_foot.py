@@ -215,7 +215,7 @@ def test_the_first_screen_of_a_phone_has_what_matters(
             assert bottom_of(page, "#bars") <= bar["y"]
         rows = {
             round(top_of(page, f"#{name}"))
-            for name in ("tare", "record", "stop", "marker", "fields")
+            for name in ("tare", "record", "undo", "marker", "fields")
         }
         assert len(rows) == 1
         expect(page.locator("#session-name")).to_be_hidden()
