@@ -79,11 +79,17 @@ def test_a_deleted_session_can_be_had_back_at_once_or_from_the_trash_until_it_is
 ) -> None:
     session = scripted.recorded("walk")
     page = open_page(f"{scripted.url}/sessions")
+    other = open_page(f"{scripted.url}/sessions")
     row = row_of(page, session)
     choose(page, row, "Delete")
     expect(row).to_have_count(0)
+    legends = [one.locator("#trash-legend") for one in (page, other)]
+    for legend in legends:
+        expect(legend).to_have_text("1 session, can be restored")
     page.locator("#notices").get_by_role("button", name="Undo").click()
     expect(row).to_have_count(1)
+    for legend in legends:
+        expect(legend).to_have_text("empty")
     choose(page, row, "Delete")
     expect(row).to_have_count(0)
     page.locator("#trash-card summary").click()
