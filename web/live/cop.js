@@ -10,7 +10,6 @@ const MM = 1000;
 const TRAIL_S = 2;
 const PARTS = 8; // of the trail, older ones paler
 const GAP_S = 0.25; // longer gaps interrupt the trail
-const TRAIL_EVERY_S = 0.06; // costly, and its new end is next to the symbol
 
 /** COP symbol, uncertainty and trail. */
 export class Cop {
@@ -28,19 +27,18 @@ export class Cop {
     this.trail = Array.from({ length: PARTS }, (_, i) => svg("path", { class: "cop-trail", opacity: ((i + 1) / PARTS).toFixed(2) }));
     if (!layout.plan) this.trail.forEach((part) => part.classList.add("on-sole"));
     this.parts = [...this.trail, this.halo, this.area, this.span, this.symbol];
-    this.trailS = -Infinity; // time of the trail as drawn
   }
 
-  draw(node, frame, writesText) {
+  draw(node, frame) {
     const note = byId("cop");
     const at = this.layout.copPlace(frame?.cop_x_m, frame?.cop_y_m);
     const shown = at !== null;
-    this.updateTrail(frame, writesText);
+    this.updateTrail(frame);
     for (const part of [this.symbol, this.halo, this.span, this.area]) place(part, { visibility: shown ? "visible" : "hidden" });
     const sigma = frame?.cop_sigma_x_m ?? null;
     setData(note, "xM", shown ? at.x.toFixed(6) : "");
     setData(note, "sigmaM", shown && sigma !== null ? sigma.toFixed(6) : "");
-    if (writesText) setText(note, shown ? this.text(frame) : `No COP: ${whyNoCop(node, frame, this.layout)}${frame?.contact === false ? this.lastText() : ""}`);
+    setText(note, shown ? this.text(frame) : `No COP: ${whyNoCop(node, frame, this.layout)}${frame?.contact === false ? this.lastText() : ""}`);
     if (!shown) return;
     if (this.layout.plan) this.drawPlan(frame, at);
     else this.drawSide(frame, at);
@@ -92,7 +90,7 @@ export class Cop {
   }
 
   /** Extend the trail, by the time stamps of the frames: replay has one, too. */
-  updateTrail(frame, writesText) {
+  updateTrail(frame) {
     const { past, layout } = this;
     const nowS = timeOf(frame);
     if (nowS === null) past.length = 0;
@@ -102,8 +100,6 @@ export class Cop {
       while (past[0].timeS < nowS - TRAIL_S) past.shift();
     }
     setData(layout.plan ? this.area : this.span, "trail", String(past.length));
-    if (!writesText && nowS !== null && Math.abs(nowS - this.trailS) < TRAIL_EVERY_S) return;
-    this.trailS = nowS;
     const paths = Array.from({ length: PARTS }, () => []);
     past.forEach((one, i) => {
       const before = past[i - 1];

@@ -115,19 +115,19 @@ export class Foot {
     return { group, dome, arrow, number: this.grid && cell >= NUMBERS_FROM_PX ? label : null, name: label };
   }
 
-  /** Draw a frame; `writesText`: write the numbers, too. */
-  draw(node, frame, writesText = true) {
+  /** Draw a frame and write its numbers. */
+  draw(node, frame) {
     this.fit(node);
     this.range.update(node, frame, performance.now());
     const fullScale = this.range.foot;
     setText(this.top, `${number(fullScale, fullScale < 10 && fullScale % 1 ? 1 : 0)} N`);
     this.turn(node, frame);
-    if (writesText) this.writeAngle(node, frame);
-    this.symbols.forEach((symbol, i) => this.drawTile(symbol, i, readTile(node, i, frame, "N"), fullScale, writesText));
-    this.cop.draw(node, frame, writesText);
+    this.writeAngle(node, frame);
+    this.symbols.forEach((symbol, i) => this.drawTile(symbol, i, readTile(node, i, frame, "N"), fullScale));
+    this.cop.draw(node, frame);
   }
 
-  drawTile({ group, dome, arrow, number: label, name }, i, reading, fullScale, writesText) {
+  drawTile({ group, dome, arrow, number: label, name }, i, reading, fullScale) {
     const fault = FAULT_STATES.has(reading.state);
     setData(group, "state", fault ? "fault" : reading.state);
     const known = reading.value !== null && !this.tiles[i].reference;
@@ -135,7 +135,7 @@ export class Foot {
     const { fill, ink } = known ? shadeOf(this.shades, share) : { fill: "none", ink: "" };
     place(dome, { fill });
     place(name, { fill: known ? ink : "currentColor" });
-    if (label && writesText) setText(label, known ? number(reading.value, 0) : reading.bound ? `≥${reading.bound}` : "");
+    if (label) setText(label, known ? number(reading.value, 0) : reading.bound ? `≥${reading.bound}` : "");
     if (!this.plan) this.drawArrow(arrow, i, Math.min(1, share));
   }
 
