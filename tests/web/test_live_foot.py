@@ -205,11 +205,13 @@ def test_the_first_screen_of_a_phone_has_what_matters(
         trouble = [f"trouble {i} that is long enough for two lines of a phone" for i in range(9)]
         tell(scripted, *trouble)
         expect(page.locator("#notes-more")).to_have_text("8 more")
+        expect(page.locator("#tared")).to_have_text(re.compile("^Tared .+ ago$"))
+        expect(page.locator("#fields")).to_have_text("Names …")
         bar = page.locator("#actions").bounding_box()
         assert bar is not None
         assert bar["height"] < 110  # a line of what is recorded, and the buttons
         assert bar["y"] + bar["height"] <= height
-        for part in ("#notes-box", "#grf", "#trace", "#foot", "#record"):
+        for part in ("#notes-box", "#grf", "#tared", "#trace", "#foot", "#record"):
             assert bottom_of(page, part) <= height, part
         if height == 844:
             assert bottom_of(page, "#bars") <= bar["y"]
