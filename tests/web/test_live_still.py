@@ -55,6 +55,9 @@ def test_warnings_pauses_messages_and_recordings_leave_everything_where_it_is(
         assert places(page) == before
         page.keyboard.press("p")
         expect(page.locator("#paused")).to_be_visible()
+        expect(page.locator("#notes")).to_be_in_viewport()
+        paused = page.evaluate("document.querySelector('#paused').getBoundingClientRect().top")
+        assert paused >= places(page)["trace-card"]["top"]  # over no warning
         assert places(page) == before
         page.keyboard.press("p")
         scripted.node.record(name="by another one")
