@@ -46,8 +46,10 @@ export class Cop {
 
   /** Return the position as text. */
   text({ cop_x_m: x = null, cop_y_m: y = null, cop_sigma_x_m: sigmaX = null, cop_sigma_y_m: sigmaY = null }) {
-    const across = this.layout.plan ? `, ${coordinateText("y", y, sigmaY)}` : "";
-    return `COP ${coordinateText("x", x, sigmaX)}${across} (95 %)`;
+    const all = [["x", x, sigmaX], ...(this.layout.plan ? [["y", y, sigmaY]] : [])];
+    const measured = all.filter(([, value]) => value !== null).map(([name, value, sigma]) => coordinateText(name, value, sigma));
+    const others = all.filter(([, value]) => value === null).map(([name]) => `, ${name} not measured`);
+    return `COP ${measured.join(", ")} (95\u00a0%)${others.join("")}`;
   }
 
   /** Return the last position before flight as text. */
@@ -120,7 +122,7 @@ export class Cop {
 
 const timeOf = (frame) => (!frame ? null : Number.isFinite(frame.t_ns) ? frame.t_ns / 1e9 : frame.timeS ?? null);
 
-const coordinateText = (name, value, sigma) => value === null ? `${name} not measured` : `${name} ${number(value * MM)}${sigma === null ? "" : ` ± ${number(Z95 * sigma * MM)}`} mm`;
+const coordinateText = (name, value, sigma) => `${name} ${number(value * MM)}${sigma === null ? "" : ` ± ${number(Z95 * sigma * MM)}`} mm`;
 
 /** Return a dot and four strokes around an ellipse. */
 const hairs = (x, y, rx, ry) => `M${x} ${y}h.1M${x - rx - 14} ${y}h10M${x + rx + 4} ${y}h10M${x} ${y - ry - 14}v10M${x} ${y + ry + 4}v10`;
@@ -134,6 +136,6 @@ function whyNoCop(node, frame, { row }) {
   if (bits & (ESTIMATE.TILE_MISSING | ESTIMATE.SATURATED)) return whyNot(node, frame);
   if (frame.contact === false) return "no contact";
   if (bits & ESTIMATE.COP_MASKED) return "too uncertain";
-  if (row.x !== null && row.y !== null) return "not measured: all tiles at one point";
+  if (row.x !== null && row.y !== null) return "all tiles at one place";
   return "not determined";
 }
