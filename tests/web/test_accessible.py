@@ -71,6 +71,7 @@ def test_live_recording_and_marked(
         page.keyboard.press("p")
         expect(page.locator("#paused")).to_be_visible()
         expect(page.locator("#tares li")).not_to_have_count(0)
+        expect(page.locator("#tares li").first).to_be_in_viewport()
         assert complaints(page) == []
 
 
