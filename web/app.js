@@ -26,7 +26,7 @@ import { History } from "./live/history.js";
 import { LastSession } from "./live/last_session.js";
 import { MarkerQueue } from "./live/markers.js";
 import { Notes } from "./live/notes.js";
-import { Pace, TextPace } from "./live/pace.js";
+import { FramePace, Pace } from "./live/pace.js";
 import { Pause } from "./live/pause.js";
 import { Range } from "./live/range.js";
 import { Status } from "./live/status.js";
@@ -51,11 +51,11 @@ const state = {
 };
 
 inSunlight();
-const textPace = new TextPace();
+const framePace = new FramePace();
 const pace = new Pace(draw);
 const redraw = () => {
   state.fresh = true;
-  textPace.reset();
+  framePace.reset();
   pace.request();
 };
 const range = new Range(byId("range"), redraw);
@@ -251,12 +251,12 @@ function draw() {
   if (!node) return;
   const nowMs = performance.now();
   const { frame, nowMs: shownMs } = pause.held ?? { frame: state.frame, nowMs };
-  const writesText = textPace.isDue(node, frame, nowMs);
-  if (state.fresh || writesText) {
-    state.fresh = false;
-    if (!tileTraces.shown) bars.draw(node, frame, shownMs, writesText);
-    foot.draw(node, frame, writesText);
-    if (writesText) drawGrf(node, frame);
+  const isDue = framePace.isDue(node, frame, nowMs);
+  if (isDue || pause.held) state.fresh = false;
+  if (isDue) { // numbers and pictures of one frame
+    if (!tileTraces.shown) bars.draw(node, frame, shownMs);
+    foot.draw(node, frame);
+    drawGrf(node, frame);
   }
   const drawn = trace.draw(nowMs, status.live);
   if (drawn) tileTraces.draw(node, drawn, nowMs, bars.unit);

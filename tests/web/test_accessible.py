@@ -71,6 +71,7 @@ def test_live_recording_and_marked(
         page.keyboard.press("p")
         expect(page.locator("#paused")).to_be_visible()
         expect(page.locator("#tares li")).not_to_have_count(0)
+        expect(page.locator("#tares li").first).to_be_in_viewport()
         assert complaints(page) == []
 
 
@@ -110,6 +111,6 @@ def test_dialogs_and_refusals(scripted: Scripted, open_page: OpenPage, dialog: s
         page.evaluate("import('/static/common/login.js').then((login) => void login.askToLogIn())")
     else:
         page.keyboard.press("m")
-        page.click("#stop", force=True)
+        page.keyboard.press("s")
     time.sleep(0.3)
     assert complaints(page) == []

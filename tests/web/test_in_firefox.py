@@ -64,7 +64,7 @@ def test_what_stands_on_the_foot_is_watched_recorded_marked_looked_at_and_downlo
         firefox.wait_for_text("#recordings", "in Firefox")
         firefox.find("#marker-label").send_keys("a stone", ENTER)
         firefox.wait_for_text("#notices", "a stone")
-        until(lambda: scripted.running.sessions()[0]["frames"] > 300)
+        until(lambda: scripted.running.sessions()[0]["frames"] > 600)
         firefox.click("#stop")
         until(lambda: scripted.running.sessions()[0]["state"] == "sealed")
 

@@ -160,11 +160,11 @@ def test_a_grid_is_a_heat_map_with_readable_numbers_on_a_phone(
         # A reference tile beside the row: drawn from above.
         (
             [(0.0, 0.012), (0.014, 0.012), (0.0, 0.04)],
-            "COP x .+ ± .+ mm, y not measured",
+            r"COP x .+ ± .+ mm \(95\s%\), y not measured",
         ),
         (
             [(0.02, -0.01), (0.02, 0.01), (0.05, 0.0)],
-            "COP x not measured, y .+ ± .+ mm",
+            r"COP y .+ ± .+ mm \(95\s%\), x not measured",
         ),
     ],
 )
@@ -188,7 +188,7 @@ def test_a_row_of_tiles_draws_the_cop_on_the_row_and_gives_no_number_across_it(
     with Play(node, 15.0):
         page = open_page(scripted.url)
         page.select_option("#node-select", "row")
-        expect(page.locator("#cop")).to_have_text(re.compile(rf"^{text} \(95 %\)$"))
+        expect(page.locator("#cop")).to_have_text(re.compile(f"^{text}$"))
         expect(page.locator("#foot .cop-symbol")).to_be_visible()
         page.goto(f"{scripted.url}/nodes")
         expect(page.locator('.node[data-node="row"][data-live="true"]')).to_have_count(1)
@@ -205,17 +205,19 @@ def test_the_first_screen_of_a_phone_has_what_matters(
         trouble = [f"trouble {i} that is long enough for two lines of a phone" for i in range(9)]
         tell(scripted, *trouble)
         expect(page.locator("#notes-more")).to_have_text("8 more")
+        expect(page.locator("#tared")).to_have_text(re.compile("^Tared .+ ago$"))
+        expect(page.locator("#fields")).to_have_text("Names …")
         bar = page.locator("#actions").bounding_box()
         assert bar is not None
         assert bar["height"] < 110  # a line of what is recorded, and the buttons
         assert bar["y"] + bar["height"] <= height
-        for part in ("#notes-box", "#grf", "#trace", "#foot", "#record"):
+        for part in ("#notes-box", "#grf", "#tared", "#trace", "#foot", "#record"):
             assert bottom_of(page, part) <= height, part
         if height == 844:
             assert bottom_of(page, "#bars") <= bar["y"]
         rows = {
             round(top_of(page, f"#{name}"))
-            for name in ("tare", "record", "stop", "marker", "fields")
+            for name in ("tare", "record", "undo", "marker", "fields")
         }
         assert len(rows) == 1
         expect(page.locator("#session-name")).to_be_hidden()

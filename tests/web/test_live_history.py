@@ -118,7 +118,7 @@ def test_a_paused_picture_stands_still_says_so_and_goes_on(
         expect(page.locator("#paused")).to_be_hidden()
         page.keyboard.press("p")
         expect(page.locator("#paused")).to_contain_text("Acquisition and recording continue")
-        expect(page.locator("#pause")).to_have_attribute("aria-pressed", "true")
+        expect(page.locator("#pause-text")).to_have_text("Resume")
         page.wait_for_timeout(200)
         before, sent, grf = page.evaluate(PICTURE), play.node.seq, page.inner_text("#grf")
         play.force_n = 50.0

@@ -1,4 +1,4 @@
-"""How often the live page draws and writes, and that what it draws is right all the same."""
+"""How often the pages draw and write, and that what they show is of one frame."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ OpenPage = Callable[..., Page]
 LIVE = "body[data-live=true]"
 
 WRITTEN = """async () => {
-  const { TextPace } = await import("/static/live/pace.js");
-  const pace = new TextPace();
+  const { FramePace } = await import("/static/live/pace.js");
+  const pace = new FramePace();
   const node = {};
   const of = (tile_flags, force_n) =>
     ({ tile_flags, force_n, saturated: [false], frame_flags: 0, estimate_flags: 0 });
@@ -95,7 +95,7 @@ STRIP = """async () => {
 }"""
 
 
-def test_numbers_are_written_five_times_a_second_and_what_is_new_at_once(
+def test_a_frame_is_shown_ten_times_a_second_and_what_is_new_at_once(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     assert open_page(scripted.url).evaluate(WRITTEN) == {
@@ -108,6 +108,66 @@ def test_numbers_are_written_five_times_a_second_and_what_is_new_at_once(
         "nodeSaysMore": True,
         "later": True,
     }
+
+
+NOTE_NUMBERS_AND_BARS = """() => {
+  window.seen = [];
+  const at = (id) => document.getElementById(id);
+  const note = () => {
+    requestAnimationFrame(note);
+    const tiles = [...document.querySelectorAll("#bars .tile")];
+    const written = tiles.map((tile) => Number(tile.querySelector(".value").textContent));
+    const drawn = tiles.map((tile) => Number(tile.dataset.value));
+    const sum = (all) => all.reduce((a, b) => a + b, 0);
+    window.seen.push([Number(at("grf").textContent), sum(written), sum(drawn)]);
+  };
+  note();
+}"""
+NOTE_CARD_AND_FOOT = """
+  const write = CanvasRenderingContext2D.prototype.fillText;
+  let numbers = [];
+  window.seen = [];
+  CanvasRenderingContext2D.prototype.fillText = function (text, ...where) {
+    if (this.canvas.className === "node-foot" && this.textAlign === "center") numbers.push(text);
+    return write.call(this, text, ...where);
+  };
+  addEventListener("load", function note() {
+    requestAnimationFrame(note);
+    const force = document.querySelector(".node .value")?.textContent;
+    const drawn = numbers.slice(-2).reduce((a, b) => a + Number(b), 0);
+    if (numbers.length) window.seen.push([Number(force), drawn]);
+  });
+"""
+
+
+def play_steps(play: Play, page: Page) -> list[list[float]]:
+    """What the page has shown, in each picture, of a force that changes all the time."""
+    page.wait_for_function("window.seen.length > 0")
+    for force_n in (5.0, 15.0) * 10:
+        play.force_n = force_n
+        page.wait_for_timeout(170)
+    seen: list[list[float]] = page.evaluate("window.seen.slice(1)")
+    forces = [one[0] for one in seen]
+    assert max(forces) - min(forces) > 15.0
+    return seen
+
+
+def test_force_numbers_and_bars_are_of_one_frame(scripted: Scripted, open_page: OpenPage) -> None:
+    with Play(scripted.node, 15.0) as play:
+        page = open_page(scripted.url)
+        expect(page.locator(LIVE)).to_have_count(1)
+        page.evaluate(NOTE_NUMBERS_AND_BARS)
+        for force_n, written, drawn in play_steps(play, page):
+            assert written == pytest.approx(force_n, abs=0.16)
+            assert drawn == pytest.approx(force_n, abs=0.11)
+
+
+def test_force_and_foot_of_a_card_are_of_one_frame(scripted: Scripted, open_page: OpenPage) -> None:
+    with Play(scripted.node, 15.0) as play:
+        page = open_page(f"{scripted.url}/nodes", first=NOTE_CARD_AND_FOOT)
+        expect(page.locator(".node[data-live=true]")).to_have_count(1)
+        for force_n, drawn in play_steps(play, page):
+            assert drawn == pytest.approx(force_n, abs=1.1)
 
 
 def test_whatever_asks_for_a_picture_there_is_one_in_a_display_frame(

@@ -25,7 +25,7 @@ PLACES = """() => Object.fromEntries(
 COVERED = """() => {
   const at = document.querySelector("#notices .notice:last-child").getBoundingClientRect();
   const parts =
-    "#pause #foot #grf #trace #bars #record #stop #marker #tare #recording-state".split(" ");
+    "#pause #foot #grf #trace #bars #record #marker #tare #recording-state".split(" ");
   return parts.filter((name) => {
     const { left, right, top, bottom } = document.querySelector(name).getBoundingClientRect();
     return left < at.right && right > at.left && top < at.bottom && bottom > at.top;
@@ -55,6 +55,9 @@ def test_warnings_pauses_messages_and_recordings_leave_everything_where_it_is(
         assert places(page) == before
         page.keyboard.press("p")
         expect(page.locator("#paused")).to_be_visible()
+        expect(page.locator("#notes")).to_be_in_viewport()
+        paused = page.evaluate("document.querySelector('#paused').getBoundingClientRect().top")
+        assert paused >= places(page)["trace-card"]["top"]  # over no warning
         assert places(page) == before
         page.keyboard.press("p")
         scripted.node.record(name="by another one")
@@ -68,6 +71,35 @@ def test_warnings_pauses_messages_and_recordings_leave_everything_where_it_is(
         assert places(page)["actions"] == before["actions"]
         assert page.evaluate(COVERED) == []
         assert page.evaluate("document.documentElement.scrollWidth") == size[0]
+
+
+BUTTONS = """() => Object.fromEntries([...document.querySelectorAll("#actions button[id]")]
+  .filter((one) => one.offsetParent && one.id !== "another")
+  .map((one) => [one.id, JSON.stringify(one.getBoundingClientRect())]))"""
+
+
+@SIZES
+def test_stop_has_the_place_of_record_and_no_button_moves(
+    scripted: Scripted, open_page: OpenPage, size: tuple[int, int]
+) -> None:
+    with Play(scripted.node):
+        page = open_page(scripted.url, *size)
+        expect(page.locator(LIVE)).to_have_count(1)
+        for _ in range(2):  # on a phone: fields closed, then open
+            idle = page.evaluate(BUTTONS)
+            page.locator("#record:not([aria-disabled=true])").dblclick()
+            expect(page.locator("#recordings li")).to_have_count(1)
+            expect(page.locator("#stop")).to_be_visible()
+            running = page.evaluate(BUTTONS)
+            assert running.pop("stop") == idle.pop("record")
+            assert running == idle
+            page.locator("#stop:not([aria-disabled=true])").dblclick()
+            expect(page.locator("#recordings")).to_be_hidden()
+            expect(page.locator("#record")).to_be_visible()
+            if page.locator("#fields").is_visible():
+                page.click("#fields")
+        assert len(scripted.running.sessions()) == 2
+        assert scripted.running.http.get("/nodes/bench/tares").json()["items"][1:] == []
 
 
 @SIZES
@@ -94,7 +126,7 @@ def test_a_recording_has_a_row_with_its_name_time_and_lost_frames(
     with Play(node):
         page = open_page(scripted.url)
         expect(page.locator(LIVE)).to_have_count(1)
-        expect(page.locator("#actions .primary")).to_have_attribute("id", "record")
+        expect(page.locator("#actions .primary:visible")).to_have_attribute("id", "record")
         session = node.record(name="walk")
         row = page.locator("#recordings li")
         expect(row.locator(".recording-name")).to_have_text("“walk”")
@@ -105,7 +137,7 @@ def test_a_recording_has_a_row_with_its_name_time_and_lost_frames(
         expect(frames).not_to_have_text(before)  # it counts on
         node.socket.send(json.dumps({"type": "status", "missed_slots": 5, "warnings": []}))
         expect(row.locator(".recording-lost")).to_have_text(re.compile("^0 lost, .+ not sampled$"))
-        expect(page.locator("#actions .primary")).to_have_attribute("id", "stop")
+        expect(page.locator("#actions .primary:visible")).to_have_attribute("id", "stop")
     first = node.seq
     node.frames(12)
     node.say_lost(evicted=[[first, first + 11]])

@@ -140,7 +140,7 @@ def test_a_phone_shows_the_bars_and_needs_no_sideways_scrolling(
     expect(page.locator("body")).to_have_attribute("data-live", "true")
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
     expect(page.locator('#bars [data-serial="T04"]')).to_be_in_viewport()
-    for button in ("#tare", "#record", "#stop", "#marker"):
+    for button in ("#tare", "#record", "#undo", "#marker"):
         expect(page.locator(button)).to_be_in_viewport()
 
 

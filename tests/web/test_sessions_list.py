@@ -66,6 +66,10 @@ LOW = (1280, 400)
 """So low that the twenty rows of a first answer reach beyond what is fetched ahead."""
 
 
+TOPS = """() => [...document.querySelectorAll("#sessions .session")]
+  .map((row) => row.getBoundingClientRect().top)"""
+
+
 def names(page: Page) -> list[str]:
     return page.locator("#sessions .session-name").all_text_contents()
 
@@ -147,9 +151,18 @@ def test_several_are_chosen_and_come_as_one_zip_file(
     page = open_page(f"{archive.url}/sessions", *LOW)
     searched(page)
     expect(page.locator("#chosen")).to_be_hidden()
-    for name in ("mud 7", "mud 107"):
-        page.get_by_role("checkbox", name=f"Select {name}", exact=True).check()
+    compare = page.locator("#chosen-compare")
+    before = page.evaluate(TOPS)
+    page.get_by_role("checkbox", name="Select mud 7", exact=True).check()
+    expect(page.locator("#chosen-text")).to_have_text("1 selected")
+    expect(page.locator("#chosen")).to_be_in_viewport()
+    assert page.evaluate(TOPS) == before
+    expect(compare).to_be_hidden()
+    page.get_by_role("checkbox", name="Select mud 107", exact=True).check()
     expect(page.locator("#chosen-text")).to_have_text("2 selected")
+    expect(compare).to_have_attribute(
+        "href", "/sessions/20200101T000000Z-000007?with=20200101T000000Z-00006b"
+    )
     expect(page.locator("#chosen-zip")).to_contain_text("Download 2 sessions as zip")
     assert complaints(page) == []
     with page.expect_download() as download:
@@ -164,6 +177,7 @@ def test_several_are_chosen_and_come_as_one_zip_file(
             assert file.read(name) == (archive.data / "sessions" / name).read_bytes()
     page.get_by_role("checkbox", name="Select all").check()
     expect(page.locator("#chosen-text")).to_have_text("10 selected")
+    expect(compare).to_be_hidden()
     page.click("#chosen-none")
     expect(page.locator("#chosen")).to_be_hidden()
 

@@ -28,9 +28,9 @@ def test_recordings_that_run_at_once_are_all_shown_marked_and_stopped_one_by_one
     with Play(scripted.node):
         page = open_page(scripted.url)
         expect(page.locator("body")).to_have_attribute("data-live", "true")
-        for name in ("first", "second"):
+        for name, button in (("first", "#record"), ("second", "#another")):
             page.fill("#session-name", name)
-            page.click("#record")
+            page.click(button)
             expect(page.locator("#recordings")).to_contain_text(name)
             time.sleep(1.0)  # within it a press is the second of a double tap
         expect(page.locator("#recordings li")).to_have_count(2)
@@ -79,11 +79,17 @@ def test_a_deleted_session_can_be_had_back_at_once_or_from_the_trash_until_it_is
 ) -> None:
     session = scripted.recorded("walk")
     page = open_page(f"{scripted.url}/sessions")
+    other = open_page(f"{scripted.url}/sessions")
     row = row_of(page, session)
     choose(page, row, "Delete")
     expect(row).to_have_count(0)
+    legends = [one.locator("#trash-legend") for one in (page, other)]
+    for legend in legends:
+        expect(legend).to_have_text("1 session, can be restored")
     page.locator("#notices").get_by_role("button", name="Undo").click()
     expect(row).to_have_count(1)
+    for legend in legends:
+        expect(legend).to_have_text("empty")
     choose(page, row, "Delete")
     expect(row).to_have_count(0)
     page.locator("#trash-card summary").click()
@@ -218,7 +224,7 @@ def test_a_phone_has_room_for_several_recordings_and_all_buttons(
         expect(page.locator("body")).to_have_attribute("data-live", "true")
         expect(page.locator("#recordings li")).to_have_count(3)
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
-        for button in ("#tare", "#record", "#stop", "#marker"):
+        for button in ("#tare", "#another", "#stop", "#marker"):
             expect(page.locator(button)).to_be_in_viewport()
 
 

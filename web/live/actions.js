@@ -7,7 +7,7 @@ import { notice, showRefusal } from "../common/notices.js";
 import { byId, duration, el, isInside, localTime, setData, setText } from "../common/text.js";
 
 const UNDO_KEY = "foottile.undo"; // survives a reload, not the tab
-const DOUBLE_TAP_MS = 1000; // a second press of Record within it is no second recording
+const DOUBLE_TAP_MS = 1000; // a second press of Record or Stop within it is one press
 
 /** Action bar of the live page. */
 export class Actions {
@@ -21,10 +21,14 @@ export class Actions {
     this.onSession = onSession;
     this.busy = new Set();
     this.recordedMs = -Infinity; // latest start, by performance.now()
+    this.swappedMs = -Infinity; // Stop has replaced Record, or Record Stop
     this.rows = new Map(); // session id -> row
-    for (const name of ["tare", "undo", "record", "stop", "marker"]) {
-      byId(name).addEventListener("click", () => this.run(name));
+    for (const name of ["tare", "undo", "marker"]) byId(name).addEventListener("click", () => this.run(name));
+    // One place for both: the second tap of a double tap meets the other button.
+    for (const name of ["record", "stop"]) {
+      byId(name).addEventListener("click", () => { if (performance.now() - this.swappedMs >= DOUBLE_TAP_MS) this.run(name); });
     }
+    byId("another").addEventListener("click", () => this.run("record"));
     this.bindField("marker-label", "marker");
     this.bindField("session-name", "record");
     document.addEventListener("keydown", (event) => this.shortcut(event));
@@ -112,7 +116,7 @@ export class Actions {
     this.onSession(session);
     notice(`Recording “${session.name}”.`);
     this.draw();
-    if (document.activeElement === document.body || document.activeElement === byId("record")) byId("stop").focus();
+    if ([document.body, byId("record")].includes(document.activeElement)) byId("stop").focus();
   }
 
   /** Stop recordings; by default all of the selected node. */
@@ -127,7 +131,7 @@ export class Actions {
     notice(sessions.length > 1 ? `Stopped ${sessions.length} recordings.${pending ? " They are sealed once their last frames arrive." : ""}`
       : `Stopped “${name}”.${pending ? " It is sealed once its last frames arrive." : ""}`);
     this.draw();
-    if (document.activeElement === document.body) byId("record").focus();
+    if ([document.body, byId("stop")].includes(document.activeElement)) byId("record").focus();
   }
 
   async marker() {
@@ -158,19 +162,20 @@ export class Actions {
     const { node } = this.state;
     const running = this.running();
     const reason = this.state.cannotRecord;
-    byId("tare", HTMLButtonElement).disabled = byId("record", HTMLButtonElement).disabled = !node || Boolean(reason);
+    for (const name of ["tare", "record", "another"]) byId(name, HTMLButtonElement).disabled = !node || Boolean(reason);
     const box = byId("cannot-record");
     box.hidden = !reason;
     setText(box, reason ? `Cannot record or tare: ${reason[0].toLowerCase()}${reason.slice(1)}` : "");
     byId("stop", HTMLButtonElement).disabled = byId("marker", HTMLButtonElement).disabled = !running.length;
-    setText(byId("record-text"), running.length ? "Record another" : "Record");
     setText(byId("stop-text"), running.length > 1 ? `Stop all ${running.length}` : "Stop");
     if (this.undoId === undefined) {
       try { this.undoId = sessionStorage.getItem(UNDO_KEY); } catch { this.undoId = null; }
     }
     const tare = node?.tare;
     const isOwn = this.undoId && tare?.id === this.undoId;
-    byId("undo").hidden = !(tare && !tare.undone && (isOwn || tare.source === "flight"));
+    const undo = byId("undo", HTMLButtonElement);
+    undo.title = !tare || tare.undone ? "No tare to undo" : isOwn || tare.source === "flight" ? "" : "Only automatic tares, and those of this page, can be undone";
+    undo.disabled = undo.title !== "";
     this.drawRecordings(running);
   }
 
@@ -178,10 +183,10 @@ export class Actions {
     const box = byId("recordings");
     box.hidden = !running.length;
     byId("last-session").hidden = Boolean(running.length || this.state.cannotRecord);
-    setData(byId("actions"), "running", String(Boolean(running.length)));
-    // Highlight the next action.
-    byId("record").classList.toggle("primary", !running.length);
-    byId("stop").classList.toggle("primary", Boolean(running.length));
+    const isRunning = String(Boolean(running.length));
+    if (byId("actions").dataset.running !== isRunning) this.swappedMs = performance.now();
+    setData(byId("actions"), "running", isRunning);
+    for (const name of ["record", "stop"]) byId(name).setAttribute("aria-disabled", String(performance.now() - this.swappedMs < DOUBLE_TAP_MS));
     box.dataset.several = String(running.length > 1);
     const rows = new Map(running.map((session) => [session.id, this.rows.get(session.id) ?? this.row(session)]));
     this.rows = rows;

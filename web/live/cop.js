@@ -10,7 +10,6 @@ const MM = 1000;
 const TRAIL_S = 2;
 const PARTS = 8; // of the trail, older ones paler
 const GAP_S = 0.25; // longer gaps interrupt the trail
-const TRAIL_EVERY_S = 0.06; // costly, and its new end is next to the symbol
 
 /** COP symbol, uncertainty and trail. */
 export class Cop {
@@ -28,19 +27,18 @@ export class Cop {
     this.trail = Array.from({ length: PARTS }, (_, i) => svg("path", { class: "cop-trail", opacity: ((i + 1) / PARTS).toFixed(2) }));
     if (!layout.plan) this.trail.forEach((part) => part.classList.add("on-sole"));
     this.parts = [...this.trail, this.halo, this.area, this.span, this.symbol];
-    this.trailS = -Infinity; // time of the trail as drawn
   }
 
-  draw(node, frame, writesText) {
+  draw(node, frame) {
     const note = byId("cop");
     const at = this.layout.copPlace(frame?.cop_x_m, frame?.cop_y_m);
     const shown = at !== null;
-    this.updateTrail(frame, writesText);
+    this.updateTrail(frame);
     for (const part of [this.symbol, this.halo, this.span, this.area]) place(part, { visibility: shown ? "visible" : "hidden" });
     const sigma = frame?.cop_sigma_x_m ?? null;
     setData(note, "xM", shown ? at.x.toFixed(6) : "");
     setData(note, "sigmaM", shown && sigma !== null ? sigma.toFixed(6) : "");
-    if (writesText) setText(note, shown ? this.text(frame) : `No COP: ${whyNoCop(node, frame, this.layout)}${frame?.contact === false ? this.lastText() : ""}`);
+    setText(note, shown ? this.text(frame) : `No COP: ${whyNoCop(node, frame, this.layout)}${frame?.contact === false ? this.lastText() : ""}`);
     if (!shown) return;
     if (this.layout.plan) this.drawPlan(frame, at);
     else this.drawSide(frame, at);
@@ -48,8 +46,10 @@ export class Cop {
 
   /** Return the position as text. */
   text({ cop_x_m: x = null, cop_y_m: y = null, cop_sigma_x_m: sigmaX = null, cop_sigma_y_m: sigmaY = null }) {
-    const across = this.layout.plan ? `, ${coordinateText("y", y, sigmaY)}` : "";
-    return `COP ${coordinateText("x", x, sigmaX)}${across} (95 %)`;
+    const all = [["x", x, sigmaX], ...(this.layout.plan ? [["y", y, sigmaY]] : [])];
+    const measured = all.filter(([, value]) => value !== null).map(([name, value, sigma]) => coordinateText(name, value, sigma));
+    const others = all.filter(([, value]) => value === null).map(([name]) => `, ${name} not measured`);
+    return `COP ${measured.join(", ")} (95\u00a0%)${others.join("")}`;
   }
 
   /** Return the last position before flight as text. */
@@ -92,7 +92,7 @@ export class Cop {
   }
 
   /** Extend the trail, by the time stamps of the frames: replay has one, too. */
-  updateTrail(frame, writesText) {
+  updateTrail(frame) {
     const { past, layout } = this;
     const nowS = timeOf(frame);
     if (nowS === null) past.length = 0;
@@ -102,8 +102,6 @@ export class Cop {
       while (past[0].timeS < nowS - TRAIL_S) past.shift();
     }
     setData(layout.plan ? this.area : this.span, "trail", String(past.length));
-    if (!writesText && nowS !== null && Math.abs(nowS - this.trailS) < TRAIL_EVERY_S) return;
-    this.trailS = nowS;
     const paths = Array.from({ length: PARTS }, () => []);
     past.forEach((one, i) => {
       const before = past[i - 1];
@@ -124,7 +122,7 @@ export class Cop {
 
 const timeOf = (frame) => (!frame ? null : Number.isFinite(frame.t_ns) ? frame.t_ns / 1e9 : frame.timeS ?? null);
 
-const coordinateText = (name, value, sigma) => value === null ? `${name} not measured` : `${name} ${number(value * MM)}${sigma === null ? "" : ` ± ${number(Z95 * sigma * MM)}`} mm`;
+const coordinateText = (name, value, sigma) => `${name} ${number(value * MM)}${sigma === null ? "" : ` ± ${number(Z95 * sigma * MM)}`} mm`;
 
 /** Return a dot and four strokes around an ellipse. */
 const hairs = (x, y, rx, ry) => `M${x} ${y}h.1M${x - rx - 14} ${y}h10M${x + rx + 4} ${y}h10M${x} ${y - ry - 14}v10M${x} ${y + ry + 4}v10`;
@@ -138,6 +136,6 @@ function whyNoCop(node, frame, { row }) {
   if (bits & (ESTIMATE.TILE_MISSING | ESTIMATE.SATURATED)) return whyNot(node, frame);
   if (frame.contact === false) return "no contact";
   if (bits & ESTIMATE.COP_MASKED) return "too uncertain";
-  if (row.x !== null && row.y !== null) return "not measured: all tiles at one point";
+  if (row.x !== null && row.y !== null) return "all tiles at one place";
   return "not determined";
 }

@@ -14,6 +14,8 @@ const SIDE_PX = 42; // left and right of a foot from above: legend, direction of
 const LOW_PX = 220; // below: little room under the foot
 const LIFT_PX = 12; // over the ground in flight
 const NUMBERS_FROM_PX = 26; // width of a square that holds a number
+const NAMES_FROM_PX = 34; // that holds a name above it
+const LETTER_PX = 6.5; // of such a name
 const KEY_PX = 18; // height of the legend of reference tiles
 
 /** SVG of the foot. */
@@ -107,35 +109,39 @@ export class Foot {
       : svg("circle", { class: "dome", cx: x, cy: y, r });
     const cross = svg("path", { class: "cross", d: `M${x - r} ${y - r}L${x + r} ${y + r}M${x - r} ${y + r}L${x + r} ${y - r}` });
     const arrow = svg("path", { class: "arrow" });
-    const label = svg("text", { class: "name", x, y: y + 4, "text-anchor": "middle" }, this.grid ? "" : tile.serial);
+    const isNamed = this.grid && 2 * r >= Math.max(NAMES_FROM_PX, LETTER_PX * tile.serial.length);
+    const text = (cls, down, content) => svg("text", { class: cls, x, y: y + down, "text-anchor": "middle" }, content);
+    const label = text("name", isNamed ? 10 : 4, this.grid ? "" : tile.serial);
+    const above = text("name above", -5, tile.serial);
     group.append(dome, arrow, cross, svg("title", {}, tile.serial));
     if (r >= 13) group.append(label);
+    if (isNamed) group.append(above);
     this.turning.append(group);
     setData(group, "reference", String(Boolean(tile.reference)));
-    return { group, dome, arrow, number: this.grid && cell >= NUMBERS_FROM_PX ? label : null, name: label };
+    return { group, dome, arrow, number: this.grid && cell >= NUMBERS_FROM_PX ? label : null, names: [label, above] };
   }
 
-  /** Draw a frame; `writesText`: write the numbers, too. */
-  draw(node, frame, writesText = true) {
+  /** Draw a frame and write its numbers. */
+  draw(node, frame) {
     this.fit(node);
     this.range.update(node, frame, performance.now());
     const fullScale = this.range.foot;
     setText(this.top, `${number(fullScale, fullScale < 10 && fullScale % 1 ? 1 : 0)} N`);
     this.turn(node, frame);
-    if (writesText) this.writeAngle(node, frame);
-    this.symbols.forEach((symbol, i) => this.drawTile(symbol, i, readTile(node, i, frame, "N"), fullScale, writesText));
-    this.cop.draw(node, frame, writesText);
+    this.writeAngle(node, frame);
+    this.symbols.forEach((symbol, i) => this.drawTile(symbol, i, readTile(node, i, frame, "N"), fullScale));
+    this.cop.draw(node, frame);
   }
 
-  drawTile({ group, dome, arrow, number: label, name }, i, reading, fullScale, writesText) {
+  drawTile({ group, dome, arrow, number: label, names }, i, reading, fullScale) {
     const fault = FAULT_STATES.has(reading.state);
     setData(group, "state", fault ? "fault" : reading.state);
     const known = reading.value !== null && !this.tiles[i].reference;
     const share = reading.state === "saturated" ? 1 : known ? Math.max(0, reading.value / fullScale) : 0;
     const { fill, ink } = known ? shadeOf(this.shades, share) : { fill: "none", ink: "" };
     place(dome, { fill });
-    place(name, { fill: known ? ink : "currentColor" });
-    if (label && writesText) setText(label, known ? number(reading.value, 0) : reading.bound ? `≥${reading.bound}` : "");
+    for (const name of names) place(name, { fill: known ? ink : "currentColor" });
+    if (label) setText(label, known ? number(reading.value, 0) : reading.bound ? `≥${reading.bound}` : "");
     if (!this.plan) this.drawArrow(arrow, i, Math.min(1, share));
   }
 

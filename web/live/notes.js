@@ -109,7 +109,11 @@ export class Notes {
     for (const old of [...this.list.children]) if (!shown.includes(old)) old.remove();
     shown.forEach((one, i) => { if (this.list.children[i] !== one) this.list.insertBefore(one, this.list.children[i] ?? null); });
     this.fold();
-    setText(byId("facts"), node ? facts(node, frame, serverNowMs) : "");
+    const tared = node ? taredText(node, serverNowMs) : "";
+    const others = node ? facts(node, frame) : "";
+    setText(byId("tared"), tared.split(",")[0]); // on a phone, where warnings take the line of facts
+    setText(byId("tare-fact"), tared && others ? `${tared} · ` : tared);
+    setText(byId("other-facts"), others);
   }
 
   /** Show the first warning in one line and the number of others, so that the cards below do not move. */
@@ -176,14 +180,18 @@ const clippedText = ({ serial }, gaugeKpa) => `${serial} stops rising ${Number.i
 
 const tareAge = (tare, serverNowMs) => roughly((serverNowMs - tare.t_ns / 1e6) / 1000);
 
-const SOURCES = { unloaded: "manual", recognised: "recognised in flight", flight: "automatic in flight" };
+const SOURCES = { unloaded: "by hand", recognised: "recognised in flight", flight: "in flight" };
 const FOLLOWS = { paused: "automatic tare paused after an undo: press Tare to resume it", off: "automatic tare off" };
 
-/** Return the line of facts about tare, calibration and clock. */
-function facts(node, frame, serverNowMs) {
-  const tare = node.tare && !node.tare.undone ? node.tare : null;
+/** Return age and kind of the tare, or "". */
+function taredText({ tare }, serverNowMs) {
+  if (!tare || tare.undone) return "";
+  return `Tared ${tareAge(tare, serverNowMs)} ago${SOURCES[tare.source] ? `, ${SOURCES[tare.source]}` : ""}`;
+}
+
+/** Return the facts about drift, calibration and clock. */
+function facts(node, frame) {
   const parts = [];
-  if (tare) parts.push(`Tared ${tareAge(tare, serverNowMs)} ago${SOURCES[tare.source] ? `, ${SOURCES[tare.source]}` : ""}`);
   const perHour = node.drift?.grf_n_per_hour;
   if (Number.isFinite(perHour) && Math.abs(perHour) >= 0.1) parts.push(`zero drifts ${number(perHour)} N/h`);
   if (FOLLOWS[node.auto_tare]) parts.push(FOLLOWS[node.auto_tare]);

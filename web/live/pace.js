@@ -1,10 +1,10 @@
-// Drawing pace: one drawing per message, text less often.
+// Drawing pace: the trace with each message, a frame's numbers and pictures less often.
 //
 // A drawing costs the same with and without news, so none is requested in between. Nobody reads
-// numbers that change thirty times a second, and their layout costs more than all drawing.
+// numbers that change thirty times a second, and pictures of another frame would contradict them.
 
 const IDLE_MS = 50; // without messages the trace still moves
-const TEXT_MS = 200;
+const FRAME_MS = 100;
 
 /** Requests at most one drawing per display frame. */
 export class Pace {
@@ -28,25 +28,25 @@ export class Pace {
   }
 }
 
-/** Decides whether to write the numbers of a frame now. */
-export class TextPace {
+/** Decides whether to show a frame now. */
+export class FramePace {
   constructor() {
     this.reset();
   }
 
-  /** Write next time in any case: the display has changed. */
+  /** Show the next one in any case: the display has changed. */
   reset() {
     this.node = this.frame = undefined;
     this.state = "";
-    this.writtenMs = 0;
+    this.shownMs = 0;
   }
 
-  /** Return true at once for another state, such as a fault; for another value of the same state every `TEXT_MS`. */
+  /** Return true at once for another state, such as a fault; for another value of the same state every `FRAME_MS`. */
   isDue(node, frame, nowMs) {
     if (node === this.node && frame === this.frame) return false;
     const state = stateOf(frame);
-    if (node === this.node && state === this.state && nowMs - this.writtenMs < TEXT_MS) return false;
-    [this.node, this.frame, this.state, this.writtenMs] = [node, frame, state, nowMs];
+    if (node === this.node && state === this.state && nowMs - this.shownMs < FRAME_MS) return false;
+    [this.node, this.frame, this.state, this.shownMs] = [node, frame, state, nowMs];
     return true;
   }
 }

@@ -9,7 +9,7 @@ export class Pause {
     this.onChange = onChange;
     this.held = null; // frame on display, and its time
     this.latest = null; // returns the latest frame
-    for (const name of ["pause", "resume"]) byId(name).addEventListener("click", () => this.toggle());
+    byId("pause").addEventListener("click", () => this.toggle());
   }
 
   toggle() {
@@ -17,22 +17,20 @@ export class Pause {
     const frame = this.latest?.();
     if (!frame) return; // nothing to hold
     this.held = { frame, nowMs: performance.now() };
-    setText(byId("paused-text"), `Paused at ${localTime(new Date()).slice(11)}. Acquisition and recording continue.`);
+    setText(byId("paused-text"), `Paused at ${localTime(new Date()).slice(11)}.`);
     this.show();
   }
 
   resume() {
     if (!this.held) return;
     this.held = null;
-    const back = document.activeElement === byId("resume");
     this.show();
-    if (back) byId("pause").focus();
   }
 
   show() {
     byId("paused").hidden = !this.held;
     document.body.dataset.paused = String(Boolean(this.held));
-    byId("pause").setAttribute("aria-pressed", String(Boolean(this.held)));
+    setText(byId("pause-text"), this.held ? "Resume" : "Pause");
     this.onChange();
   }
 }

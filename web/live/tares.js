@@ -11,7 +11,10 @@ export class Tares {
   constructor() {
     this.card = byId("tares-card", HTMLDetailsElement);
     this.shown = "";
-    this.card.addEventListener("toggle", () => { this.shown = ""; });
+    this.card.addEventListener("toggle", () => {
+      this.shown = "";
+      this.isOpening = this.card.open;
+    });
   }
 
   /** Load the list while it is open and outdated; cheap to call. */
@@ -28,7 +31,9 @@ export class Tares {
     try {
       const { items, drift } = await api.listTares(node.node);
       byId("tares").replaceChildren(...items.slice(0, SHOWN).map((tare) => row(tare, items)));
-      setText(byId("tares-legend"), legend(items, drift));
+      setText(byId("tares-legend"), legend(items, drift, node));
+      if (this.isOpening) this.card.scrollIntoView({ block: "nearest" }); // below the fold of a laptop
+      this.isOpening = false;
     } catch (error) {
       showRefusal(error);
     }
@@ -38,14 +43,15 @@ export class Tares {
 function row(tare, items) {
   const isActive = !tare.undone && items.find((other) => !other.undone)?.id === tare.id;
   const state = tare.undone ? ", undone" : isActive ? ", active" : "";
-  return el("li", { text: `${localTime(new Date(tare.t_ns / 1e6))} ${tare.reason}${state}` });
+  return el("li", { text: `${localTime(new Date(tare.t_ns / 1e6))} ${tare.reason.replaceAll(" -", " −")}${state}` });
 }
 
-function legend(items, drift) {
+function legend(items, drift, { tiles }) {
   const all = `${items.length}, newest first`;
   const known = drift.kpa_per_hour.filter(Number.isFinite);
   if (!known.length) return all;
   const most = known.reduce((a, b) => (Math.abs(b) > Math.abs(a) ? b : a));
   const newtons = Number.isFinite(drift.grf_n_per_hour) ? `, ${number(drift.grf_n_per_hour)} N/h on the foot` : "";
-  return `${all}; drift up to ${number(most, 2)} kPa/h${newtons}`;
+  const { serial } = tiles[drift.kpa_per_hour.indexOf(most)];
+  return `${all}; drift, a line through the tares of the last 6 h that are not undone: up to ${number(most, 2)} kPa/h (${serial})${newtons}`;
 }

@@ -93,23 +93,16 @@ export class Card {
     this.fresh = true;
   }
 
-  /** Draw foot and trace, if there is a new frame. */
+  /** Draw force, foot and trace of one frame, if there is a new one. */
   draw() {
     if (!this.fresh || !this.node) return;
     this.fresh = false;
+    this.writeForce(this.node, this.frame);
     this.foot.draw(this.node, this.frame);
     this.trace.draw(performance.now());
   }
 
-  /** Write all texts; `linkOpen`: the server is connected. */
-  write(nowMs, serverNowMs, linkOpen) {
-    const { node, frame } = this;
-    const live = linkOpen && this.isLive(nowMs);
-    setData(this.element, "live", String(live));
-    const [text, cls] = this.liveText(live, nowMs, serverNowMs, linkOpen);
-    setText(this.state, text);
-    if (this.state.className !== `state ${cls}`) this.state.className = `state ${cls}`;
-
+  writeForce(node, frame) {
     const grf = Number.isFinite(frame?.grf_n) ? frame.grf_n : null;
     const atLeast = grf === null && Number.isFinite(frame?.grf_lower_bound_n) ? Math.max(0, Math.floor(frame.grf_lower_bound_n * 10) / 10) : null;
     setText(this.bound, atLeast === null ? "" : "at least ");
@@ -120,6 +113,16 @@ export class Card {
     setText(this.sigma, grf === null ? whyNot(node, frame)
       : Number.isFinite(frame.grf_sigma_n) ? `± ${number(1.96 * frame.grf_sigma_n)} N (95 %)${assumed}` : "");
     drawContact(this.contact, frame);
+  }
+
+  /** Write state, link quality, warnings and session; `linkOpen`: the server is connected. */
+  write(nowMs, serverNowMs, linkOpen) {
+    const { node, frame } = this;
+    const live = linkOpen && this.isLive(nowMs);
+    setData(this.element, "live", String(live));
+    const [text, cls] = this.liveText(live, nowMs, serverNowMs, linkOpen);
+    setText(this.state, text);
+    if (this.state.className !== `state ${cls}`) this.state.className = `state ${cls}`;
 
     this.writeFacts(node);
     this.replacement.draw(node);

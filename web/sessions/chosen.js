@@ -1,9 +1,10 @@
-// Selected sessions: download as one zip file, or move to the trash.
+// Selected sessions: download as one zip file, compare two, or move to the trash.
 
 import * as api from "../common/api.js";
 import { ask } from "../common/dialogs.js";
 import { notice, quietly } from "../common/notices.js";
 import { byId, bytes, el, setText } from "../common/text.js";
+import { comparisonAddress } from "./row.js";
 
 const ZIP_MAX = 1000; // limit of the server
 
@@ -90,6 +91,9 @@ export class Chosen {
     setText(zip, can ? `Download ${many(sealed.length)} as zip, ${bytes(size)}` : sealed.length ? `Zip: ${ZIP_MAX} sessions at most` : "No sealed session selected");
     if (can) zip.href = api.zipAddress(sealed.map(({ id }) => id));
     else zip.removeAttribute("href");
+    const compare = byId("chosen-compare", HTMLAnchorElement);
+    compare.hidden = sealed.length !== 2 || left > 0;
+    if (!compare.hidden) compare.href = comparisonAddress(...sealed);
   }
 
   async delete() {

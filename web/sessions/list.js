@@ -8,7 +8,7 @@ import { menuButton } from "../common/menu.js";
 import { notice, quietly } from "../common/notices.js";
 import { byId, el, setData, setText } from "../common/text.js";
 import { Chosen } from "./chosen.js";
-import { counts, head, makeRow, makeTakeRow } from "./row.js";
+import { comparisonAddress, counts, head, makeRow, makeTakeRow } from "./row.js";
 import { stateText } from "./state.js";
 
 const SESSIONS_MAX = 5000; // bounds a page left open for weeks
@@ -254,7 +254,7 @@ function links(session, others) {
   return [
     ...formats.map(([format, text]) => link(format, `Download ${text}`, { href: api.dataAddress(session, format), download: "" })),
     ...others.filter(({ state }) => state === "sealed" && session.state === "sealed").slice(0, COMPARED_MAX)
-      .map((other) => link("compare", `Compare with ${other.node}`, { href: `/sessions/${encodeURIComponent(session.id)}?with=${encodeURIComponent(other.id)}` })),
+      .map((other) => link("compare", `Compare with ${other.node}`, { href: comparisonAddress(session, other) })),
   ];
 }
 

@@ -11,7 +11,10 @@ import { Trash } from "./trash.js";
 
 const RATE_HZ = 1; // no frames on this page
 
-const updateSession = (session) => sessions.update(session);
+function updateSession(session) {
+  sessions.update(session);
+  trash.follow(session);
+}
 
 function removeSession(id) {
   sessions.drop(id);

@@ -50,6 +50,9 @@ function about({ subject, tags, notes }) {
   return lines;
 }
 
+/** Return the address of a session's page with another one beside it. @param {Session} session @param {Session} other */
+export const comparisonAddress = (session, other) => `/sessions/${encodeURIComponent(session.id)}?with=${encodeURIComponent(other.id)}`;
+
 /** Make the row above the sessions of a take. @param {Session[]} sessions @param {HTMLInputElement} pick selects them all */
 export function makeTakeRow(sessions, pick) {
   const names = [...new Set(sessions.map(({ name }) => name))];

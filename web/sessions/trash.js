@@ -12,17 +12,28 @@ export class Trash {
   /** `onRestored(session)` receives a restored session. */
   constructor(onRestored) {
     this.onRestored = onRestored;
+    /** @type {Session[]} */
+    this.items = [];
+    this.requests = this.answered = 0;
     byId("trash-empty").addEventListener("click", () => this.empty());
   }
 
+  /** Follow a listed session: one that is in the trash, or may be in a list on its way, has been restored. */
+  follow({ id }) {
+    if (this.answered !== this.requests || this.items.some((one) => one.id === id)) this.load();
+  }
+
   async load() {
+    const number = ++this.requests;
     await quietly(async () => {
       const { items } = await api.listTrash();
+      if (number !== this.requests) return;
       this.items = items;
       byId("trash").replaceChildren(...items.map((session) => this.row(session)));
       byId("trash-empty").hidden = !items.length;
       setText(byId("trash-legend"), items.length ? `${countOf(items)}, can be restored` : "empty");
     });
+    if (number === this.requests) this.answered = number;
   }
 
   /** @param {Session} session */
@@ -46,7 +57,7 @@ export class Trash {
   }
 
   async empty() {
-    const what = countOf(this.items ?? []);
+    const what = countOf(this.items);
     if (!await ask("Empty the trash?", `${what} will be deleted permanently.`, `Delete ${what}`)) return;
     await quietly(async () => {
       const emptied = await api.emptyTrash();

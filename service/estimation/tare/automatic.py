@@ -240,7 +240,7 @@ def propose_flight_tare(
         return NO_TARE
     most = int(np.argmax(np.abs(shift_kpa)))
     reason = (
-        f"in flight; {serials[most]} by {shift_kpa[most]:+.2f} kPa in {since_s / 60:.0f} min"
+        f"in flight; {serials[most]} {shift_kpa[most]:+.2f} kPa since the tare before"
         if has_shifted
         else f"in flight; nothing has moved in {since_s / 60:.0f} min"
     )
