@@ -329,7 +329,11 @@ def test_a_selected_stance_stays_selected_until_all_or_escape_is_pressed(
 
     point(0.5)
     expect(which).to_have_text(medians)  # pointing reads
-    for deselect in (lambda: page.keyboard.press("Escape"), lambda: page.click("#zoom-all")):
+    deselections: tuple[Callable[[], None], ...] = (
+        lambda: page.keyboard.press("Escape"),
+        lambda: page.click("#zoom-all"),
+    )
+    for deselect in deselections:
         page.locator("#stances-rows tr").nth(2).click()
         says(page, stances[2])
         for share in (0.2, 0.95):  # within it, and in the pause behind it

@@ -116,7 +116,7 @@ export class Actions {
     this.onSession(session);
     notice(`Recording “${session.name}”.`);
     this.draw();
-    if ([document.body, byId("record")].includes(document.activeElement)) byId("stop").focus();
+    if ([document.body, byId("record")].some((element) => element === document.activeElement)) byId("stop").focus();
   }
 
   /** Stop recordings; by default all of the selected node. */
@@ -131,7 +131,7 @@ export class Actions {
     notice(sessions.length > 1 ? `Stopped ${sessions.length} recordings.${pending ? " They are sealed once their last frames arrive." : ""}`
       : `Stopped “${name}”.${pending ? " It is sealed once its last frames arrive." : ""}`);
     this.draw();
-    if ([document.body, byId("stop")].includes(document.activeElement)) byId("record").focus();
+    if ([document.body, byId("stop")].some((element) => element === document.activeElement)) byId("record").focus();
   }
 
   async marker() {

@@ -93,7 +93,7 @@ export class Chosen {
     else zip.removeAttribute("href");
     const compare = byId("chosen-compare", HTMLAnchorElement);
     compare.hidden = sealed.length !== 2 || left > 0;
-    if (!compare.hidden) compare.href = comparisonAddress(...sealed);
+    if (!compare.hidden) compare.href = comparisonAddress(sealed[0], sealed[1]);
   }
 
   async delete() {
