@@ -252,9 +252,11 @@ function draw() {
   const nowMs = performance.now();
   const { frame, nowMs: shownMs } = pause.held ?? { frame: state.frame, nowMs };
   const isDue = framePace.isDue(node, frame, nowMs);
-  if (isDue || pause.held) state.fresh = false;
-  if (isDue) { // numbers and pictures of one frame
-    if (!tileTraces.shown) bars.draw(node, frame, shownMs);
+  if (state.fresh || isDue) {
+    state.fresh = false;
+    if (!tileTraces.shown) bars.draw(node, frame, shownMs, isDue);
+  }
+  if (isDue) { // all numbers, and the foot that contains some, are of one frame
     foot.draw(node, frame);
     drawGrf(node, frame);
   }

@@ -110,16 +110,15 @@ def test_a_frame_is_shown_ten_times_a_second_and_what_is_new_at_once(
     }
 
 
-NOTE_NUMBERS_AND_BARS = """() => {
+NOTE_NUMBERS = """() => {
   window.seen = [];
   const at = (id) => document.getElementById(id);
   const note = () => {
     requestAnimationFrame(note);
     const tiles = [...document.querySelectorAll("#bars .tile")];
     const written = tiles.map((tile) => Number(tile.querySelector(".value").textContent));
-    const drawn = tiles.map((tile) => Number(tile.dataset.value));
     const sum = (all) => all.reduce((a, b) => a + b, 0);
-    window.seen.push([Number(at("grf").textContent), sum(written), sum(drawn)]);
+    window.seen.push([Number(at("grf").textContent), sum(written)]);
   };
   note();
 }"""
@@ -152,14 +151,15 @@ def play_steps(play: Play, page: Page) -> list[list[float]]:
     return seen
 
 
-def test_force_numbers_and_bars_are_of_one_frame(scripted: Scripted, open_page: OpenPage) -> None:
+def test_force_and_numbers_of_the_tiles_are_of_one_frame(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
     with Play(scripted.node, 15.0) as play:
         page = open_page(scripted.url)
         expect(page.locator(LIVE)).to_have_count(1)
-        page.evaluate(NOTE_NUMBERS_AND_BARS)
-        for force_n, written, drawn in play_steps(play, page):
+        page.evaluate(NOTE_NUMBERS)
+        for force_n, written in play_steps(play, page):
             assert written == pytest.approx(force_n, abs=0.16)
-            assert drawn == pytest.approx(force_n, abs=0.11)
 
 
 def test_force_and_foot_of_a_card_are_of_one_frame(scripted: Scripted, open_page: OpenPage) -> None:

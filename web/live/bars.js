@@ -78,8 +78,8 @@ export class Bars {
     this.list.style.setProperty("--rows", String(Math.ceil(count / columns)));
   }
 
-  /** Draw the bars and write their numbers. */
-  draw(node, frame, nowMs) {
+  /** Draw the bars; `writesText`: write their numbers, too. */
+  draw(node, frame, nowMs, writesText = true) {
     const unit = hasPressuresOnly(frame) ? "kPa" : this.unit;
     if (unit !== this.shown) this.showUnit(unit);
     this.fit(node);
@@ -88,7 +88,7 @@ export class Bars {
       setScale(cell, this.range.of(cell.tile, cell.unit), this.range.automatic);
       const reading = readTile(node, i, frame, this.shown);
       setData(cell.root, "value", plain(reading.value));
-      writeCell(cell, reading);
+      if (writesText) writeCell(cell, reading);
       return barOf(cell, reading, nowMs);
     }));
   }

@@ -1,7 +1,7 @@
-// Drawing pace: the trace with each message, a frame's numbers and pictures less often.
+// Drawing pace: trace and bars with each message, a frame's numbers and the foot less often.
 //
 // A drawing costs the same with and without news, so none is requested in between. Nobody reads
-// numbers that change thirty times a second, and pictures of another frame would contradict them.
+// numbers that change thirty times a second, and a foot of another frame would contradict them.
 
 const IDLE_MS = 50; // without messages the trace still moves
 const FRAME_MS = 100;
