@@ -21,6 +21,7 @@ export class Actions {
     this.onSession = onSession;
     this.busy = new Set();
     this.recordedMs = -Infinity; // latest start, by performance.now()
+    this.drawnNode = undefined;
     this.swappedMs = -Infinity; // Stop has replaced Record, or Record Stop
     this.rows = new Map(); // session id -> row
     for (const name of ["tare", "undo", "marker"]) byId(name).addEventListener("click", () => this.run(name));
@@ -184,7 +185,10 @@ export class Actions {
     box.hidden = !running.length;
     byId("last-session").hidden = Boolean(running.length || this.state.cannotRecord);
     const isRunning = String(Boolean(running.length));
-    if (byId("actions").dataset.running !== isRunning) this.swappedMs = performance.now();
+    const node = this.state.node?.node;
+    // A page that has just opened, or shows another node, has swapped nothing under a finger.
+    if (byId("actions").dataset.running !== isRunning && node && node === this.drawnNode) this.swappedMs = performance.now();
+    this.drawnNode = node;
     setData(byId("actions"), "running", isRunning);
     for (const name of ["record", "stop"]) byId(name).setAttribute("aria-disabled", String(performance.now() - this.swappedMs < DOUBLE_TAP_MS));
     box.dataset.several = String(running.length > 1);

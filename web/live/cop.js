@@ -33,7 +33,8 @@ export class Cop {
     const note = byId("cop");
     const at = this.layout.copPlace(frame?.cop_x_m, frame?.cop_y_m);
     const shown = at !== null;
-    this.updateTrail(frame);
+    this.notePosition(frame);
+    this.drawTrail(frame);
     for (const part of [this.symbol, this.halo, this.span, this.area]) place(part, { visibility: shown ? "visible" : "hidden" });
     const sigma = frame?.cop_sigma_x_m ?? null;
     setData(note, "xM", shown ? at.x.toFixed(6) : "");
@@ -92,7 +93,7 @@ export class Cop {
   }
 
   /** Extend the trail, by the time stamps of the frames: replay has one, too. */
-  updateTrail(frame) {
+  notePosition(frame) {
     const { past, layout } = this;
     const nowS = timeOf(frame);
     if (nowS === null) past.length = 0;
@@ -101,6 +102,11 @@ export class Cop {
       past.push({ timeS: nowS, x: null, y: null, ...layout.copPlace(frame.cop_x_m, frame.cop_y_m) });
       while (past[0].timeS < nowS - TRAIL_S) past.shift();
     }
+  }
+
+  drawTrail(frame) {
+    const { past, layout } = this;
+    const nowS = timeOf(frame);
     setData(layout.plan ? this.area : this.span, "trail", String(past.length));
     const paths = Array.from({ length: PARTS }, () => []);
     past.forEach((one, i) => {

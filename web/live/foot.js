@@ -121,6 +121,11 @@ export class Foot {
     return { group, dome, arrow, number: this.grid && cell >= NUMBERS_FROM_PX ? label : null, names: [label, above] };
   }
 
+  /** Extend the trail of the COP by a frame that is not drawn. */
+  noteCop(node, frame) {
+    if (node?.node === this.shown) this.cop?.notePosition(frame);
+  }
+
   /** Draw a frame and write its numbers. */
   draw(node, frame) {
     this.fit(node);
