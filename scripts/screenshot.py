@@ -109,7 +109,7 @@ def session(browser: Browser) -> None:
         # In the first of them: beside the plots are the axis and a margin.
         share = (begin_s + 0.45 * stances[middle]["duration_s"] - from_s) / (to_s - from_s)
         page.mouse.move(box["x"] + 56 + share * (box["width"] - 56 - 12), box["y"] + 100)
-        page.wait_for_selector("#stance-says:not([data-stance=''])")
+        page.wait_for_selector("#readout:not([data-time-s=''])")
         time.sleep(0.5)
         save(page, "session")
 
