@@ -428,7 +428,7 @@ class ScratchFile:
         stored = pa.compress(content, codec="zstd", asbytes=True)
         try:
             if self._file is None:
-                # Stays open as long as this object lives.
+                # Open as long as this object lives.
                 self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115
                 weakref.finalize(self, self._file.close)
             descriptor, written = self._file.fileno(), 0

@@ -255,7 +255,7 @@ function draw() {
   if (state.fresh || isDue) {
     state.fresh = false;
     if (!tileTraces.shown) bars.draw(node, frame, shownMs, isDue);
-    foot.noteCop(node, frame);
+    if (!isDue) foot.noteCop(node, frame);
   }
   if (isDue) { // all numbers, and the foot that contains some, are of one frame
     foot.draw(node, frame);

@@ -410,7 +410,7 @@ class Rig:
         port: str | Callable[[], str] = scene.port
         if port == EMULATED and world is not None:
             emulated = stack.enter_context(world.open_servo(scene, self._line_clock))
-            port = lambda: emulated.port  # noqa: E731
+            port = lambda: emulated.port  # noqa: E731  # read again at each opening
         servo = open_servo(
             port,
             baudrate=scene.baudrate,

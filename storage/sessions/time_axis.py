@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import TypeAdapter
@@ -120,10 +120,11 @@ class TimeAxis:
             FileFormatError: it is none.
         """
         try:
+            parts = TypeAdapter(list[dict[str, Any]]).validate_python(content)
             return TypeAdapter(TimeAxis).validate_python(
                 {
-                    "shifts_ns": [part["shift_ns"] for part in content],  # type: ignore[attr-defined]
-                    "bases": [part["by"] for part in content],  # type: ignore[attr-defined]
+                    "shifts_ns": [part["shift_ns"] for part in parts],
+                    "bases": [part["by"] for part in parts],
                 }
             )
         except (TypeError, KeyError, ValueError) as error:

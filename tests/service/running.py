@@ -34,7 +34,7 @@ from tests.waiting import PATIENCE_S
 T = TypeVar("T")
 
 _NO_TLS = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-"""For clients that speak plain HTTP: to read the authorities' certificates takes each 30 ms."""
+"""For clients that speak plain HTTP: reading the authorities' certificates takes 30 ms a client."""
 
 
 def assert_refused(answer: httpx.Response, status: int, *words: str) -> None:

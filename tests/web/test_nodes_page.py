@@ -145,7 +145,7 @@ def test_tare_all_tares_who_can_be_tared_says_who_cannot_and_can_be_undone(
             page.wait_for_timeout(3000)  # frames to tare from
             held: list[Route] = []
             # The lambda is needed: Playwright sets an attribute of it.
-            page.route("**/tare", lambda route: held.append(route))  # noqa: PLW0108
+            page.route("**/tare", lambda route: held.append(route))  # noqa: PLW0108  # playwright counts parameters
             page.keyboard.press("t")
             expect(page.locator("#notices")).to_have_text(re.compile("^Taring 2 nodes"))
             while len(held) < 2:

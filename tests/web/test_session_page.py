@@ -264,8 +264,7 @@ def test_of_tiles_in_one_row_the_page_says_that_y_is_not_measured(
         return [said([null, null]), said([1, 2])];
       })"""
     alone, plan = open_page(f"{server.url}/nodes").evaluate(asked)
-    words = "not measured: tiles in one row"
-    assert alone == [False, words, "y not measured"]
+    assert alone == [False, "not measured: tiles in one row", "y not measured"]
     assert plan == [True, "1000.0 mm ± 500.0", None]
 
 

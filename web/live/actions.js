@@ -9,6 +9,12 @@ import { byId, duration, el, isInside, localTime, setData, setText } from "../co
 const UNDO_KEY = "foottile.undo"; // survives a reload, not the tab
 const DOUBLE_TAP_MS = 1000; // a second press of Record or Stop within it is one press
 
+/** Focus a button that replaced another one, unless something else has the focus. */
+function moveFocus(from, to) {
+  const { activeElement } = document;
+  if (activeElement === document.body || activeElement === byId(from)) byId(to).focus();
+}
+
 /** Action bar of the live page. */
 export class Actions {
   /**
@@ -72,7 +78,7 @@ export class Actions {
       notice("viewers cannot tare, record or set markers. To log in as operator, press “viewer” beside the title.", { bad: true });
       return;
     }
-    if (button.disabled || button.hidden || this.busy.has(name)) {
+    if (button.disabled || this.busy.has(name)) {
       if (name === "marker" && !this.running().length) notice("no recording is running. Press Record first.", { bad: true });
       else if (["record", "tare"].includes(name) && this.state.cannotRecord) notice(this.state.cannotRecord, { bad: true });
       return;
@@ -117,7 +123,7 @@ export class Actions {
     this.onSession(session);
     notice(`Recording “${session.name}”.`);
     this.draw();
-    if ([document.body, byId("record")].some((element) => element === document.activeElement)) byId("stop").focus();
+    moveFocus("record", "stop");
   }
 
   /** Stop recordings; by default all of the selected node. */
@@ -132,7 +138,7 @@ export class Actions {
     notice(sessions.length > 1 ? `Stopped ${sessions.length} recordings.${pending ? " They are sealed once their last frames arrive." : ""}`
       : `Stopped “${name}”.${pending ? " It is sealed once its last frames arrive." : ""}`);
     this.draw();
-    if ([document.body, byId("stop")].some((element) => element === document.activeElement)) byId("record").focus();
+    moveFocus("stop", "record");
   }
 
   async marker() {
@@ -175,8 +181,9 @@ export class Actions {
     const tare = node?.tare;
     const isOwn = this.undoId && tare?.id === this.undoId;
     const undo = byId("undo", HTMLButtonElement);
-    undo.title = !tare || tare.undone ? "No tare to undo" : isOwn || tare.source === "flight" ? "" : "Only automatic tares, and those of this page, can be undone";
-    undo.disabled = undo.title !== "";
+    const whyNot = !tare || tare.undone ? "No tare to undo" : isOwn || tare.source === "flight" ? "" : "Only automatic tares, and those of this page, can be undone";
+    if (undo.title !== whyNot) undo.title = whyNot;
+    undo.disabled = Boolean(whyNot);
     this.drawRecordings(running);
   }
 

@@ -112,13 +112,12 @@ export class Foot {
     const isNamed = this.grid && 2 * r >= Math.max(NAMES_FROM_PX, LETTER_PX * tile.serial.length);
     const text = (cls, down, content) => svg("text", { class: cls, x, y: y + down, "text-anchor": "middle" }, content);
     const label = text("name", isNamed ? 10 : 4, this.grid ? "" : tile.serial);
-    const above = text("name above", -5, tile.serial);
+    const names = isNamed ? [label, text("name above", -5, tile.serial)] : [label];
     group.append(dome, arrow, cross, svg("title", {}, tile.serial));
-    if (r >= 13) group.append(label);
-    if (isNamed) group.append(above);
+    if (r >= 13) group.append(...names);
     this.turning.append(group);
     setData(group, "reference", String(Boolean(tile.reference)));
-    return { group, dome, arrow, number: this.grid && cell >= NUMBERS_FROM_PX ? label : null, names: [label, above] };
+    return { group, dome, arrow, number: this.grid && cell >= NUMBERS_FROM_PX ? label : null, names };
   }
 
   /** Extend the trail of the COP by a frame that is not drawn. */

@@ -109,9 +109,10 @@ export class Notes {
     for (const old of [...this.list.children]) if (!shown.includes(old)) old.remove();
     shown.forEach((one, i) => { if (this.list.children[i] !== one) this.list.insertBefore(one, this.list.children[i] ?? null); });
     this.fold();
-    const tared = node ? taredText(node, serverNowMs) : "";
+    const [age, kind] = node ? tareTexts(node, serverNowMs) : ["", ""];
+    const tared = age + kind;
     const others = node ? facts(node, frame) : "";
-    setText(byId("tared"), tared.split(",")[0]); // on a phone, where warnings take the line of facts
+    setText(byId("tared"), age); // on a phone, where warnings take the line of facts
     setText(byId("tare-fact"), tared && others ? `${tared} · ` : tared);
     setText(byId("other-facts"), others);
   }
@@ -183,10 +184,10 @@ const tareAge = (tare, serverNowMs) => roughly((serverNowMs - tare.t_ns / 1e6) /
 const SOURCES = { unloaded: "by hand", recognised: "recognised in flight", flight: "in flight" };
 const FOLLOWS = { paused: "automatic tare paused after an undo: press Tare to resume it", off: "automatic tare off" };
 
-/** Return age and kind of the tare, or "". */
-function taredText({ tare }, serverNowMs) {
-  if (!tare || tare.undone) return "";
-  return `Tared ${tareAge(tare, serverNowMs)} ago${SOURCES[tare.source] ? `, ${SOURCES[tare.source]}` : ""}`;
+/** Return age and kind of the tare as texts, both "" without one. */
+function tareTexts({ tare }, serverNowMs) {
+  if (!tare || tare.undone) return ["", ""];
+  return [`Tared ${tareAge(tare, serverNowMs)} ago`, SOURCES[tare.source] ? `, ${SOURCES[tare.source]}` : ""];
 }
 
 /** Return the facts about drift, calibration and clock. */

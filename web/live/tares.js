@@ -11,6 +11,7 @@ export class Tares {
   constructor() {
     this.card = byId("tares-card", HTMLDetailsElement);
     this.shown = "";
+    this.isOpening = false; // the list is scrolled into view once it is loaded
     this.card.addEventListener("toggle", () => {
       this.shown = "";
       this.isOpening = this.card.open;
@@ -52,6 +53,6 @@ function legend(items, drift, { tiles }) {
   if (!known.length) return all;
   const most = known.reduce((a, b) => (Math.abs(b) > Math.abs(a) ? b : a));
   const newtons = Number.isFinite(drift.grf_n_per_hour) ? `, ${number(drift.grf_n_per_hour)} N/h on the foot` : "";
-  const { serial } = tiles[drift.kpa_per_hour.indexOf(most)];
-  return `${all}; drift, a line through the tares of the last 6 h that are not undone: up to ${number(most, 2)} kPa/h (${serial})${newtons}`;
+  const tile = tiles[drift.kpa_per_hour.indexOf(most)]; // none: the tiles have changed meanwhile
+  return `${all}; drift, a line through the tares of the last 6 h that are not undone: up to ${number(most, 2)} kPa/h${tile ? ` (${tile.serial})` : ""}${newtons}`;
 }

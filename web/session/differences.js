@@ -28,11 +28,11 @@ export function differenceOf(own, other) {
 
 /** Return decimals, `least` or more, with which a difference is that of the values as shown. */
 function decimalsFor(own, other, least) {
-  const isTrue = (decimals) => {
+  const agrees = (decimals) => {
     const shown = (value) => Number(value.toFixed(decimals));
     return Math.abs(shown(other) - shown(own) - shown(other - own)) < 0.5 * 10 ** -decimals;
   };
-  return [0, 1, 2].map((more) => least + more).find(isTrue) ?? least + 2;
+  return [0, 1, 2].map((more) => least + more).find(agrees) ?? least + 2;
 }
 
 /** Fill the table with whole stances of this and another session. @param {string} name of the other */

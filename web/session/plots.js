@@ -287,7 +287,10 @@ export class Plots {
     context.lineTo(x(timeS), bottom + 5);
     context.stroke();
     // The line has a gap at a peak and its value: it would hide them.
-    for (const { left, right, top, bottom: foot } of this.peaks) context.clearRect(left, top, right - left, foot - top);
+    const lineX = x(timeS);
+    for (const peak of this.peaks) {
+      if (peak.left <= lineX && lineX <= peak.right) context.clearRect(lineX - 2, peak.top, 4, peak.bottom - peak.top);
+    }
     if (i < 0) return;
     for (const { panel, y } of this.drawn) {
       const value = y && bins.columns[panel.columns[1]]?.[i];

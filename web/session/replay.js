@@ -1,5 +1,6 @@
 // Replay: the live page's foot and bars with the session's frames.
 
+import { ESTIMATE } from "../common/flags.js";
 import { Bars } from "../live/bars.js";
 import { Foot } from "../live/foot.js";
 import { drawGrf } from "../live/grf.js";
@@ -14,9 +15,10 @@ const SPEED_TEXTS = { 0.1: "0.1×", 0.25: "0.25×", 1: "1×", 4: "4×" };
 const JUMP_S = 0.1;
 
 /** Return the GRF of a frame with its 95 % interval, such as "22.1 ± 0.3 N". */
-function forceText({ grf_n: grf, grf_sigma_n: sigma, grf_lower_bound_n: bound }) {
-  if (Number.isFinite(grf)) return `${number(grf)}${Number.isFinite(sigma) ? ` ± ${number(1.96 * sigma)}` : ""} N`;
-  return bound > 0 ? `≥ ${number(Math.floor(bound * 10) / 10)} N` : "force unknown";
+function forceText({ grf_n: grf, grf_sigma_n: sigma, grf_lower_bound_n: bound, estimate_flags: bits = 0 }, node) {
+  const isAssumed = node?.calibration?.absolute_scale === "assumed" || bits & ESTIMATE.ASSUMED_SCALE;
+  if (Number.isFinite(grf)) return `${number(grf)}${Number.isFinite(sigma) ? ` ± ${number(1.96 * sigma)}` : ""} N${isAssumed ? ", assumed scale" : ""}`;
+  return Number.isFinite(bound) ? `≥ ${number(Math.max(0, Math.floor(bound * 10) / 10))} N` : "force unknown";
 }
 
 /** Foot at the cursor, and the player. */
@@ -124,7 +126,7 @@ export class Replay {
     setData(panel, "timeS", frame ? String(frame.timeS) : "");
     setData(panel, "seq", frame ? String(frame.seq) : "");
     setText(byId("replay-time"), frame ? timeText(frame.timeS, 0.001) : "No frame here");
-    setText(byId("replay-force"), frame && samples.whole.estimated ? `, ${forceText(frame)}` : "");
+    setText(byId("replay-force"), frame && samples.whole.estimated ? `, ${forceText(frame, this.node)}` : "");
     setText(byId("replay-frame"), frame ? `, frame ${frame.seq.toLocaleString("en-GB")}` : "");
     if (!this.node) return;
     this.foot.draw(this.node, frame);

@@ -28,6 +28,7 @@ export class StanceOverlay {
     this.other = null; // other session
     this.beside = null; // its mean and spread
     this.chosen = null; // selected stance and its frames
+    this.stopping = null; // of their request
     this.hover = null; // curve and percentage under the pointer
     this.paths = new CopPaths(() => this.draw(), (curve) => this.go(curve.number));
     const card = byId("overlay-card");
@@ -100,16 +101,19 @@ export class StanceOverlay {
   async choose(index) {
     const stance = this.stances[index];
     if (stance?.number === this.chosen?.number) return;
+    this.stopping?.abort();
+    const stopping = this.stopping = new AbortController();
     const chosen = this.chosen = stance ? { number: stance.number, whole: stance.is_whole, bins: null } : null;
     this.draw();
     if (!chosen) return;
     try {
       const answer = await api.overview(this.id, {
         points: FRAMES_MAX, start_s: Math.max(0, stance.from - 1e-7), end_s: stance.to + 1e-6, columns: "grf_n,cop_x_m,cop_y_m",
-      });
+      }, stopping.signal);
       chosen.bins = answer.columns;
       chosen.framesInBin = answer.frames_in_bin;
     } catch (error) {
+      if (stopping.signal.aborted) return;
       if (!(error instanceof api.Refusal)) throw error; // the thin curve stays
     }
     if (chosen === this.chosen) this.draw();

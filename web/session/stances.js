@@ -90,7 +90,7 @@ export class Stances {
     this.selected = selected;
     this.body = byId("stances-rows");
     this.stances = [];
-    this.drawn = -1; // index of the highlighted row
+    this.drawn = null; // index of the stance on display, -1: none; null: nothing is drawn yet
     this.line = byId("stance-text");
     this.figures = new Map(FIGURES.map(({ key }) => [key, el("dd")]));
     byId("stance-figures").replaceChildren(...FIGURES.map(({ key, label }) => el("div", { "data-figure": key }, el("dt", { text: label }), this.figures.get(key))));
@@ -102,8 +102,9 @@ export class Stances {
 
   show(stances) {
     this.stances = stances;
+    if (stances.length && this.current < 0) this.selected = null; // of a URL: there is no such stance
     this.body.replaceChildren();
-    this.drawn = -1;
+    this.drawn = null;
     for (const id of ["stances-card", "stance-line"]) byId(id).hidden = !stances.length;
     this.add();
   }
@@ -136,8 +137,8 @@ export class Stances {
   /** Show the selected stance, and highlight it in the table. */
   draw() {
     const index = this.current;
-    this.showFigures(this.stances[index]);
     if (index === this.drawn) return;
+    this.showFigures(this.stances[index]);
     this.drawn = index;
     while (index >= this.body.children.length) this.add();
     for (const row of this.body.querySelectorAll("[aria-current]")) row.removeAttribute("aria-current");
@@ -160,7 +161,7 @@ export class Stances {
     const shown = stance ?? medianOf(whole);
     for (const figure of FIGURES) {
       const [value, interval] = figureOf(shown, figure);
-      setText(this.figures.get(figure.key), [value, interval && `${interval}`, figure.unit].filter(Boolean).join("\u00a0"));
+      setText(this.figures.get(figure.key), [value, interval, figure.unit].filter(Boolean).join("\u00a0"));
     }
     setText(byId("stance-flags"), stance ? flagsOf(stance).join(", ") : "");
     setData(this.line, "stance", stance ? String(stance.number) : "");

@@ -8,7 +8,7 @@ import { comparisonAddress } from "./row.js";
 
 const ZIP_MAX = 1000; // limit of the server
 
-const many = (count) => `${count} session${count === 1 ? "" : "s"}`;
+export const many = (count) => `${count} session${count === 1 ? "" : "s"}`;
 
 /** Selection of sessions in the list. */
 export class Chosen {

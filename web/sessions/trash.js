@@ -4,8 +4,7 @@ import * as api from "../common/api.js";
 import { ask } from "../common/dialogs.js";
 import { notice, quietly, withdraw } from "../common/notices.js";
 import { byId, bytes, el, localTime, setText } from "../common/text.js";
-
-const countOf = (items) => `${items.length} session${items.length === 1 ? "" : "s"}`;
+import { many } from "./chosen.js";
 
 /** List of deleted sessions. */
 export class Trash {
@@ -31,7 +30,7 @@ export class Trash {
       this.items = items;
       byId("trash").replaceChildren(...items.map((session) => this.row(session)));
       byId("trash-empty").hidden = !items.length;
-      setText(byId("trash-legend"), items.length ? `${countOf(items)}, can be restored` : "empty");
+      setText(byId("trash-legend"), items.length ? `${many(items.length)}, can be restored` : "empty");
     });
     if (number === this.requests) this.answered = number;
   }
@@ -50,18 +49,17 @@ export class Trash {
     return quietly(async () => {
       const restored = await api.restoreSession(session.id);
       withdraw(session.id); // here, since messages of the live socket may be of before the deletion
-      this.onRestored(restored);
+      this.onRestored(restored); // loads the trash again, see `follow`
       notice(`Restored “${restored.name}”.`);
-      await this.load();
     });
   }
 
   async empty() {
-    const what = countOf(this.items);
+    const what = many(this.items.length);
     if (!await ask("Empty the trash?", `${what} will be deleted permanently.`, `Delete ${what}`)) return;
     await quietly(async () => {
       const emptied = await api.emptyTrash();
-      notice(`Deleted ${emptied.sessions} session${emptied.sessions === 1 ? "" : "s"}, ${bytes(emptied.bytes)} freed.`);
+      notice(`Deleted ${many(emptied.sessions)}, ${bytes(emptied.bytes)} freed.`);
       await this.load();
     });
   }

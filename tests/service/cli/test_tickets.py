@@ -104,7 +104,7 @@ def test_a_server_that_no_phone_reaches_shows_no_code(
     ("host", "url", "addresses", "word"),
     [
         ("0.0.0.0", "http://127.0.0.1:8000", [], "no network"),  # noqa: S104  # nothing listens
-        ("0.0.0.0", "http://127.0.0.1:8000", ["fe80::1%eth0"], "--host ::"),  # noqa: S104
+        ("0.0.0.0", "http://127.0.0.1:8000", ["fe80::1%eth0"], "--host ::"),  # noqa: S104  # same
         ("::", "http://[fe80::1%25eth0]:8000", ["fe80::1%eth0"], "the other machine's"),
         ("0.0.0.0", AWAY, ["192.168.4.1"], ""),  # noqa: S104  # nothing listens
         ("127.0.0.1", "http://127.0.0.1:8000", [], ""),

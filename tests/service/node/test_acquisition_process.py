@@ -164,7 +164,7 @@ def opened_after(
     monkeypatch.setattr(service.node.acquisition_process, "_await_stop", lambda *_: None)
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     scene = make_scene(array={"bus": bus})
-    service.node.acquisition_process._run_child(RigOptions(scene, "leg"), connection)  # type: ignore[arg-type]
+    service.node.acquisition_process._run_child(RigOptions(scene, "leg"), connection)  # type: ignore[arg-type]  # double
     return connection.got, closed
 
 
