@@ -4,8 +4,8 @@ A file is written whole or not at all, and synced. Reading follows no links and 
 The lock of a folder keeps out a second process, which would undo what the first one does. A damaged
 file is renamed, never deleted: its owner may still need it.
 
-For data that would take too much memory and can be made again. The disk space is freed when the
-process ends, in whatever way.
+A scratch file is for data that would take too much memory and can be made again. Its disk space is
+freed when the process ends, in whatever way.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ import pyarrow as pa
 from devices.errors import FileFormatError
 from storage.schema import frames_from_record_batch
 
-RECORD_BATCH = 3
+_RECORD_BATCH = 3
 """Type code of a record batch in `MessageHeader`; 2 is a dictionary, 1 a schema."""
 _HEADER_TYPE, _HEADER, _BODY_LENGTH = 1, 2, 3
 _LENGTH, _NODES, _BUFFERS, _COMPRESSION, _VARIADIC = range(5)
@@ -49,7 +49,7 @@ class BatchHeader:
     body_bytes: int
 
 
-def parse_uncompressed_batch_header(message: pa.ipc.Message) -> BatchHeader:
+def _parse_uncompressed_batch_header(message: pa.ipc.Message) -> BatchHeader:
     """Parse the header of a record batch; refuse compression and columns of variable length.
 
     Raises:
@@ -58,7 +58,7 @@ def parse_uncompressed_batch_header(message: pa.ipc.Message) -> BatchHeader:
     content = message.metadata.to_pybytes()
     try:
         root = _Table(content, _u32(content, 0))
-        if root.read_number(_HEADER_TYPE, "<B") != RECORD_BATCH:
+        if root.read_number(_HEADER_TYPE, "<B") != _RECORD_BATCH:
             raise HeaderError(f"it is a {message.type}, and no record batch")
         batch = root.read_table(_HEADER)
         if batch.has_field(_COMPRESSION):
@@ -171,7 +171,7 @@ def compute_layout(message: pa.ipc.Message, schema: pa.Schema) -> MessageLayout:
         FileFormatError: it has no frames, or too many.
         HeaderError: columns or buffers do not fit that many frames.
     """
-    header = parse_uncompressed_batch_header(message)
+    header = _parse_uncompressed_batch_header(message)
     rows = header.rows
     if not 0 < rows <= MAX_MESSAGE_FRAMES:
         raise FileFormatError(

@@ -5,7 +5,8 @@ in a page. A sealed session's footer also has a hash of the footer alone: a read
 columns, offsets and statistics by it in a millisecond, and the pages that it reads by their
 checksums.
 
-The hash is in the footer (`storage.parquet_hash`), and every page has a checksum.
+Small tables, such as markers and clocks of a session, have the file's hash, and a checksum of every
+page.
 """
 
 from __future__ import annotations
@@ -47,12 +48,12 @@ def fill_hash_placeholders_and_sync(path: Path) -> None:
         FileFormatError: the file has no placeholder for its hash.
     """
     with path.open("r+b") as file:
-        fill_hash_placeholders(file, where=str(path))
+        _fill_hash_placeholders(file, where=str(path))
         file.flush()
         os.fsync(file.fileno())
 
 
-def fill_hash_placeholders(file: BinaryIO, *, where: str) -> None:
+def _fill_hash_placeholders(file: BinaryIO, *, where: str) -> None:
     """Fill in the hashes of an open or in-memory Parquet file, where placeholders stand.
 
     Raises:
@@ -90,7 +91,7 @@ def read_stated_and_actual_hash(path: Path) -> HashPair | None:
         return _hashes(file)
 
 
-def compute_stated_and_actual_hash(content: bytes) -> HashPair | None:
+def _compute_stated_and_actual_hash(content: bytes) -> HashPair | None:
     """Return the stated and actual hash of a Parquet file in memory; None if it states none."""
     return _hashes(io.BytesIO(content))
 
@@ -262,7 +263,7 @@ def write_hashed_table(
     with pq.ParquetWriter(sink, table.schema, write_page_checksum=True, **options) as file:
         file.write_table(table, row_group_size=max_group_rows)
         file.add_key_value_metadata({FILE_HASH_KEY.decode(): HASH_PLACEHOLDER.decode()})
-    fill_hash_placeholders(sink, where=str(path))
+    _fill_hash_placeholders(sink, where=str(path))
     write_atomically(path, sink.getvalue())
 
 
@@ -283,7 +284,7 @@ def parse_hashed_table(content: bytes, *, where: str) -> pa.Table:
     Raises:
         DamagedFileError: its hash is wrong or missing, or it is no table.
     """
-    check_file_hash(compute_stated_and_actual_hash(content), where=where)
+    check_file_hash(_compute_stated_and_actual_hash(content), where=where)
     try:
         with pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True) as file:
             # On this thread: if one of Arrow's released `content` last while the interpreter ends,

@@ -48,7 +48,7 @@ class _PandasBlocker(MetaPathFinder):
         return None
 
 
-def skip_pyarrow_pandas_import() -> None:
+def _skip_pyarrow_pandas_import() -> None:
     """Make pyarrow's one attempt to import pandas fail; no effect if pandas is loaded already."""
     if "pandas" in sys.modules:
         return
@@ -60,7 +60,7 @@ def skip_pyarrow_pandas_import() -> None:
         sys.meta_path.remove(finder)
 
 
-skip_pyarrow_pandas_import()  # here: a schema is imported before any array is made
+_skip_pyarrow_pandas_import()  # here: a schema is imported before any array is made
 
 ARRAY_INFO_KEY = b"foottile.array_info"
 ARRAY_HASH_KEY = b"foottile.array_info_sha256"

@@ -6,8 +6,8 @@ stream that any tool can read.
 
 A batch of 25 ms costs as much to decode as thousands of frames, and a journal has 140,000 of them
 an hour. So the bytes of each message are checked against its CRC-32, which is cheap, and everything
-else is checked for all messages together. If any check fails the result is None: the caller then
-decodes batch by batch to find the faulty one.
+else is checked for all messages together. If any check fails, decoding of many messages gives None:
+the caller then decodes batch by batch to find the faulty one.
 """
 
 from __future__ import annotations

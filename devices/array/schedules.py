@@ -1,13 +1,12 @@
 """Schedules of one frame's transfers on the bus, and the time each of them takes.
 
 Each schedule is a function that scans one frame of an array into a `Scan`. `TileArray` handles and
-flags faults; a schedule is only the order. `devices.array.schedules` predicts the durations. At
-400 kHz with four tiles of 1.6 ms: `sequential` 132 frames a second, `simultaneous` 395,
-`pipelined` 544 (hardware.md 4, strategies a, b, c; `per_mux` is d).
+flags faults; a schedule is only the order. At 400 kHz with four tiles of 1.6 ms: `sequential` 132
+frames a second, `simultaneous` 395, `pipelined` 544 (hardware.md 4, strategies a, b, c; `per_mux`
+is d).
 
 Timing model of hardware.md 4: START, repeated START and STOP take one SCL period each, a byte nine;
-every transaction may have a fixed overhead, every sleep an overshoot. The schedules are in
-`devices.array.schedules`.
+every transaction may have a fixed overhead, every sleep an overshoot.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Dome physics: contact force in, gas pressure on the chip out.
 
 Signal chain (hardware.md 9): contact force -> creep of the rubber -> hysteresis -> volume of the
-bubble -> gas temperature -> absolute pressure; the equations are in `dome_equations`.
+bubble -> gas temperature -> absolute pressure.
 
 Pressures of all domes are computed in chunks on a fine time grid, and interpolated at the sample
 instants: the result does not depend on the chunks or on the times of the samples.

@@ -1,7 +1,7 @@
 """Timing of faults of parts, multiplexers and wires, from scene files or injected by tests.
 
-Their effects are in the emulated devices: `mpl115a2` and `front_end` for tiles, `tca9548a` for
-multiplexers, `Line` of `buses.i2c` for the two wires.
+Their effects are in the emulated devices: `mpl115a2` for tiles, `tca9548a` for multiplexers,
+`FaultyWires` of `i2c_bus` for the two wires.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
 A serial is the same part in every scene and session with the same `parts_seed`. Drivers and
 estimators must not read these properties: they use only the bus, and calibration recordings.
 
-The default family (`devices.emulation.parts`) is the basis of stored calibrations and results, and
-never changes. The broad one tests an estimator on unknown domes: its ranges are wider wherever
-hardware.md says "not known", or gives a number of one part only.
+The default family is the basis of stored calibrations and results, and never changes. The broad one
+tests an estimator on unknown domes: its ranges are wider wherever hardware.md says "not known", or
+gives a number of one part only.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Surroundings of the tiles: temperature, atmospheric pressure, water; and the leak of a dome.
 
-The head affects a dome through the compliance of its wall only, and the weather not at all: it is
-sealed, and a session is short. Both affect a bare reference tile directly.
+The head of water affects a dome through the compliance of its wall only, and the weather not at
+all: it is sealed, and a session is short. Head and weather affect a bare reference tile directly.
 
 The leak is a capillary, like a crack or a bad seam: the flow is proportional to the pressure
 difference over the wall. It equalises in some hundredths of a second through a needle's hole, in

@@ -1,7 +1,7 @@
 """Sender of frames to a server: the newest first, then the backlog of missing older ones.
 
-Flow control (`service.node.frame_sender`) bounds the bytes in flight to a part of a second. Answers
-to interleaved pings show how much the server has read.
+Flow control bounds the bytes in flight to a part of a second. Answers to interleaved pings show how
+much the server has read.
 
 A message is in flight until the answer to a later ping shows that it was read. The throughput gives
 the bytes that the link transfers in `WINDOW_S`, and no more are sent ahead: a slow link has half a

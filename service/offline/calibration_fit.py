@@ -50,7 +50,7 @@ RigProgramme = tuple[npt.NDArray[np.object_], npt.NDArray[np.str_]]
 """Programme by frame: serial of the loaded tile, or None, and phase."""
 
 
-def read_rig_programme(session: SealedFileReader) -> RigProgramme | None:
+def _read_rig_programme(session: SealedFileReader) -> RigProgramme | None:
     """Read the calibration programme from a sealed session's markers; None: they have no step.
 
     Raises:
@@ -300,7 +300,7 @@ def _read_marked_programme(session: SealedFileReader) -> RigProgramme:
             expected="a recording in one part",
             remedy="Record again",
         )
-    marked = read_rig_programme(session)
+    marked = _read_rig_programme(session)
     if marked is None:
         raise CalibrationError(
             "not an indentation recording",

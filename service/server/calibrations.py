@@ -180,7 +180,7 @@ class CalibrationStore:
 
 log = logging.getLogger("foottile.fits")
 
-SESSIONS_MAX = 32
+JOB_SESSIONS_MAX = 32
 FRAMES_MAX = 1_000_000
 """Half an hour of the fastest array; all frames are in memory at once."""
 _JOBS_KEPT = 16
@@ -188,10 +188,15 @@ _JOBS_KEPT = 16
 _LOG_LINES_KEPT = 300
 """Number of log lines: more than an array has tiles."""
 _LINE_BYTES = 4000
-_TIMEOUT_S = 1800.0
+_JOB_TIMEOUT_S = 1800.0
 """Time limit, against a process that hangs."""
 _NICENESS = 15
-_COMMAND = (sys.executable, "-c", "from service.cli.main import main; main()", "calibrate")
+_CALIBRATE_COMMAND = (
+    sys.executable,
+    "-c",
+    "from service.cli.main import main; main()",
+    "calibrate",
+)
 _EXIT_TILE_REFUSED = 3
 """Exit code of `foottile calibrate`: file written, but a tile was refused."""
 
@@ -354,7 +359,7 @@ class CalibrationJobs:
         """
         all_options = {"name": fit.name, **options}
         process = await asyncio.create_subprocess_exec(
-            *(*_COMMAND, f"--out={out}"),
+            *(*_CALIBRATE_COMMAND, f"--out={out}"),
             *(f"--{name.replace('_', '-')}={value}" for name, value in all_options.items()),
             *("--", *map(str, paths)),
             stdin=asyncio.subprocess.DEVNULL,
@@ -365,11 +370,11 @@ class CalibrationJobs:
         try:
             with suppress(OSError):
                 os.setpriority(os.PRIO_PROCESS, process.pid, _NICENESS)
-            async with asyncio.timeout(_TIMEOUT_S):
+            async with asyncio.timeout(_JOB_TIMEOUT_S):
                 await self._read_log(fit, process)
                 code = await process.wait()
         except TimeoutError as error:
-            raise StateError(f"not finished after {_TIMEOUT_S:.0f} s") from error
+            raise StateError(f"not finished after {_JOB_TIMEOUT_S:.0f} s") from error
         finally:
             if process.returncode is None:
                 process.kill()

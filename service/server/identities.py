@@ -34,7 +34,6 @@ class IdentityClaim:
     node: str
     challenge: Challenge
     proof: Proof
-    """answer of the machine."""
     address: str
 
 

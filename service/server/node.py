@@ -33,8 +33,8 @@ from storage.durable_files import make_synced_folder, translate_storage_errors
 from storage.intervals import NO_END, NODE_RESTARTED, Intervals, to_open_pairs
 from storage.journal.journal import RING_DURATION_NS, Journal
 
-_OVER_NS = 1_000_000_000
-_JITTER = 1.02
+_RATE_WINDOW_NS = 1_000_000_000
+_RATE_JITTER = 1.02
 
 
 class FrameRateMeter:
@@ -51,7 +51,7 @@ class FrameRateMeter:
         """Add time and number of the newest frame."""
         noted = self._samples
         noted.append((t_mono_ns, seq))
-        while noted[-1][0] - noted[0][0] > _OVER_NS and len(noted) > 2:
+        while noted[-1][0] - noted[0][0] > _RATE_WINDOW_NS and len(noted) > 2:
             noted.popleft()
 
     def rate_hz(self, nominal_hz: float, silent_ns: int | None) -> float | None:
@@ -64,13 +64,13 @@ class FrameRateMeter:
         """
         if len(self._samples) < 2:  # a rate needs two instants
             return None
-        if silent_ns is None or silent_ns > 2 * _OVER_NS:
+        if silent_ns is None or silent_ns > 2 * _RATE_WINDOW_NS:
             return 0.0
         (first_ns, first_seq), (last_ns, last_seq) = self._samples[0], self._samples[-1]
         if last_ns <= first_ns:
             return None
         rate_hz = (last_seq - first_seq) / ((last_ns - first_ns) * 1e-9)
-        return nominal_hz if nominal_hz < rate_hz < _JITTER * nominal_hz else rate_hz
+        return nominal_hz if nominal_hz < rate_hz < _RATE_JITTER * nominal_hz else rate_hz
 
 
 log = logging.getLogger("foottile.nodes")

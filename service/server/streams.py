@@ -3,11 +3,11 @@
 The report is stored in `stream.json` beside the journal: a restarted server still has the reasons
 of losses and the stream's end. `sync` writes it.
 
-The bounds follow from hello, in which a node states its clock and its next number, and from the
-server's clock, which counts suspend and never steps (`service.server_clock`). A node's clock gains
-no more on it than `FAST`; it may fall behind, where the node was suspended. So neither a date that
-was set nor an offset that the node measured changes them, and frames of the past are never beyond
-them.
+The upper bounds of a running stream's frames (`StreamLimit`) follow from hello, in which a node
+states its clock and its next number, and from the server's clock, which counts suspend and never
+steps (`service.server_clock`). A node's clock gains no more on it than `DISCIPLINE_RATE_LIMIT`; it
+may fall behind, where the node was suspended. So neither a date that was set nor an offset that the
+node measured changes them, and frames of the past are never beyond them.
 """
 
 from __future__ import annotations

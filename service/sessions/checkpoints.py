@@ -49,14 +49,10 @@ class Checkpoint:
     part: int = 0
     seq: int = 0
     fed_frames: int = 0
-    """frames fed before."""
     estimated_frames: int = 0
-    """frames estimated before; others wait for their look-ahead."""
     newest_ns: int = -_EVER_NS
     last_estimated: tuple[int, int] | None = None
-    """part and `t_ns` of the last estimated frame; None: there is none."""
     state: ScratchBlock | None = None
-    """saved state of the estimator; None: initial state."""
     begin_ns: int = _EVER_NS
     end_ns: int = -_EVER_NS
 

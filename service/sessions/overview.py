@@ -106,11 +106,9 @@ class BinnedSlice:
 
     bins: Bins
     frames_per_bin: int
-    """number of frames per bin; 1: these are the frames themselves."""
     begin_ns: int
     end_ns: int
     time_axis: TimeAxis
-    """time axis of the session."""
 
 
 def bin_from_overview_or_rebuild(

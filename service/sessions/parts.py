@@ -124,7 +124,11 @@ def split_number(name: str) -> NumberedName:
 
 
 class SeqsAround(NamedTuple):
-    """Stored frames next to a time; `last` is one less than the first that counts if none is."""
+    """Numbers of the stored frames next to a time.
+
+    `last` is at or before it, or one less than the first number that counts if none is; `after` is
+    the next stored one, or `last` + 1.
+    """
 
     last: int
     after: int
@@ -159,7 +163,6 @@ class SessionStream(StreamState):
     info: ArrayInfo | None = None
     journal: Journal | None = None
     find_seqs_around: SeqsAroundFinder | None = None
-    """lookup of the frames next to a time."""
     offset_ns: int | None = None
     last_seen_t_ns: int | None = None
 

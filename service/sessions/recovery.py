@@ -70,7 +70,6 @@ class OpenedStream:
     notes: StreamNotes | None
     damaged: Intervals
     is_node_folder: bool
-    """True: the stream is in its own node's folder."""
 
     @property
     def lost(self) -> Losses:
@@ -155,7 +154,7 @@ class MendedStreams(NamedTuple):
     problems: list[str]
 
 
-def open_and_mend_streams(
+def _open_and_mend_streams(
     data: Path, report_step: Callable[[str], None], *, is_node_folder: bool
 ) -> MendedStreams:
     """Open and mend every journal of a data folder: cut off partial batches, sync the rest.
@@ -192,7 +191,7 @@ def open_and_mend_streams(
     return mended
 
 
-def read_hello_or_empty(data: Path, node: str) -> dict[str, Any]:
+def _read_hello_or_empty(data: Path, node: str) -> dict[str, Any]:
     """Read the node's last hello on the server's disk; empty if it is missing or unreadable."""
     try:
         content = json.loads(read_checksummed_json(data / "nodes" / node / "hello.json"))
@@ -237,13 +236,9 @@ class RecoveryReport:
 
     sessions: list[RecoveredSession] = field(default_factory=list)
     removed_temporaries: list[Path] = field(default_factory=list)
-    """half-written files of dead processes."""
     cut_bytes: dict[str, int] = field(default_factory=dict)
-    """bytes that were cut off, by journal; they are set aside, not deleted."""
     rewritten_markers: list[str] = field(default_factory=list)
-    """sessions whose `markers.parquet` was written again."""
     rebuilt_sessions: list[str] = field(default_factory=list)
-    """sessions whose `session.json` was rebuilt from the files beside it."""
     problems: list[str] = field(default_factory=list)
 
     @property
@@ -290,7 +285,7 @@ def recover_folder(
     before = _find_cut_files(data)
     if _is_node_folder(data):
         recover_node_journals(data)  # frames in flight of a killed node
-    opened, recovery.problems = open_and_mend_streams(
+    opened, recovery.problems = _open_and_mend_streams(
         data, report_step, is_node_folder=_is_node_folder(data)
     )
     for path in sorted(_find_cut_files(data) - before):
@@ -365,7 +360,7 @@ def _seal_if_possible(
             session,
             streams,
             load_tares=lambda: TareHistory(data / "nodes" / session.node / "tares.json"),
-            emulated=read_hello_or_empty(data, session.node).get("emulated"),
+            emulated=_read_hello_or_empty(data, session.node).get("emulated"),
         )
         sealed = seal_session(sources, folder, ledger)
         problems = verify_session(folder, expected_session=sealed).problems
@@ -437,7 +432,7 @@ def _make_sessions(
     for (node, stream_id), stream in streams.items():
         parts = (part for session in known if session.node == node for part in session.parts)
         used = group_numbers_by_stream(parts).get(stream_id, Intervals())
-        journal, hello = stream.journal, read_hello_or_empty(data, node)
+        journal, hello = stream.journal, _read_hello_or_empty(data, node)
         # Lost frames do not split a run; frames that belong to a session do.
         unused = (journal.stored | stream.lost.numbers | stream.damaged) - used
         for run in unused:

@@ -193,13 +193,9 @@ class SessionOverlay:
     overlay: Overlay
     numbers: tuple[int, ...]
     whole_count: int
-    """number of stances that could be overlaid."""
     overlaid_count: int
-    """number of stances in mean and spread: all, or `STANCES_MAX`."""
     partial_count: int
-    """number of stances left out as incomplete."""
     too_short_count: int
-    """number of stances left out as single frames without duration."""
 
 
 def overlay_stances(

@@ -60,7 +60,7 @@ class RecordedTare:
 
         A swapped part has the same serial but another chip.
         """
-        return self.serials == info.serials and self.chips == chip_coefficients(info)
+        return self.serials == info.serials and self.chips == _chip_coefficients(info)
 
     @property
     def is_automatic(self) -> bool:
@@ -92,7 +92,7 @@ class TareFileContent:
     is_damaged: bool = False
 
 
-def chip_coefficients(info: ArrayInfo) -> tuple[tuple[int, ...], ...]:
+def _chip_coefficients(info: ArrayInfo) -> tuple[tuple[int, ...], ...]:
     """Return the coefficients of an array's chips."""
     return tuple(tuple(tile.coefficient_words) for tile in info.tiles)
 
@@ -173,10 +173,10 @@ def _parse_intact(text: bytes) -> tuple[tuple[Entry, ...], int | None]:
         entry = _parse_entry(json.loads(bodies.pop() + b"}")) if len(bodies) == 1 else None
         lost += entry is None
         entries.append(entry or LOST)
-    return merge_lost_runs(entries), lost
+    return _merge_lost_runs(entries), lost
 
 
-def merge_lost_runs(entries: Iterable[Entry]) -> tuple[Entry, ...]:
+def _merge_lost_runs(entries: Iterable[Entry]) -> tuple[Entry, ...]:
     """Return the entries with each run of lost ones merged into one."""
     merged: list[Entry] = []
     for entry in entries:
@@ -328,9 +328,8 @@ class TareHistory:
     ) -> tuple[Tare, ...]:
         """Return the tares in force at some time of an interval, oldest first.
 
-        Those are the last one before it and all within; without one before, the first within is
-        ... `Tare.make_lost` stands for a lost one ..., from the earliest time at
-        which it may have been in force.
+        Those are the last one up to its begin, if there is one, and all within. `Tare.make_lost`
+        stands for a lost one, from the earliest time at which it may have been in force.
         """
         gaps = list(self._lost_intervals())
         valid = [(recorded.tare.t_ns, recorded.tare) for recorded in self._valid_tares(info)]
@@ -377,7 +376,7 @@ class TareHistory:
         """
         reason = (reason or REASONS.get(tare.source, tare.source))[:REASON_LENGTH_MAX]
         recorded = RecordedTare(
-            uuid.uuid4().hex[:12], info.serials, tare, reason, chip_coefficients(info)
+            uuid.uuid4().hex[:12], info.serials, tare, reason, _chip_coefficients(info)
         )
         self._store(_thin_out((*self._entries, recorded)))
         return recorded
@@ -435,4 +434,4 @@ def _thin_out(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
         older = automatic[1 : len(automatic) // 2]
         least = min(older, key=lambda tare: gaps_ns[tare.id])
         entries = tuple(entry for entry in entries if entry is not least)
-    return merge_lost_runs(entries[-KEPT_MAX:])
+    return _merge_lost_runs(entries[-KEPT_MAX:])

@@ -71,7 +71,7 @@ class ClockTable:
         for stream in streams:
             own = rows.get(stream.stream_id)
             if own is not None and len(own):
-                check_rows_in_range(own, stream.stream_id, where)
+                _check_rows_in_range(own, stream.stream_id, where)
                 self._maps[stream.stream_id] = ClockOffsets(own)
 
     def compute_server_time_columns(
@@ -166,7 +166,7 @@ def group_rows_by_stream(rows: Iterable[ClockOffset], *, where: str = "") -> dic
         raise FileFormatError(f"a clock row is out of range: {error}", where=where) from error
 
 
-def check_rows_in_range(rows: OffsetRows, stream_id: str, where: str) -> None:
+def _check_rows_in_range(rows: OffsetRows, stream_id: str, where: str) -> None:
     """Refuse measurements that no clock can give.
 
     Raises:
@@ -372,5 +372,5 @@ def read_clock_file(path: Path) -> StoredClock:
         for stream_id in dict.fromkeys(stream_ids.tolist())
     }
     for stream_id, own in rows.items():
-        check_rows_in_range(own, stream_id, str(path))
+        _check_rows_in_range(own, stream_id, str(path))
     return StoredClock(rows, {stream.stream_id: stream for stream in facts})

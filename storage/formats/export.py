@@ -57,7 +57,7 @@ _SERVER_TIME_BASE = (
 )
 
 
-def describe_completeness_and_axes(
+def _describe_completeness_and_axes(
     notes: Mapping[str, object], provenance: Mapping[str, object], *, has_server_time: bool
 ) -> dict[str, object]:
     """Return completeness, losses, time base and axes of an export of unmodified frames, as JSON.
@@ -192,7 +192,7 @@ class Export:
 
     @property
     def metadata(self) -> dict[str, object]:
-        """Metadata of the file as JSON: session, slice, clock, `storage.formats.export`.
+        """Metadata of the file as JSON: session, slice, clock, completeness and axes.
 
         A format that resamples or fills replaces the facts concerned.
         """
@@ -206,7 +206,7 @@ class Export:
         if self.frame_source.axis.is_shifted:
             chosen[TIME_AXIS_NOTE] = self.frame_source.axis.to_json_list()
         has_server_time = self.clock is not None
-        facts = describe_completeness_and_axes(
+        facts = _describe_completeness_and_axes(
             self.notes, self.provenance, has_server_time=has_server_time
         )
         return {**self.provenance, "node": self.array_info.node, **chosen, **facts}

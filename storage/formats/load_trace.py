@@ -1,9 +1,9 @@
 """Reader of recorded loads, from any table of forces; implausible loads are refused.
 
-Columns, in any case: `time_s`, and either `fz_n, cop_x_m, cop_y_m` or one force per tile,
-`cell1_n, cell2_n, ...`; optionally `angle_rad`. Others are ignored. A FootTile session, sealed or
-exported, has `t_ns` instead, and is converted (`storage.formats.load_trace`). Force platforms
-and OpenSim's ground reactions are read like references.
+Columns, in any case: `time_s`, and either `fz_n, cop_x_m, cop_y_m` or one force per tile, `cell1_n,
+cell2_n, ...`; optionally `angle_rad`. Others are ignored. A FootTile session, sealed or exported,
+has `t_ns` instead, and is converted. Force platforms and OpenSim's ground reactions are read like
+references.
 
 True loads of an emulation (`true_*`) take precedence over estimates, and forces of tiles
 (`force_n_0`, ...) over GRF with centre of pressure (`grf_n`). An unloaded reference tile has no
@@ -36,7 +36,7 @@ from storage.formats.reference import ReferenceOptions, table_to_reference
 from storage.schema import read_array_info
 from storage.sessions.time_axis import NODE_AXIS, TimeAxis
 
-SESSION_COLUMN_PATTERN = re.compile(
+_SESSION_COLUMN_PATTERN = re.compile(
     r"t_ns|part|(true_)?(force_n_\d+|grf_n|cop_[xy]_m|angle_rad)",
 )
 """Pattern of the needed columns."""
@@ -44,7 +44,7 @@ SESSION_COLUMN_PATTERN = re.compile(
 _TOTAL_FORCE_COLUMNS = ("grf_n", "cop_x_m", "cop_y_m")
 
 
-def extract_trimmed_load_trace(
+def _extract_trimmed_load_trace(
     columns: Mapping[str, Column],
     schema: pa.Schema | None,
     *,
@@ -56,7 +56,7 @@ def extract_trimmed_load_trace(
     Rows before the first load and after the last are left out.
 
     Args:
-        columns: columns of a session that match `SESSION_COLUMN_PATTERN`.
+        columns: columns of a session that match `_SESSION_COLUMN_PATTERN`.
         schema: schema of its Parquet file, which may describe the array; None for text.
         where: path of the file, for errors.
         axis: time axis of the session.
@@ -236,7 +236,7 @@ def read_load_trace(path: Path, options: ReferenceOptions | None = None) -> Load
 def _is_trace_column(name: str) -> bool:
     name = name.lower()
     return (
-        bool(_TRACE_COLUMN_PATTERN.fullmatch(name) or SESSION_COLUMN_PATTERN.fullmatch(name))
+        bool(_TRACE_COLUMN_PATTERN.fullmatch(name) or _SESSION_COLUMN_PATTERN.fullmatch(name))
         or name in STANDARD_UNITS
     )
 
@@ -254,7 +254,7 @@ def _read_columns(path: Path, options: ReferenceOptions) -> tuple[dict[str, Colu
             return columns, list(dict.fromkeys([*names, *columns]))
         columns = _lowercase_names(table)
         if INSTANT_COLUMN in columns:
-            columns = extract_trimmed_load_trace(
+            columns = _extract_trimmed_load_trace(
                 columns, table.schema, where=table.where, axis=read_time_axis_or_node_axis(path)
             )
         elif "grf_n" in columns and "fz_n" not in columns and "cell1_n" not in columns:

@@ -2,8 +2,9 @@
 
 Pure functions of intervals, which a running server or files alone may give.
 
-`seq` and `t_mono_ns` rise within a part, and `t_ns` is `t_mono_ns` plus one offset. Every filter
-over time relies on that; a file of another program, or an edited one, need not keep to it.
+Frames of a file are in order: `seq` and `t_mono_ns` rise within a part, and `t_ns` is `t_mono_ns`
+plus one offset. Every filter over time relies on that; a file of another program, or an edited one,
+need not keep to it.
 """
 
 from __future__ import annotations

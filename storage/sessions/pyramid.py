@@ -171,10 +171,10 @@ def merge_bins(bins: Bins, group_size: int) -> Bins:
     """Merge `group_size` bins at a time, or fewer at the end of a part."""
     if not len(bins["part"]):
         return bins
-    return _merge_groups(bins, find_group_starts(bins["part"], group_size))
+    return _merge_groups(bins, _find_group_starts(bins["part"], group_size))
 
 
-def find_group_starts(part: Array, group_size: int) -> npt.NDArray[np.intp]:
+def _find_group_starts(part: Array, group_size: int) -> npt.NDArray[np.intp]:
     """Return the first index of each group of `group_size`; no group extends over two parts."""
     n = len(part)
     begins = np.flatnonzero(np.r_[True, part[1:] != part[:-1]])
@@ -259,7 +259,7 @@ class PyramidBuilder:
 
     def _merge_full_bins(self) -> None:
         frames = concatenate_bins(self._open_frames)
-        starts, n = find_group_starts(frames["part"], FRAMES_PER_FINEST_BIN), len(frames["part"])
+        starts, n = _find_group_starts(frames["part"], FRAMES_PER_FINEST_BIN), len(frames["part"])
         self._open_frames = []
         if n - starts[-1] < FRAMES_PER_FINEST_BIN:
             last, starts = int(starts[-1]), starts[:-1]
@@ -366,7 +366,7 @@ class PreviewBins:
     def _merge_full_bins(self) -> None:
         """Merge pending frames, except those of a bin that is not full yet."""
         frames = concatenate_bins(self._pending)
-        last = int(find_group_starts(frames["part"], self.frames_in_bin)[-1])
+        last = int(_find_group_starts(frames["part"], self.frames_in_bin)[-1])
         end = len(frames["part"])
         full = end if end - last == self.frames_in_bin else last
         self._pending = [_copy_rows(frames, full, end)] if full < end else []

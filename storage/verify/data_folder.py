@@ -44,7 +44,7 @@ class OtherFilesReport:
     set_aside: list[str] = field(default_factory=list)
 
 
-def verify_json_and_server_id(data_folder: Path, verified_folders: set[Path]) -> OtherFilesReport:
+def _verify_json_and_server_id(data_folder: Path, verified_folders: set[Path]) -> OtherFilesReport:
     """Verify `server_id` and every JSON file of a data folder, except in folders done elsewhere.
 
     Token, locks and other files have no checksum.
@@ -71,7 +71,7 @@ def verify_json_and_server_id(data_folder: Path, verified_folders: set[Path]) ->
             elif path == data_folder / SERVER_ID_NAME:
                 _verify_with(path, name, read_server_id, found)
             elif name.endswith(".json") and not name.startswith(".") and not is_verified:
-                verify_checksummed_json(path, _relative_path(path, data_folder), found)
+                _verify_checksummed_json(path, _relative_path(path, data_folder), found)
         # A folder that was set aside, or that has the name of a file, is skipped.
         folders[:] = [
             name for name in folders if ASIDE_SUFFIX not in name and not name.endswith(".json")
@@ -81,7 +81,7 @@ def verify_json_and_server_id(data_folder: Path, verified_folders: set[Path]) ->
     return found
 
 
-def verify_checksummed_json(path: Path, name: str, report: OtherFilesReport) -> None:
+def _verify_checksummed_json(path: Path, name: str, report: OtherFilesReport) -> None:
     """Verify one JSON file, and add any finding under `name`."""
     _verify_with(path, name, read_checksummed_json, report)
 
@@ -178,7 +178,7 @@ def verify_path(path: Path, *, data_folder: Path | None = None) -> Report:
             return verify_journal(path.absolute().parent)
         if path.suffix == ".json":
             others = OtherFilesReport()
-            verify_checksummed_json(path, path.name, others)
+            _verify_checksummed_json(path, path.name, others)
             return DataFolderReport(path, problems=others.problems)
         return verify_export(path) or verify_lone_sealed_file(path)
     if not path.exists():
@@ -233,7 +233,7 @@ def verify_data_folder(path: Path) -> DataFolderReport:
                 )
                 session.problems.append(f"{place}/{stray.name}: {stray.error.what}")
                 report.sessions.append(session)
-    others = verify_json_and_server_id(data, proven)
+    others = _verify_json_and_server_id(data, proven)
     report.problems += others.problems
     report.set_aside = others.set_aside
     return report

@@ -3,9 +3,9 @@
 Sources: e-manual of the MX series and hardware.md 5. The driver has no write commands, so that no
 mistake in a measurement can move a robot.
 
-The register counts 0 to 32767 and wraps (e-manual, Realtime Tick), so after a silence of half a
-minute it is ambiguous. Firmware of Protocol 1.0 before version 40 has no such register; then any
-silence may have been a restart.
+A restart is detected by the Realtime Tick, milliseconds since power-up. It counts 0 to 32767 and
+wraps (e-manual, Realtime Tick), so after a silence of half a minute it is ambiguous. Firmware of
+Protocol 1.0 before version 40 has no such register; then any silence may have been a restart.
 """
 
 from __future__ import annotations

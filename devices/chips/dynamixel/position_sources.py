@@ -118,7 +118,7 @@ class _ServoSourceBase(ABC):
         )
 
     def _read_position(self) -> PositionReading | None:
-        """Read the servo once; None if it failed, which `trouble` explains."""
+        """Read the servo once; None if it failed: the error is kept."""
         try:
             reading = self._turns.unwrap(self._servo.read_position())
         except ServoError as error:

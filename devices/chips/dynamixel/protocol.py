@@ -1,14 +1,10 @@
-"""Common part of both Dynamixel protocols: packets, their decoder, and the protocol's interface.
+"""Dynamixel Protocols 1.0 and 2.0: packets, their decoder, and the interface of a protocol.
 
-Sources: e-manual protocol1.md and protocol2.md, hardware.md 5.1 and 5.2.
+Sources: e-manual protocol1.md, protocol2.md and crc.md, hardware.md 5.1 and 5.2.
 
 Requests and answers have the same form, and a one-wire adapter echoes requests. An answer may equal
 its request: the answer to a ping, with the voltage bit set, is a ping. So the driver sends no
 request whose answer would have the same length: no ping, no read of two bytes.
-
-Sources: e-manual protocol1.md, hardware.md 5.1.
-
-Sources: e-manual protocol2.md and crc.md, hardware.md 5.1.
 """
 
 from __future__ import annotations
@@ -224,7 +220,7 @@ PROTOCOL_1 = _Protocol1()
 
 ALERT = 0x80
 """Bit of the error byte: a hardware error (register at address 70); the answer is valid."""
-ERRORS = (
+_ERRORS_2 = (
     "none",
     "result fail",
     "undefined instruction",
@@ -298,7 +294,7 @@ class _Protocol2(DynamixelProtocol):
         error = packet.parameters[0] if packet.parameters else 0
         refusal, number = "", error & ~ALERT
         if number:
-            meaning = ERRORS[number] if number < len(ERRORS) else "unknown"
+            meaning = _ERRORS_2[number] if number < len(_ERRORS_2) else "unknown"
             refusal = f"error {number}, {meaning}"
         return ServoAnswer(packet, packet.parameters[1:], bool(error & ALERT), refusal)
 

@@ -3,11 +3,11 @@
 A thread answers any program that opens `port`: `devices.chips.dynamixel.driver`, or ROBOTIS's own
 SDK. A pseudo-terminal has no wire, so the time on the wire and the return delay pass on the
 injected clock: with a `SystemClock` an answer takes as long as a servo's, with a `VirtualClock` it
-takes as long in virtual time, while the reader is blocked. The answers are in
-`devices.emulation.chips.dynamixel`. Sources: hardware.md 5.1 and 5.2.
+takes as long in virtual time, while the reader is blocked.
 
-Sources: hardware.md 5 and 5.1, e-manual protocol1.md, protocol2.md and the MX control tables. Not
-documented, so assumed: gaps in the control table read as zero, and a read may begin and end
+Sources: hardware.md 5, 5.1 and 5.2, e-manual protocol1.md, protocol2.md and the MX control tables.
+
+Not documented, so assumed: gaps in the control table read as zero, and a read may begin and end
 anywhere (as in an XM540, DynamixelSDK #175); as the only servo on the line it uses the first slot
 after a broadcast; in 1.0 a read of no bytes, or beyond the table, is out of range. Not implemented:
 writes and bulk reads, which are undefined instructions; fast sync read; in 1.0 the multi-turn

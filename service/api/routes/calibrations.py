@@ -27,7 +27,7 @@ from service.server.broadcast.views import (
     View,
     absolute_scale,
 )
-from service.server.calibrations import SESSIONS_MAX, CalibrationJob, CalibrationSummary
+from service.server.calibrations import JOB_SESSIONS_MAX, CalibrationJob, CalibrationSummary
 from service.server.node import ServerNode
 from service.server.session_store import check_revision
 from service.server_clock import server_utc_ns
@@ -84,7 +84,7 @@ class StartFit(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    sessions: Annotated[tuple[SessionId, ...], Field(min_length=1, max_length=SESSIONS_MAX)] = (
+    sessions: Annotated[tuple[SessionId, ...], Field(min_length=1, max_length=JOB_SESSIONS_MAX)] = (
         Field(description="Test-rig recordings; repeats of a tile may be spread over several.")
     )
     name: Line = Field(examples=["left leg, November"])

@@ -148,7 +148,7 @@ async def get_history(
     came since the server was started; where frames are missing, numbers are missing.
     """
     the_node = server.nodes.get(node)
-    rows = server.broadcaster.get_present_force_history(the_node).get_newest_spans(
+    rows = server.broadcaster.get_or_start_force_history(the_node).get_newest_spans(
         query.seconds, query.before_seq
     )
     age_ms = server.broadcaster.newest_frame_age_ms(the_node)
@@ -170,7 +170,7 @@ async def get_history(
 def _make_tiles_view(
     node: ServerNode, query: RecentQuery, unit: str, server: Server
 ) -> RecentTilesView:
-    recent = server.broadcaster.get_present_tile_history(node)
+    recent = server.broadcaster.get_or_start_tile_history(node)
     spans = recent.get_newest_spans(query.seconds, unit, query.before_seq)
     least, greatest = (
         [_round_four_digits(row) for row in values.tolist()]

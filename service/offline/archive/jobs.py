@@ -92,14 +92,14 @@ def run_job(job: Job) -> Outcome | Unfinished:
     try:
         done = _run_unless_done(job)
     except FootTileError as error:
-        return make_failed_outcome(job, str(error))
+        return _make_failed_outcome(job, str(error))
     except Exception as error:  # one session must not stop the others
         log.exception("%s: this is a bug", where)
-        return make_failed_outcome(job, f"this is a bug: {type(error).__name__}: {error}")
+        return _make_failed_outcome(job, f"this is a bug: {type(error).__name__}: {error}")
     return done if isinstance(done, Unfinished) else Outcome(name, where, *done)
 
 
-def make_failed_outcome(job: Job, reason: str) -> Outcome:
+def _make_failed_outcome(job: Job, reason: str) -> Outcome:
     """Return the outcome of a failed job."""
     return Outcome(job.location.session_id, job.location.uri, "failed", reason=reason)
 
@@ -224,7 +224,7 @@ def run_jobs(jobs: Iterable[Job], map_jobs: JobMapper) -> Iterator[Outcome]:
     """
     for job, outcome in map_jobs(run_job, jobs):
         if isinstance(outcome, WorkerLostError):
-            yield make_failed_outcome(job, str(outcome))
+            yield _make_failed_outcome(job, str(outcome))
         elif isinstance(outcome, Exception):
             raise outcome
         else:

@@ -1,6 +1,7 @@
 """Local copies of sessions and files in object stores, and temporary folders of workers.
 
-They are named by machine and process, because several machines may share the parent folder.
+Temporary folders are named by machine and process, because several machines may share the parent
+folder.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 Files are written first, atomically, then the note with their hashes. Files without a note do not
 count, so an interrupted job runs again. Object stores write objects atomically.
 
-The folder's name contains the hash of version, input and options, so chunks made from other input
-are never used. It is deleted once the result is written.
+The name of the folder of chunks contains the hash of version, input and options, so chunks made
+from other input are never used. It is deleted once the result is written.
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ class ChunkedTask(SessionTask, Protocol):
         """Process the next chunk.
 
         Args:
-            source: as for `run`.
+            source: as for `process_session`.
             chunks_folder: folder of the chunks; the new one is written to it.
 
         Returns:
@@ -97,7 +97,7 @@ class ChunkedTask(SessionTask, Protocol):
         """
 
     def join_chunks(self, source: Path, chunks_folder: Path, result_folder: Path) -> dict[str, Any]:
-        """Make the result of `run` from the folder of the chunks."""
+        """Make the result of `process_session` from the folder of the chunks."""
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,12 @@
 """Alignment of a reference with our force: lag, drift, offset and scale, with intervals.
 
-Cross-correlation finds a coarse lag; robust least squares then fits all four parameters under
-ever narrower windows. The loss is pseudo-Huber, so landings count less, where plate and foot ring
+Cross-correlation finds a coarse lag; robust least squares then fits all four parameters under ever
+narrower windows. The loss is pseudo-Huber, so landings count less, where plate and foot ring
 differently. The residual is `ours - scale (reference - offset)`: noise of the regressor would bias
-the scale low, and the reference is the less noisy of the two. Intervals are those of `blocks`. If
-our foot states its uncertainty, they include errors that repeat in every stance: as if all of that
-uncertainty had one sign, and by the differences between phases of the load.
+the scale low, and the reference is the less noisy of the two. Intervals are those of
+`block_covariance`. If our foot states its uncertainty, they include errors that repeat in every
+stance: as if all of that uncertainty had one sign, and by the differences between phases of the
+load.
 """
 
 from __future__ import annotations

@@ -125,7 +125,7 @@ def estimate_session(
         )
         given = stretch.select_output(stream.estimate_batches(stretch.select_needed(ordered)))
         watched = given if judged is None else judged.observe(given, stream)
-        frames = write_estimates(out, what, notes, stream, watched, on_remark)
+        frames = _write_estimates(out, what, notes, stream, watched, on_remark)
     if not frames or stream.plan is None:
         problem = "the session has no frames" + ("" if part.is_unrestricted else " in that time")
         raise FileFormatError(problem, where=str(source))
@@ -133,7 +133,7 @@ def estimate_session(
     return EstimateResult(frames, stream.plan, begin_t_ns, *found)
 
 
-def write_estimates(
+def _write_estimates(
     out: Path,
     prepared_estimate: PreparedEstimate,
     notes: Mapping[str, object],
@@ -345,7 +345,7 @@ def join_chunks(
         ordered = iterate_checking_order(
             _read_chunks(what, chunks_folder, pieces), where=str(source)
         )
-        frames = write_estimates(out, what, session.notes, stream, ordered, on_remark)
+        frames = _write_estimates(out, what, session.notes, stream, ordered, on_remark)
         begin_t_ns = session.read_span_ns()[0]
     assert stream.plan is not None  # noqa: S101  # it goes on with one
     return EstimateResult(frames, stream.plan, begin_t_ns)

@@ -5,8 +5,8 @@ and framed once per tick, and written to each without waiting. A subscriber that
 last update gets nothing more: its updates are merged until it reads, or until it is disconnected.
 Others are not affected.
 
-Minimum and maximum, so that no peak hides; in half precision, to 0.05 % of the value, which no plot
-shows. Memory: 5 kB per tile and 20 kB for the frames' numbers.
+The history of a tile has minimum and maximum, so that no peak hides; in half precision, to 0.05 %
+of the value, which no plot shows. Memory: 5 kB per tile and 20 kB for the frames' numbers.
 """
 
 from __future__ import annotations
@@ -32,16 +32,19 @@ from service.server.estimates.node_estimator import EstimatedBatch
 from service.server.node import ServerNode
 from service.server_clock import server_utc_ns
 
-UNITS = ("force_n", "gauge_kpa")
-SPAN_PERIOD_NS = 100_000_000
-_SPANS_MAX = int(SECONDS_MAX * 1e9) // SPAN_PERIOD_NS + 2
-_ROW = np.dtype([(name, np.int64) for name in ("seq_first", "seq", "n", "t_ns")])
+TILE_QUANTITIES = ("force_n", "gauge_kpa")
+TILE_SPAN_PERIOD_NS = 100_000_000
+_TILE_SPANS_MAX = int(SECONDS_MAX * 1e9) // TILE_SPAN_PERIOD_NS + 2
+_TILE_SPAN_ROW = np.dtype([(name, np.int64) for name in ("seq_first", "seq", "n", "t_ns")])
 _HALF_MAX = float(np.finfo(np.float16).max)
 Halves = npt.NDArray[np.float16]
 
 
 class TileSpans(NamedTuple):
-    """Merged spans: fields of `ForceSpan` (n,), and extremes (n, tiles)."""
+    """Merged spans: `seq_first`, `seq`, `n` and `t_ns` as of `ForceSpan`, (n,), and extremes.
+
+    Extremes are (n, tiles), in N or kPa by the quantity; NaN where unknown.
+    """
 
     rows: npt.NDArray[np.void]
     minimum: Halves
@@ -59,8 +62,10 @@ class TileHistory:
     def __init__(self, stream_id: str, tile_count: int) -> None:
         self.stream_id = stream_id
         self.tile_count = tile_count
-        self._rows = np.zeros(_SPANS_MAX, _ROW)
-        self._extremes: Halves = np.zeros((_SPANS_MAX, 2, len(UNITS), tile_count), np.float16)
+        self._rows = np.zeros(_TILE_SPANS_MAX, _TILE_SPAN_ROW)
+        self._extremes: Halves = np.zeros(
+            (_TILE_SPANS_MAX, 2, len(TILE_QUANTITIES), tile_count), np.float16
+        )
         self._count = 0
         """Number of spans ever started in the two rings."""
         self._span_begin_ns = 0
@@ -68,19 +73,21 @@ class TileHistory:
     def add_frames(self, span: ForceSpan, columns: Mapping[str, npt.NDArray[Any]]) -> None:
         """Merge published frames into each tile's minimum and maximum."""
         unknown = np.full((1, self.tile_count), np.nan)
-        quantities = [columns.get(unit, unknown).clip(-_HALF_MAX, _HALF_MAX) for unit in UNITS]
+        quantities = [
+            columns.get(name, unknown).clip(-_HALF_MAX, _HALF_MAX) for name in TILE_QUANTITIES
+        ]
         least, greatest = (
             np.array([pick.reduce(values, axis=0) for values in quantities], np.float16)
             for pick in (np.fmin, np.fmax)
         )
-        if self._count and span.t_ns_first - self._span_begin_ns < SPAN_PERIOD_NS:
-            index = (self._count - 1) % _SPANS_MAX
+        if self._count and span.t_ns_first - self._span_begin_ns < TILE_SPAN_PERIOD_NS:
+            index = (self._count - 1) % _TILE_SPANS_MAX
             row, extremes = self._rows[index], self._extremes[index]
             row["seq"], row["n"], row["t_ns"] = span.seq, row["n"] + span.n, span.t_ns
             np.fmin(extremes[0], least, out=extremes[0])
             np.fmax(extremes[1], greatest, out=extremes[1])
             return
-        index, self._span_begin_ns = self._count % _SPANS_MAX, span.t_ns_first
+        index, self._span_begin_ns = self._count % _TILE_SPANS_MAX, span.t_ns_first
         self._rows[index] = span.seq_first, span.seq, span.n, span.t_ns
         self._extremes[index] = least, greatest
         self._count += 1
@@ -92,13 +99,15 @@ class TileHistory:
 
         Args:
             seconds: counted back from the newest frame.
-            quantity: one of `UNITS`.
+            quantity: one of `TILE_QUANTITIES`.
             before_seq: only spans that begin before this number.
         """
-        indices = np.arange(max(0, self._count - _SPANS_MAX), self._count) % _SPANS_MAX
+        indices = np.arange(max(0, self._count - _TILE_SPANS_MAX), self._count) % _TILE_SPANS_MAX
         rows = self._rows[indices]
         keep = select_newest_spans(rows, seconds, before_seq)
-        least, greatest = self._extremes[indices[keep], :, UNITS.index(quantity)].swapaxes(0, 1)
+        least, greatest = self._extremes[
+            indices[keep], :, TILE_QUANTITIES.index(quantity)
+        ].swapaxes(0, 1)
         return TileSpans(rows[keep], least, greatest)
 
 
@@ -270,21 +279,21 @@ class Broadcaster:
         for frames, columns in batches:
             node.published_t_ns = int(frames.t_ns[-1])
             span = summarize_force(frames, columns)
-            self.get_present_force_history(node).add_span(span)
+            self.get_or_start_force_history(node).add_span(span)
             self._get_tile_history(node, frames.tile_count).add_frames(span, columns)
             if self._groups:
                 piece = summarize_frames(node.stream_id, span, frames, columns)
                 for summary in self._pending_updates():
                     summary.add_summary(node.name, piece)
 
-    def get_present_force_history(self, node: ServerNode) -> ForceHistory:
+    def get_or_start_force_history(self, node: ServerNode) -> ForceHistory:
         """Return the force history of a node's present stream, in place of another stream's."""
         recent = self._force_histories.get(node.name)
         if recent is None or recent.stream_id != node.stream_id:
             recent = self._force_histories[node.name] = ForceHistory(node.stream_id)
         return recent
 
-    def get_present_tile_history(self, node: ServerNode) -> TileHistory:
+    def get_or_start_tile_history(self, node: ServerNode) -> TileHistory:
         """Return the tile history of a node's present stream, in place of another stream's."""
         return self._get_tile_history(node, len(node.last_info.tiles))
 

@@ -86,11 +86,11 @@ def nan_max(a: float, b: float) -> float:
 
 
 SECONDS_MAX = 60.0
-SPAN_PERIOD_NS = 1_000_000_000 // 30
+FORCE_SPAN_PERIOD_NS = 1_000_000_000 // 30
 """Least distance between the begins of merged spans: no plot of a minute is finer."""
 _AS_PUBLISHED_NS = 2_000_000_000
 _AS_PUBLISHED_MAX = 128
-_MERGED_MAX = int(SECONDS_MAX * 1e9) // SPAN_PERIOD_NS + 2
+_MERGED_MAX = int(SECONDS_MAX * 1e9) // FORCE_SPAN_PERIOD_NS + 2
 _ROW = np.dtype(
     [
         *((name, np.int64) for name in ("seq_first", "seq", "n", "t_ns_first", "t_ns")),
@@ -152,7 +152,7 @@ class ForceHistory:
     def _merge(self, span: ForceSpan) -> None:
         before = self._last_merged
         if before is not None:
-            if span.t_ns_first - before.t_ns_first < SPAN_PERIOD_NS:
+            if span.t_ns_first - before.t_ns_first < FORCE_SPAN_PERIOD_NS:
                 self._last_merged = before.join(span)
                 return
             self._merged[self._count % _MERGED_MAX] = before

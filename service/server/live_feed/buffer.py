@@ -21,7 +21,7 @@ from service.server.streams import ServerStream
 from service.sessions.pipeline import Columns
 from storage.intervals import NO_END, Intervals, Losses
 
-BYTES_MAX = 8 << 20
+_BUFFER_BYTES_MAX = 8 << 20
 """Limit per node: some 20 s of 8 tiles at 544 Hz, more of fewer."""
 _BATCH_OVERHEAD_BYTES = 3000
 """Size of a batch beside its numbers: some forty numpy objects."""
@@ -58,7 +58,9 @@ class FeedBuffer:
         bytes_max: size limit.
     """
 
-    def __init__(self, recompute_turn: asyncio.Semaphore, bytes_max: int = BYTES_MAX) -> None:
+    def __init__(
+        self, recompute_turn: asyncio.Semaphore, bytes_max: int = _BUFFER_BYTES_MAX
+    ) -> None:
         self.recompute_turn = recompute_turn
         self.encode_cache = EncodeCache()
         """Encoded messages of the batches."""

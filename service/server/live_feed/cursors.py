@@ -43,13 +43,9 @@ class Recompute:
     """
 
     position: Position
-    """first frame."""
     last_seq: int
-    """greatest stored number."""
     is_final: bool
-    """True: no more frames of this stream will come."""
     until_seq: int | None
-    """first number in the buffer; None: the buffer has none."""
 
 
 class LosslessCursor:

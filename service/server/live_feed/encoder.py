@@ -27,14 +27,14 @@ from storage.schema import (
     to_flat_column,
 )
 
-BYTES_MAX = 4 << 20
+_CACHE_BYTES_MAX = 4 << 20
 """Limit per node: a second of 64 tiles at 544 Hz, more of fewer."""
 
 
 class EncodeCache:
     """LRU cache of encoded messages, bounded in bytes."""
 
-    def __init__(self, bytes_max: int = BYTES_MAX) -> None:
+    def __init__(self, bytes_max: int = _CACHE_BYTES_MAX) -> None:
         self._messages: OrderedDict[Hashable, bytes] = OrderedDict()
         self._bytes_max = bytes_max
         self.size_bytes = 0

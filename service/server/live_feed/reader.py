@@ -1,13 +1,13 @@
 """Reader of the live feed: next events by its policy, from the buffer or the journal.
 
 A reader is a position, not a queue: a slow reader costs no memory. The next event is decided in
-`lossless_cursor` and `lossy_cursor`; this module waits for it, and recomputes frames in a thread,
-one reader after the other.
+`cursors`; `FeedReader` waits for it, and recomputes frames in a thread, one reader after the other.
 
-With the live look-ahead, and the tare that was in force. The recorded epochs of the server's own
-estimates are repeated, so that the bits are the same, if the frames before were there then, too.
-For the time before the server was started the history of tares says which tare was in force, by the
-frames' times; models start so many frames earlier that their initial state is forgotten.
+Frames that are no longer buffered are estimated again as they were live: with the live look-ahead,
+and the tare that was in force. The recorded epochs of the server's own estimates are repeated, so
+that the bits are the same, if the frames before were there then, too. For the time before the
+server was started the history of tares says which tare was in force, by the frames' times; models
+start so many frames earlier that their initial state is forgotten.
 """
 
 from __future__ import annotations

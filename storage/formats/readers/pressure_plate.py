@@ -69,20 +69,20 @@ def read_npz_pressure_plate(path: Path, values_max: int) -> ForceTable:
     area_m2 = float(pitch_m.prod()) if named[0] == "pressure_kpa" else 1.0
     force_n = cells * (_CELL_FACTORS[named[0]] * area_m2)
     x_m, y_m = (origin_m[i] + pitch_m[i] * np.arange(cells.shape[i + 1]) for i in (0, 1))
-    grf_n, (cop_x_m, cop_y_m) = compute_total_force_and_cop(force_n, x_m, y_m)
+    grf_n, (cop_x_m, cop_y_m) = _compute_total_force_and_cop(force_n, x_m, y_m)
     columns = {"time_s": time_s, "grf_n": grf_n, "cop_x_m": cop_x_m, "cop_y_m": cop_y_m}
     notes = (f"a plate of {cells.shape[1]} by {cells.shape[2]} cells, added up",)
     return make_table_with_standard_names(where, columns, columns, notes=notes)
 
 
 class TotalForce(NamedTuple):
-    """Force of all cells (n,), and its centre of pressure (2, n), NaN without load."""
+    """Force of all cells (n,) in N, and its centre of pressure (2, n) in m, NaN without load."""
 
     force_n: Floats
     cop_m: Floats
 
 
-def compute_total_force_and_cop(force_n: Floats, x_m: Floats, y_m: Floats) -> TotalForce:
+def _compute_total_force_and_cop(force_n: Floats, x_m: Floats, y_m: Floats) -> TotalForce:
     """Add up the cells of each of n frames.
 
     Args:
@@ -169,7 +169,7 @@ def parse_tekscan_force_and_cop(text: str, where: str, values_max: int) -> Force
         np.asarray(pitch * ((count - 1) / 2 - np.arange(count)), dtype=np.float64)
         for pitch, count in zip(pitch_m, (rows, columns), strict=True)
     )
-    force_n, cop_m = compute_total_force_and_cop(
+    force_n, cop_m = _compute_total_force_and_cop(
         pressure * (_PASCALS[unit.lower()] * area_m2), x_m, y_m
     )
     notes = [f"a sensor of {rows} by {columns} cells, added up"]

@@ -48,7 +48,7 @@ _NUMBER_TYPES: Mapping[str, tuple[int, int]] = {
 """Class of array and type of data by numpy type, from MathWorks' "MAT-File Format"."""
 _MATRIX, _FLAGS, _SIZE, _NAME = 14, 6, 5, 1
 """Types of elements, from the same tables."""
-HEADER_BYTES = 128
+_HEADER_BYTES = 128
 """Length of a file's header; variables follow."""
 BYTES_MAX = 2**31 - 1
 """Limit of a variable's length in MATLAB."""
@@ -57,7 +57,7 @@ _MATRIX_HEAD_BYTES = 56
 _EMPTY = np.empty((0, 0))
 
 
-def encode_mat_file(variables: Mapping[str, object]) -> bytes:
+def _encode_mat_file(variables: Mapping[str, object]) -> bytes:
     """Return a file of these variables, encoded by scipy."""
     from scipy.io import savemat
 
@@ -67,15 +67,15 @@ def encode_mat_file(variables: Mapping[str, object]) -> bytes:
     return content
 
 
-def encode_mat_variable(name: str, value: object) -> bytes:
+def _encode_mat_variable(name: str, value: object) -> bytes:
     """Return an encoded variable, without the file's header."""
-    return encode_mat_file({name: value})[HEADER_BYTES:]
+    return _encode_mat_file({name: value})[_HEADER_BYTES:]
 
 
-def encode_mat_matrix(
+def _encode_mat_matrix(
     name: str, shape: tuple[int, int], number_type: npt.DTypeLike, chunks: Iterable[Array]
 ) -> Iterator[bytes]:
-    """Yield an encoded variable of numbers while `pieces` is read.
+    """Yield an encoded variable of numbers while `chunks` is read.
 
     Args:
         name: name of the variable.
@@ -102,7 +102,7 @@ def encode_mat_matrix(
 
 
 @dataclass(frozen=True)
-class StructField:
+class _StructField:
     """Field of a struct.
 
     Attributes:
@@ -114,7 +114,7 @@ class StructField:
     encode: Callable[[], bytes]
 
     @classmethod
-    def from_value(cls, value: object) -> StructField:
+    def from_value(cls, value: object) -> _StructField:
         """Return a field whose small value is encoded now."""
         content = _encode_element(value)
         return cls(len(content), lambda: content)
@@ -125,8 +125,8 @@ class StructField:
         shape: tuple[int, int],
         number_type: npt.DTypeLike,
         compute_matrix: Callable[[], object],
-    ) -> StructField:
-        """Return a field of numbers of this shape and class, computed by `make` when written."""
+    ) -> _StructField:
+        """Return a field of numbers, computed by `compute_matrix` when written."""
         size = shape[0] * shape[1] * np.dtype(number_type).itemsize
         in_tag = size <= 4  # up to 4 bytes are stored in the tag of the numbers
         return cls(
@@ -135,8 +135,8 @@ class StructField:
         )
 
 
-def encode_mat_struct_array(
-    name: str, structs: Sequence[Mapping[str, StructField]]
+def _encode_mat_struct_array(
+    name: str, structs: Sequence[Mapping[str, _StructField]]
 ) -> Iterator[bytes]:
     """Yield an encoded array of structs; each has the fields of all, missing ones are empty.
 
@@ -149,9 +149,9 @@ def encode_mat_struct_array(
     for key in names:
         for i in range(len(structs)):
             plain[key][0, i] = _EMPTY
-    head = bytearray(encode_mat_variable(name, plain))
+    head = bytearray(_encode_mat_variable(name, plain))
     del head[len(head) - _MATRIX_HEAD_BYTES * plain.size * len(names) :]
-    nothing = StructField.from_value(_EMPTY)
+    nothing = _StructField.from_value(_EMPTY)
     fields = [element.get(key, nothing) for element in structs for key in names]
     struct.pack_into("<I", head, 4, len(head) - 8 + sum(field.size_bytes for field in fields))
     yield bytes(head)
@@ -162,31 +162,31 @@ def encode_mat_struct_array(
         yield content
 
 
-def estimate_struct_array_bytes(structs: Sequence[Mapping[str, StructField]]) -> int:
+def _estimate_struct_array_bytes(structs: Sequence[Mapping[str, _StructField]]) -> int:
     """Return the approximate length of an array of these structs in bytes."""
     return sum(field.size_bytes for element in structs for field in element.values())
 
 
 def _encode_element(value: object) -> bytes:
     """Return a value encoded as in a struct, without a name."""
-    empty = len(encode_mat_variable("s", {"f": _EMPTY})) - _MATRIX_HEAD_BYTES
-    return encode_mat_variable("s", {"f": value})[empty:]
+    empty = len(_encode_mat_variable("s", {"f": _EMPTY})) - _MATRIX_HEAD_BYTES
+    return _encode_mat_variable("s", {"f": value})[empty:]
 
 
-def list_mat_quantities(export: Export) -> list[Column]:
+def _list_mat_quantities(export: Export) -> list[Column]:
     """Return the selected quantities in column order, without `marker` and `time_utc`."""
     chosen = dict.fromkeys(export.map_columns_to_quantities().values())
     return [COLUMNS_BY_NAME[of] for of in chosen if of not in ("time_utc", "marker")]
 
 
-def list_selected_columns_or_name(export: Export, quantity: Column) -> list[str]:
+def _list_selected_columns_or_name(export: Export, quantity: Column) -> list[str]:
     """Return the selected columns of a quantity; its own name if no column is selected."""
     return [
         name for name, of in export.map_columns_to_quantities().items() if of == quantity.name
     ] or [quantity.name]
 
 
-def choose_mat_number_type(quantity: Column) -> npt.DTypeLike:
+def _choose_mat_number_type(quantity: Column) -> npt.DTypeLike:
     """Return the class of a quantity's numbers; for a text, of the codes of its kinds."""
     kind = quantity.type
     if pa.types.is_string(kind):
@@ -197,21 +197,21 @@ def choose_mat_number_type(quantity: Column) -> npt.DTypeLike:
     return np.float32 if kind.bit_width <= 16 else np.float64
 
 
-def read_mat_variables(export: Export, quantity: Column) -> Mapping[str, Array]:
+def _read_mat_variables(export: Export, quantity: Column) -> Mapping[str, Array]:
     """Read a quantity as a variable by name, (frames, columns); for a text with its kinds."""
-    names = list_selected_columns_or_name(export, quantity)
+    names = _list_selected_columns_or_name(export, quantity)
     pieces = list(_minimal_export(export, quantity).read_chunks(names))
     flat = [np.concatenate([piece[name] for piece in pieces]) for name in names]
     if pa.types.is_string(quantity.type):
         kinds, codes = np.unique(flat[0].astype(str), return_inverse=True)
-        numbers = (codes + 1).astype(choose_mat_number_type(quantity))[:, None]
+        numbers = (codes + 1).astype(_choose_mat_number_type(quantity))[:, None]
         return {quantity.name: numbers, f"{quantity.name}_kinds": np.array(kinds, dtype=object)}
     return {quantity.name: np.stack([_to_number_type(quantity, values) for values in flat], axis=1)}
 
 
-def read_chunks_column_by_column(export: Export, quantity: Column) -> Iterator[Array]:
+def _read_chunks_column_by_column(export: Export, quantity: Column) -> Iterator[Array]:
     """Read the numbers of a quantity in chunks, column after column."""
-    for name in list_selected_columns_or_name(export, quantity):
+    for name in _list_selected_columns_or_name(export, quantity):
         for piece in _minimal_export(export, quantity).read_chunks([name]):
             yield _to_number_type(quantity, piece[name])
 
@@ -224,13 +224,13 @@ def _minimal_export(export: Export, column: Column) -> Export:
 
 def _to_number_type(column: Column, values: Array) -> Array:
     """Return the numbers in the quantity's class, NaN where unknown."""
-    found = values.astype(choose_mat_number_type(column))
+    found = values.astype(_choose_mat_number_type(column))
     if column.missing_value is not None and found.dtype.kind == "f":
         found[values == column.missing_value] = np.nan
     return found
 
 
-def make_about_struct(export: Export) -> dict[str, Any]:
+def _make_about_struct(export: Export) -> dict[str, Any]:
     """Return the file's metadata; values that are no text are JSON."""
     facts = {
         **export.metadata,
@@ -248,7 +248,7 @@ def _to_text(value: object) -> object:
     return value
 
 
-def make_tile_struct(export: Export) -> dict[str, Any]:
+def _make_tile_struct(export: Export) -> dict[str, Any]:
     """Return serials and positions of the tiles."""
     tiles = export.array_info.tiles
     places = np.array([(t.x_m, t.y_m, t.z_m) for t in tiles], dtype=np.float64)
@@ -258,7 +258,7 @@ def make_tile_struct(export: Export) -> dict[str, Any]:
     }
 
 
-def make_marker_struct(export: Export) -> dict[str, Any]:
+def _make_marker_struct(export: Export) -> dict[str, Any]:
     """Return labels, instants in the server's UTC, and rows of the markers.
 
     Rows count from 1; NaN: no frame of this file.
@@ -288,31 +288,31 @@ _HEADER_TEXT_BYTES = 116
 
 
 def _encode(export: Export) -> Iterator[bytes]:
-    quantities = list_mat_quantities(export)
+    quantities = _list_mat_quantities(export)
     # Refuses too many frames before the first chunk.
     frames = len(_read_instants(export)["t_ns"])
-    yield _encode_header(export) + encode_mat_variable("about", make_about_struct(export))
+    yield _encode_header(export) + _encode_mat_variable("about", _make_about_struct(export))
     yield from _encode_meanings(quantities)
-    yield encode_mat_variable("tiles", make_tile_struct(export))
+    yield _encode_mat_variable("tiles", _make_tile_struct(export))
     if export.markers is not None:
-        yield encode_mat_variable("markers", make_marker_struct(export))
+        yield _encode_mat_variable("markers", _make_marker_struct(export))
     for column in quantities:
         if pa.types.is_string(column.type):
-            for name, values in read_mat_variables(export, column).items():
-                yield encode_mat_variable(name, values)
+            for name, values in _read_mat_variables(export, column).items():
+                yield _encode_mat_variable(name, values)
             continue
-        shape = frames, len(list_selected_columns_or_name(export, column))
-        yield from encode_mat_matrix(
+        shape = frames, len(_list_selected_columns_or_name(export, column))
+        yield from _encode_mat_matrix(
             column.name,
             shape,
-            choose_mat_number_type(column),
-            read_chunks_column_by_column(export, column),
+            _choose_mat_number_type(column),
+            _read_chunks_column_by_column(export, column),
         )
 
 
 def _encode_together(exports: Sequence[Export]) -> Iterator[bytes]:
     found = [_make_struct_fields(export) for export in exports]
-    if (size := estimate_struct_array_bytes(found)) > BYTES_MAX:
+    if (size := _estimate_struct_array_bytes(found)) > BYTES_MAX:
         raise UsageError(
             f"there are {size} bytes in these sessions, and {BYTES_MAX} in a variable at most",
             expected="fewer columns, or a slice",
@@ -321,40 +321,40 @@ def _encode_together(exports: Sequence[Export]) -> Iterator[bytes]:
     yield from _encode_meanings(
         [column for export in exports for column in _quantities_with_server_time(export)]
     )
-    yield from encode_mat_struct_array("sessions", found)
+    yield from _encode_mat_struct_array("sessions", found)
 
 
-def _make_struct_fields(export: Export) -> dict[str, StructField]:
+def _make_struct_fields(export: Export) -> dict[str, _StructField]:
     rows = len(get_instants_on_export_clock_ns(export, _read_instants(export)))
     fields = {
-        "node": StructField.from_value(export.array_info.node),
-        "about": StructField.from_value(make_about_struct(export)),
+        "node": _StructField.from_value(export.array_info.node),
+        "about": _StructField.from_value(_make_about_struct(export)),
     }
-    fields["tiles"] = StructField.from_value(make_tile_struct(export))
+    fields["tiles"] = _StructField.from_value(_make_tile_struct(export))
     if export.markers is not None:
-        fields["markers"] = StructField.from_value(make_marker_struct(export))
+        fields["markers"] = _StructField.from_value(_make_marker_struct(export))
     for column in _quantities_with_server_time(export):
         if pa.types.is_string(column.type):
             fields |= {
-                name: StructField.from_value(v)
-                for name, v in read_mat_variables(export, column).items()
+                name: _StructField.from_value(v)
+                for name, v in _read_mat_variables(export, column).items()
             }
             continue
-        width = len(list_selected_columns_or_name(export, column))
+        width = len(_list_selected_columns_or_name(export, column))
         make = partial(_read_values, export, column)
-        fields[column.name] = StructField.from_matrix_function(
-            (rows, width), choose_mat_number_type(column), make
+        fields[column.name] = _StructField.from_matrix_function(
+            (rows, width), _choose_mat_number_type(column), make
         )
     return fields
 
 
 def _quantities_with_server_time(export: Export) -> list[Column]:
     """Return the selected quantities, and always the server's time, the sessions' common axis."""
-    return list(dict.fromkeys([*list_mat_quantities(export), *SERVER_TIME_COLUMNS]))
+    return list(dict.fromkeys([*_list_mat_quantities(export), *SERVER_TIME_COLUMNS]))
 
 
 def _read_values(export: Export, column: Column) -> Array:
-    return read_mat_variables(export, column)[column.name]
+    return _read_mat_variables(export, column)[column.name]
 
 
 def _read_instants(export: Export) -> dict[str, Array]:
@@ -366,15 +366,17 @@ def _read_instants(export: Export) -> dict[str, Array]:
 
 
 def _encode_meanings(quantities: Sequence[Column]) -> Iterator[bytes]:
-    yield encode_mat_variable("units", {column.name: column.unit for column in quantities})
-    yield encode_mat_variable("meaning", {column.name: column.description for column in quantities})
+    yield _encode_mat_variable("units", {column.name: column.unit for column in quantities})
+    yield _encode_mat_variable(
+        "meaning", {column.name: column.description for column in quantities}
+    )
 
 
 def _encode_header(export: Export) -> bytes:
     """Return scipy's header without the time of day in its text: equal exports are equal files."""
     text = f"MATLAB 5.0 MAT-file, written by {export.array_info.software}"
     shown = text.encode("ascii", "replace")[:_HEADER_TEXT_BYTES].ljust(_HEADER_TEXT_BYTES)
-    return shown + encode_mat_file({})[_HEADER_TEXT_BYTES:HEADER_BYTES]
+    return shown + _encode_mat_file({})[_HEADER_TEXT_BYTES:_HEADER_BYTES]
 
 
 MATLAB = ExportFormat(

@@ -117,7 +117,7 @@ class FootLoads:
         )
 
 
-def compute_gapless_foot_loads(
+def _compute_gapless_foot_loads(
     reaction: GroundReaction, export: Export, *, is_only_foot: bool
 ) -> FootLoads:
     """Compute the loads on the foot at each sample, with unknown numbers filled.
@@ -281,7 +281,7 @@ def _make_feet(exports: Sequence[Export]) -> list[ExportedFoot]:
             )
     found = read_reactions_on_common_axis(exports, [GROUND_X], FRAMES_MAX // len(exports))
     loads = [
-        compute_gapless_foot_loads(each, export, is_only_foot=is_alone)
+        _compute_gapless_foot_loads(each, export, is_only_foot=is_alone)
         for each, export in zip(found, exports, strict=True)
     ]
     return [

@@ -39,7 +39,7 @@ from storage.journal.stream_notes import StreamNotes
 from storage.wire import EncodedBatch, encode_as_messages
 
 
-def recover_ended_stream(folder: Path, problems: list[str]) -> NodeStream | None:
+def _recover_ended_stream(folder: Path, problems: list[str]) -> NodeStream | None:
     """Open an earlier process's stream as ended, its frames in flight queued; or None.
 
     Damaged files are set aside, with a message in `problems`.
@@ -354,7 +354,7 @@ class NodeJournal:
                 folders = [path for path in self.folder.iterdir() if path.is_dir()]
             for folder in folders:
                 try:
-                    stream = recover_ended_stream(folder, self.problems)
+                    stream = _recover_ended_stream(folder, self.problems)
                 except (FileFormatError, StorageError) as error:
                     self.problems.append(f"a stream is skipped: {error}")
                     continue

@@ -2,7 +2,8 @@
 
 Metadata follow the messages because the largest bound of the server's time is known only then.
 
-The template is a message encoded by the format's library; only numbers are replaced in it.
+Messages of equal length are copies of a template, which the format's library encodes; only numbers
+are replaced in them.
 """
 
 from __future__ import annotations
@@ -95,7 +96,7 @@ def to_floats_with_nan(quantity_name: str, values: Array) -> Array:
     return found
 
 
-def read_frame_chunks(export: Export, columns: list[str]) -> Iterator[FrameChunk]:
+def _read_frame_chunks(export: Export, columns: list[str]) -> Iterator[FrameChunk]:
     """Read a session's frames in chunks, with these columns.
 
     Raises:
@@ -155,7 +156,7 @@ def _encode_together(exports: Sequence[Export]) -> Iterator[bytes]:
             remedy="Leave columns out, or ask for messages=foxglove",
         )
     needed = ros2.list_ros2_columns if is_ros2 else foxglove.list_foxglove_columns
-    pieces = [read_frame_chunks(export, needed(export)) for export in exports]
+    pieces = [_read_frame_chunks(export, needed(export)) for export in exports]
     firsts = [next(frames) for frames in pieces]  # errors are raised before the first chunk
     sink = DrainedBuffer()
     writer = Writer(sink, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.server.broadcast.history import (
+    FORCE_SPAN_PERIOD_NS,
     SECONDS_MAX,
-    SPAN_PERIOD_NS,
     ForceHistory,
     ForceSpan,
     nan_max,
@@ -130,8 +130,8 @@ def test_older_spans_are_joined_and_the_newest_are_as_they_were_told() -> None:
     rows = recent.get_newest_spans(SECONDS_MAX)
     apart_ns = np.diff(rows["t_ns_first"])
     assert (rows["n"][-100:] == 1).all()
-    assert (apart_ns[:-130] >= SPAN_PERIOD_NS).all()
-    assert (apart_ns[:-130] < SPAN_PERIOD_NS + 2 * PERIOD_NS).all()
+    assert (apart_ns[:-130] >= FORCE_SPAN_PERIOD_NS).all()
+    assert (apart_ns[:-130] < FORCE_SPAN_PERIOD_NS + 2 * PERIOD_NS).all()
 
 
 @pytest.mark.parametrize("seconds", [0.5, 5.0, 10.0, 60.0])

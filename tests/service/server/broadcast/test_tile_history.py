@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.server.broadcast.broadcaster import SPAN_PERIOD_NS, UNITS, TileHistory
+from service.server.broadcast.broadcaster import TILE_QUANTITIES, TILE_SPAN_PERIOD_NS, TileHistory
 from service.server.broadcast.history import summarize_force
 from tests.builders.arrays import PERIOD_NS
 from tests.builders.frames import make_frames
@@ -33,7 +33,7 @@ def filled(runs: list[tuple[int, int]], tiles: int = 2) -> TileHistory:
 @settings(max_examples=40, deadline=None)
 @given(
     st.lists(st.tuples(st.sampled_from([0, 0, 0, 1, 400]), st.integers(1, 60)), min_size=1),
-    st.sampled_from(UNITS),
+    st.sampled_from(TILE_QUANTITIES),
 )
 def test_least_and_greatest_are_those_of_the_frames_to_half_a_part_in_a_thousand(
     runs: list[tuple[int, int]], unit: str
@@ -64,7 +64,7 @@ def test_it_is_a_minute_in_tenths_of_a_second_and_no_more_of_it_than_is_asked_fo
     recent = filled([(0, 10)] * int(80e9 / (10 * PERIOD_NS)))
     rows, *_ = recent.get_newest_spans(60.0, "force_n")
     assert 590 <= len(rows) <= 602
-    assert (np.diff(rows["t_ns"]) >= SPAN_PERIOD_NS - 10 * PERIOD_NS).all()
+    assert (np.diff(rows["t_ns"]) >= TILE_SPAN_PERIOD_NS - 10 * PERIOD_NS).all()
     some, *_ = recent.get_newest_spans(10.0, "force_n")
     assert 98 <= len(some) <= 101
     before = int(rows["seq_first"][300])
