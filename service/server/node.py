@@ -375,7 +375,8 @@ class ServerNode:
             if stream is self.present_stream:
                 if self.last_t_ns is not None:
                     stream.delete_older(self.last_t_ns - RING_DURATION_NS, needed)
-            elif not needed:
+            elif not needed and (not stream.unacked or self.storage_problem is not None):
+                # The node waits for their acknowledgement; on a full disk, room comes first.
                 is_there = stream.journal is not None
                 stream.delete_journal()
                 if name not in self.stream_order:

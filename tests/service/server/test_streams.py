@@ -228,6 +228,17 @@ def test_what_was_deleted_because_nobody_needs_it_is_not_lost_even_after_a_resta
     assert told.node.present_stream_lost_by_reason == {}
 
 
+def test_frames_that_no_session_needs_are_acknowledged_before_they_are_deleted(told: Told) -> None:
+    told.connect(earlier=(told.earlier(stored=((0, 4),), next_seq=5),))
+    told.take(0, 4, OLD)
+    assert not told.node.delete_unneeded_step({})
+    assert told.synced()[OLD] == Intervals([(0, 4)])
+    assert told.node.delete_unneeded_step({})
+    told.take(0, 4, OLD)
+    told.node.storage_problem = "the disk is full"
+    assert told.node.delete_unneeded_step({})  # it makes room
+
+
 def test_of_the_present_stream_all_is_asked_for_and_what_sessions_need_first(told: Told) -> None:
     told.connect(stored=((0, 99),), next_seq=100)
     assert told.lacks() == {NEW: [(0, None)]}
