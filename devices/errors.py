@@ -1,6 +1,6 @@
 """Errors that FootTile raises on purpose.
 
-    FootTileError
+FootTileError
      +-- SceneError            (ValueError)    a scene file is wrong; exit code 2
      +-- UsageError            (ValueError)    a command's options do not fit together; exit code 2
      |    +-- MissingExtraError                the installation lacks a required package
@@ -47,7 +47,35 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import ClassVar, Literal, TypedDict, Unpack
 
-from devices.text import escape_control_chars
+
+def is_utf8_encodable(text: str) -> bool:
+    """Return whether a text can be encoded as UTF-8. The names of some files cannot."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def escape_control_chars(text: str, *, keep_line_breaks: bool = False) -> str:
+    r"""Escape control characters, so that a terminal prints the text and UTF-8 can encode it.
+
+    Unprintable characters become escapes: `\x1b`, `\u202e`. A byte of a file name that is not UTF-8
+    is a lone surrogate in Python: it becomes `\udcff`.
+
+    Args:
+        text: untrusted text.
+        keep_line_breaks: keep line breaks, tabs and runs of spaces; else join all to one line.
+    """
+    if not keep_line_breaks:
+        text = " ".join(text.split())
+    elif text.isascii() and text.replace("\n", "").isprintable():
+        return text
+    kept = "\n\t" if keep_line_breaks else ""
+    return "".join(
+        c if c.isprintable() or c in kept else c.encode("unicode_escape").decode() for c in text
+    )
+
 
 Extra = Literal["server", "client", "emulation", "plot", "gpio", "rig", "archive", "mocap", "mcap"]
 

@@ -15,8 +15,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator
 
-from devices.errors import UsageError
-from devices.text import escape_control_chars
+from devices.errors import UsageError, escape_control_chars
 
 FolderKind = Literal["data", "state", "cache"]
 

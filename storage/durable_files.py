@@ -29,8 +29,13 @@ from typing import IO, NamedTuple
 
 import pyarrow as pa
 
-from devices.errors import DamagedFileError, FolderGoneError, FootTileError, StorageError
-from devices.text import escape_control_chars
+from devices.errors import (
+    DamagedFileError,
+    FolderGoneError,
+    FootTileError,
+    StorageError,
+    escape_control_chars,
+)
 
 log = logging.getLogger("foottile.storage")
 

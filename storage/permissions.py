@@ -14,8 +14,7 @@ import stat
 from collections.abc import Mapping
 from pathlib import Path
 
-from devices.errors import DamagedFileError, StorageError
-from devices.text import is_utf8_encodable
+from devices.errors import DamagedFileError, StorageError, is_utf8_encodable
 from storage.checksummed_json import read_checksummed_json, write_checksummed_json
 from storage.durable_files import (
     LOCK_NAME,

@@ -29,7 +29,7 @@ from devices.emulation.ground.indenter import IndentationProgramme, Indenter
 from devices.emulation.ground.load_trace import TileLoad
 from devices.emulation.i2c_bus import EmulatedI2cAdapter, FaultyWires
 from devices.emulation.parts import draw_family_chip, draw_family_dome, make_rng
-from devices.emulation.plates.plate import PlateLoad
+from devices.emulation.plates import PlateLoad
 from devices.emulation.surroundings import Puncture, Surroundings
 from devices.scene.emulation_sections import (
     BUS_TARGET,

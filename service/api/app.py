@@ -19,17 +19,9 @@ from service.api import problems
 from service.api.guard import AccessGuard
 from service.api.logins import Logins
 from service.api.openapi import SWAGGER_FILES, add_security_scheme, find_swagger_folder
-from service.api.routes import calibrations, common, formats, health, index, login, nodes, weighings
-from service.api.routes.downloads import data, take_data, zips
-from service.api.routes.recordings import (
-    comparisons,
-    integrity,
-    overview,
-    sessions,
-    stances,
-    takes,
-    trash,
-)
+from service.api.routes import calibrations, common, index, login, nodes, weighings
+from service.api.routes.downloads import data, zips
+from service.api.routes.recordings import comparisons, integrity, overview, sessions, stances, takes
 from service.api.routes.sockets.ingest import serve_node
 from service.api.routes.sockets.live import serve_live
 from service.api.static_files import HeadFromGet, PageFiles
@@ -162,25 +154,25 @@ def _make_api_routes() -> tuple[BaseRoute, ...]:
     api.add_api_route(
         "", index.get_index, operation_id="listRoutes", summary="All routes", tags=["server"]
     )
-    for module in (
-        health,
-        login,
-        nodes,
-        calibrations,
-        weighings,
-        zips,  # before the route with a session's id
-        sessions,
-        takes,
-        trash,
-        data,
-        take_data,
-        formats,
-        integrity,
-        stances,
-        overview,
-        comparisons,
+    for router in (
+        index.router,
+        login.router,
+        nodes.router,
+        calibrations.router,
+        weighings.router,
+        zips.router,  # before the route with a session's id
+        sessions.router,
+        takes.router,
+        sessions.trash_router,
+        data.router,
+        takes.data_router,
+        index.formats_router,
+        integrity.router,
+        stances.router,
+        overview.router,
+        comparisons.router,
     ):
-        api.include_router(module.router)
+        api.include_router(router)
     routes = APIRouter()
     routes.include_router(api)
     return tuple(routes.routes)

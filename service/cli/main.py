@@ -21,8 +21,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from devices.errors import FootTileError, UsageError
-from devices.text import escape_control_chars, is_utf8_encodable
+from devices.errors import FootTileError, UsageError, escape_control_chars, is_utf8_encodable
 from foottile.errors import FootTileError as ClientError
 from service.version import SOFTWARE_VERSION
 

@@ -14,8 +14,7 @@ from typing import IO, TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from devices.errors import UsageError
-from devices.text import escape_control_chars
+from devices.errors import UsageError, escape_control_chars
 from service.cli.options import echo, remark, stderr
 
 if TYPE_CHECKING:

@@ -23,10 +23,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.text import Text
 
-from devices.errors import UsageError
+from devices.errors import UsageError, escape_control_chars
 from devices.scene.hardware_sections import EMULATED
 from devices.scene.scene_file import Scene, load_scene
-from devices.text import escape_control_chars
 from foottile.environment import read_variable
 from service.cli.reference_options import (
     DecimalOption,
@@ -42,8 +41,7 @@ from service.cli.reference_options import (
 from service.json_output import to_json_text
 
 if TYPE_CHECKING:
-    from service.rig.emulated_foot import EmulatedFoot
-    from service.rig.plate_files import PlateFiles
+    from service.rig.emulated_foot import EmulatedFoot, PlateFiles
 
 SEED_MAX = 2**63 - 1
 SECONDS_MAX = NUMBER_MAX = 1e9
@@ -279,8 +277,8 @@ class FootOptions:
         )
 
     def _make_plate_files(self, scene: Scene) -> PlateFiles:
-        from devices.emulation.plates.plate import check_plate_usable
-        from service.rig.plate_files import PlateFiles
+        from devices.emulation.plates import check_plate_usable
+        from service.rig.emulated_foot import PlateFiles
 
         for name, path, ending in (
             ("force plate", self.force_plate, ".csv"),

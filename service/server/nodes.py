@@ -17,8 +17,8 @@ from devices.errors import (
     LinkError,
     StorageError,
     UnknownError,
+    escape_control_chars,
 )
-from devices.text import escape_control_chars
 from service.protocol import PROTOCOL, Hello
 from service.server.node import BOOT_ID_PATTERN, HELLO_NAME, ServerNode
 from storage.checksummed_json import read_checksummed_json

@@ -9,8 +9,14 @@ import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
-from devices.errors import ChangedError, StateError, StorageError, UnknownError, UsageError
-from devices.text import escape_control_chars
+from devices.errors import (
+    ChangedError,
+    StateError,
+    StorageError,
+    UnknownError,
+    UsageError,
+    escape_control_chars,
+)
 from service.server.data_folder import SessionIndex, StartKey
 from service.server_clock import server_utc_ns
 from service.sessions.sealing import rebuild_session

@@ -23,8 +23,8 @@ from devices.errors import (
     FileFormatError,
     FootTileError,
     StorageError,
+    escape_control_chars,
 )
-from devices.text import escape_control_chars
 from service.sessions.inputs import make_inputs
 from service.sessions.parts import (
     SeqsAround,

@@ -17,9 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from devices.errors import DamagedFileError, FileFormatError, StorageError
+from devices.errors import DamagedFileError, FileFormatError, StorageError, escape_control_chars
 from devices.frames import ArrayInfo, FrameBatch
-from devices.text import escape_control_chars
 from storage.durable_files import make_synced_folder, translate_storage_errors
 from storage.intervals import CORRUPT, NO_END, Intervals, Losses, union
 from storage.journal import time_index

@@ -12,7 +12,7 @@ from service.estimation.fitting.least_squares import compute_curve_n, compute_me
 from service.estimation.records import SIGMAS_95
 from service.offline.compare.plot import OUR_COLOUR, REFERENCE_COLOUR, TILE_COLOURS
 from service.offline.figure_output import create_figure, render_png
-from studies.reproduce import paper
+from studies.reproduce import trials as paper
 from studies.reproduce.indentation import DomeResult
 from studies.reproduce.result import ExperimentResult, Reproduction, TrialResult
 from studies.reproduce.trials import MUD, PRESSURE_PLATE

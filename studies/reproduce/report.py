@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
-from studies.reproduce import paper
+from studies.reproduce import trials as paper
 from studies.reproduce.result import (
     REPORTED_FIGURES,
     ExperimentResult,

@@ -14,9 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
+from devices.emulation import plates as force_plate
+from devices.emulation import plates as pressure_plate
 from devices.emulation.ground.grounds import make_ground
-from devices.emulation.plates import force_plate, pressure_plate
-from devices.emulation.plates.plate import VERTICAL
+from devices.emulation.plates import VERTICAL
 from devices.scene.scene_file import Scene
 from service.estimation.calibration import Calibration
 from service.estimation.fitting.least_squares import (
@@ -27,7 +28,7 @@ from service.estimation.fitting.least_squares import (
 from service.offline.compare.block_covariance import UncertainValue
 from service.offline.compare.paired_frames import TrialMean, average_over_trials
 from service.offline.comparison import CompareOptions, Comparison, compare_session
-from service.rig.plate_files import make_injected_path
+from service.rig.emulated_foot import make_injected_path
 from storage.formats.reference import ReferenceOptions
 from storage.sessions.reader import SealedFileReader
 from studies.reproduce.indentation import DomeResult, pool_repeatability

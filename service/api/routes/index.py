@@ -1,14 +1,17 @@
-"""Index of the API: every route with its address."""
+"""Routes about the server: index of the API, health, export formats."""
 
 from __future__ import annotations
 
-from fastapi import Request
-from pydantic import Field
+from fastapi import APIRouter, Request
+from pydantic import BaseModel, Field
 
 from service.api.openapi import list_operations
-from service.protocol import INGEST_PATH, LIVE_PATH
+from service.api.routes.common import ServerState, problem_responses
+from service.protocol import INGEST_PATH, LIVE_PATH, SUBPROTOCOL
 from service.server.broadcast.views import View
+from service.user_folders import PublicText
 from service.version import SOFTWARE_VERSION
+from storage.formats.writers.registry import FORMATS
 
 
 class RouteView(View):
@@ -55,3 +58,93 @@ async def get_index(request: Request) -> IndexView:
             for path, method, operation in list_operations(app.openapi())
         ],
     )
+
+
+router = APIRouter(tags=["server"])
+
+
+class Health(View):
+    """State of the process."""
+
+    status: str = Field(examples=["ok"])
+    problems: list[PublicText] = Field(
+        description="Damage found in the data folder at the start, and the consequence, as text. "
+        "Everything else is served."
+    )
+
+
+class Ready(View):
+    """Readiness of the server."""
+
+    ready: bool
+    nodes_connected: int
+    subscribers: int
+
+
+class Version(View):
+    """Versions of software and protocols."""
+
+    software: str = Field(examples=["foottile 0.1.0"])
+    api: str = "v1"
+    protocol: str = SUBPROTOCOL
+
+
+@router.get("/health", operation_id="getHealth", summary="Liveness")
+async def get_health(server: ServerState) -> Health:
+    """Return the state of the process, with the damage found at its start."""
+    return Health(status="ok", problems=server.problems)
+
+
+@router.get(
+    "/ready",
+    operation_id="getReady",
+    summary="Readiness",
+    responses=problem_responses(_507="The data folder cannot be written."),
+)
+def get_ready(server: ServerState) -> Ready:
+    """Write a test file to the data folder, and count nodes and subscribers."""
+    server.check_writable()
+    return Ready(
+        ready=True,
+        nodes_connected=len(server.links),
+        subscribers=server.broadcaster.subscriber_count,
+    )
+
+
+@router.get("/version", operation_id="getVersion", summary="Version")
+async def get_version() -> Version:
+    """Return the versions of software, API and link protocol."""
+    return Version(software=SOFTWARE_VERSION)
+
+
+formats_router = APIRouter(prefix="/formats", tags=["data"])
+
+
+class FormatView(BaseModel):
+    """Format, as in `GET .../data?format=`."""
+
+    name: str
+    title: str = Field(description="Title for people.")
+    opened_by: str = Field(description="Programs that open it.")
+    ending: str = Field(description="File extension, without the dot.")
+    media_type: str
+    options: list[str] = Field(description="Download parameters of this format.")
+    takes_columns: bool = Field(description="True: columns can be selected.")
+    needs_forces: bool = Field(description="True: the session needs estimates.")
+    needs_sealed: bool = Field(description="True: the session has to be sealed.")
+    holds_several: bool = Field(description="True: one file can have all sessions of a take.")
+    frames_max: int | None = Field(description="Frame limit of a download; null: no limit.")
+    missing: str | None = Field(description="Missing extra of this server; null: none.")
+
+
+class FormatsView(BaseModel):
+    """All formats."""
+
+    items: list[FormatView]
+
+
+@formats_router.get("", operation_id="listFormats", summary="Formats of downloads")
+def list_formats() -> FormatsView:
+    """Return the formats in the order of menus."""
+    formats_ = FORMATS.values()
+    return FormatsView(items=[FormatView.model_validate(f, from_attributes=True) for f in formats_])

@@ -70,8 +70,7 @@ def benchmark_broad(
         count_models,
         summarize_cases,
     )
-    from studies.broad.plot import plot_broad
-    from studies.broad.report import format_broad_report
+    from studies.broad.report import format_broad_report, plot_broad
     from studies.broad.results import Seeds
 
     choices: dict[str, Seeds] = {name: name for name in get_args(Seeds)}

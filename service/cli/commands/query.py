@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from devices.errors import UsageError
-from devices.text import escape_control_chars
+from devices.errors import UsageError, escape_control_chars
 from service.cli.options import (
     JsonOption,
     echo,

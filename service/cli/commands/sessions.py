@@ -11,8 +11,7 @@ import typer
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
-from devices.errors import UsageError
-from devices.text import escape_control_chars
+from devices.errors import UsageError, escape_control_chars
 from service.cli.multi_session import (
     EXIT_INCOMPLETE,
     JobsOption,

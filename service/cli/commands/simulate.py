@@ -67,7 +67,7 @@ def simulate_command(
     from service.estimation.pipeline.model_set import check_model_selection
     from service.offline.calibration_lookup import find_calibration, replace_tiles
     from service.offline.simulation import SimulationOptions, run_simulation
-    from service.rig.plate_files import make_injected_path
+    from service.rig.emulated_foot import make_injected_path
     from service.sessions.pipeline import EstimateOptions
 
     the_scene = load_scene(scene)

@@ -17,8 +17,13 @@ from contextlib import ExitStack
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, TypeVar
 
-from devices.errors import LinkError, UsageError, WorkerLostError, require_extra
-from devices.text import escape_control_chars
+from devices.errors import (
+    LinkError,
+    UsageError,
+    WorkerLostError,
+    escape_control_chars,
+    require_extra,
+)
 from service.offline.process_pool import Unfinished
 from service.version import compute_exact_version
 

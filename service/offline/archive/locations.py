@@ -20,8 +20,14 @@ from urllib.parse import urlsplit
 
 import pyarrow.fs as fs
 
-from devices.errors import FileFormatError, StorageError, UsageError, require_extra
-from devices.text import escape_control_chars, is_utf8_encodable
+from devices.errors import (
+    FileFormatError,
+    StorageError,
+    UsageError,
+    escape_control_chars,
+    is_utf8_encodable,
+    require_extra,
+)
 from foottile.environment import read_variable
 from storage.durable_files import ASIDE_SUFFIX
 from storage.sessions.folder import FRAMES_NAME, SESSION_ID

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
-from devices.text import escape_control_chars
+from devices.errors import escape_control_chars
 from service.offline.accuracy import PHASES
 from service.offline.compare.alignment import Alignment, ClockLag
 from service.offline.compare.block_covariance import UncertainValue

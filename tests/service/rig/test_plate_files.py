@@ -11,7 +11,7 @@ import pytest
 from devices.clock import VirtualClock
 from devices.emulation.world import World
 from devices.scene.scene_file import load_scene
-from service.rig.plate_files import (
+from service.rig.emulated_foot import (
     RECORDED_MAX_S,
     PlateFiles,
     make_injected_path,

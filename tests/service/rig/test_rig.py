@@ -11,8 +11,7 @@ import pytest
 from devices.array.startup import ReadyArray
 from devices.flags import FrameFlag
 from devices.scene.scene_file import load_scene
-from service.rig.emulated_foot import EmulatedFoot, RigOptions
-from service.rig.plate_files import PlateFiles
+from service.rig.emulated_foot import EmulatedFoot, PlateFiles, RigOptions
 from service.rig.rig import Rig
 from storage.formats.reference import ReferenceOptions, read_reference
 

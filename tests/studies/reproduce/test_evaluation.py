@@ -14,8 +14,7 @@ from service.estimation import OFFLINE_LAG_MS
 from service.offline.calibration_lookup import find_calibration
 from service.offline.compare.block_covariance import UncertainValue
 from service.offline.simulation import SimulationOptions, run_simulation
-from service.rig.emulated_foot import EmulatedFoot
-from service.rig.plate_files import PlateFiles
+from service.rig.emulated_foot import EmulatedFoot, PlateFiles
 from service.sessions.pipeline import EstimateOptions
 from studies.reproduce.result import (
     InjectedValueCheck,

@@ -1,4 +1,4 @@
-"""Routes of sessions: start, stop, list, describe, marker."""
+"""Routes of sessions and of the trash."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from service.api.routes.common import (
     problem_responses,
     stored_table_response,
 )
-from service.server.broadcast.views import MarkerView, Page, SessionView
+from service.server.broadcast.views import MarkerView, Page, SessionView, View
 from service.user_folders import PublicText
 from storage.formats.writers.tables import PARQUET
 from storage.sessions.folder import Ledger
@@ -399,3 +399,43 @@ def _parse_cursor(cursor: str) -> tuple[int, str]:
     t_ns, _, session_id = cursor.partition(".")
     number = re.fullmatch(r"[0-9]{1,19}", t_ns)
     return (int(t_ns), session_id) if number else (0, "")
+
+
+trash_router = APIRouter(prefix="/trash", tags=["trash"])
+
+
+class Emptied(View):
+    """Result of emptying the trash."""
+
+    sessions: int
+    bytes: int = Field(description="Size of all their files.")
+
+
+@trash_router.get("", operation_id="listTrash", summary="Deleted sessions, newest first")
+async def list_trash(server: ServerState) -> Page[SessionView]:
+    """Return deleted sessions, newest first; each can be restored."""
+    deleted = server.sessions.trash.list_sessions()
+    return Page(items=[SessionView.from_session(session, server.recorder) for session in deleted])
+
+
+@trash_router.post(
+    "/{session_id}/restore",
+    operation_id="restoreSession",
+    summary="Restore a session",
+    responses=problem_responses(_404="No such session in the trash.", _507="The disk is full."),
+)
+async def restore_session(session_id: str, server: ServerState) -> SessionView:
+    """Restore a session; a pending one completes when its node is back."""
+    return SessionView.from_session(server.recorder.restore_session(session_id), server.recorder)
+
+
+@trash_router.delete(
+    "",
+    operation_id="emptyTrash",
+    summary="Empty the trash",
+    responses=problem_responses(_507="The data folder cannot be written."),
+)
+async def empty_trash(server: ServerState) -> Emptied:
+    """Delete all sessions in the trash for good."""
+    deleted = await server.empty_trash()
+    return Emptied(sessions=deleted.session_count, bytes=deleted.size_bytes)

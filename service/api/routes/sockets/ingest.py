@@ -11,8 +11,7 @@ from typing import TypeVar
 
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
-from devices.errors import FileFormatError, LinkError, StorageError
-from devices.text import escape_control_chars
+from devices.errors import FileFormatError, LinkError, StorageError, escape_control_chars
 from service.api.protocols import send_message
 from service.protocol import (
     LINK_TIMEOUT_S,

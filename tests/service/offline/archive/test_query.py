@@ -11,8 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from devices.errors import FileFormatError, UsageError
-from service.offline.archive.query import find_sessions, run_query
-from service.offline.archive.session_tables import MARKERS_SCHEMA, SESSIONS_SCHEMA
+from service.offline.archive.query import MARKERS_SCHEMA, SESSIONS_SCHEMA, find_sessions, run_query
 from storage.sessions.reader import SealedFileReader
 from tests.service.offline.archives import IDS, recording, sealed
 

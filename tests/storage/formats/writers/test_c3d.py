@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from devices.errors import StorageError, UsageError
-from devices.text import escape_control_chars
+from devices.errors import StorageError, UsageError, escape_control_chars
 from storage.formats.export import Export
 from storage.formats.markers import PlacedMarker, PlacedMarkers
 from storage.formats.reference import ReferenceOptions, read_reference

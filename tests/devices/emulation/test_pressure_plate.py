@@ -10,11 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from devices.emulation import plates
 from devices.emulation.ground.ground import Ground
 from devices.emulation.parts import make_rng
-from devices.emulation.plates import pressure_plate as plates
-from devices.emulation.plates.plate import PlateClock, PlateLoad
-from devices.emulation.plates.pressure_plate import PressurePlate, compute_patch_radius_m
+from devices.emulation.plates import PlateClock, PlateLoad, PressurePlate, compute_patch_radius_m
 
 Array = npt.NDArray[np.float64]
 CELL_N = 1e3 * plates.PITCH_M**2

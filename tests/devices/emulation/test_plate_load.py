@@ -8,7 +8,7 @@ import pytest
 
 from devices.clock import VirtualClock
 from devices.emulation.ground.ground import Ground
-from devices.emulation.plates.plate import PlateLoad, check_plate_usable
+from devices.emulation.plates import PlateLoad, check_plate_usable
 from devices.emulation.world import World
 from devices.errors import UsageError
 from devices.scene.scene_file import load_scene

@@ -8,10 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from devices.emulation import plates
 from devices.emulation.parts import make_rng
-from devices.emulation.plates import force_plate as plates
-from devices.emulation.plates.force_plate import ForcePlate
-from devices.emulation.plates.plate import PlateClock
+from devices.emulation.plates import ForcePlate, PlateClock
 
 Array = npt.NDArray[np.float64]
 STEP = plates.RANGE / 2 ** (plates.BITS - 1)
