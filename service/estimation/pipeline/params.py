@@ -50,6 +50,7 @@ class FootParams(KernelRecord):
     contact_on_n: float
     contact_off_n: float
     contact_min_ns: int
+    contact_pause_ns: int
     cop_sigma_max_m: float
     has_grid: int
     # Servo, and its transform to angle and position.
@@ -164,6 +165,8 @@ def _make_foot_params(plan: EstimationPlan) -> RecordArray[FootParams]:
         "contact_off_n": plan.contact.off_n,
         "contact_bound_n": plan.contact.on_n * plan.mount_gain.max(),
         "contact_min_ns": plan.contact.min_ns,
+        # Time without frames does not prove that contact has changed.
+        "contact_pause_ns": max(plan.contact.min_ns, plan.gap_ns),
         "cop_sigma_max_m": plan.cop_sigma_max_m,
         "has_grid": plan.grid is not None,
         "n_load_bearing": len(plan.load_bearing_columns),

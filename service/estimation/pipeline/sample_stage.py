@@ -30,7 +30,6 @@ from service.estimation.fault_detection.baseline_loss import (
 from service.estimation.fault_detection.clipping import update_clipping_limit_kpa
 from service.estimation.fault_detection.stuck import update_stuck_and_toggles
 from service.estimation.fault_detection.thermal_drift import update_thermal_drift_kpa
-from service.estimation.foot import LONG_GAP_NS
 from service.estimation.foot.contact import update_candidate
 from service.estimation.foot.geometry import store_servo_reading
 from service.estimation.models import gas
@@ -143,7 +142,7 @@ def compute_apparent_forces_and_contact(
     is_known_enough = math.isnan(total_n) and known_n >= foot_params.contact_on_n
     contact_n = known_n if is_known_enough else total_n
     on_n, off_n = foot_params.contact_on_n, foot_params.contact_off_n
-    update_candidate(on_n, off_n, foot_state.contact, contact_n, t_ns, row.after_long_gap == 1)
+    update_candidate(on_n, off_n, foot_state.contact, contact_n, t_ns, row.after_contact_pause == 1)
     row.is_loaded, buffer.since_ns[i] = foot_state.contact.is_loaded, foot_state.contact.since_ns
     buffer.usable_n[i, n], buffer.noise_n[i, n] = usable_n, math.sqrt(noise_n2)
     buffer.sampled_ns[i, n] = t_ns + offset_sum_ns // foot_params.n_load_bearing
@@ -378,13 +377,14 @@ def append_frames_to_buffer(
         i = foot_state.end_row
         row, now_ns = buffer.rows[i], t_mono_ns[k]
         row.seq, row.t_ns, buffer.t_mono_ns[i] = seq[k], t_ns[k], now_ns
-        gap = long_gap = False
+        gap = pause = False
         if i > 0:  # a row of the frames before always remains
             passed_ns = now_ns - buffer.t_mono_ns[i - 1]
             # Unsigned throughout: a difference wraps, and any number is compared as it is.
             follows = np.uint64(seq[k] - buffer.rows[i - 1].seq) == np.uint64(1)
-            gap, long_gap = not follows or passed_ns > foot_params.gap_ns, passed_ns > LONG_GAP_NS
-        row.after_gap, row.after_long_gap = 1 if gap else 0, 1 if long_gap else 0
+            gap = not follows or passed_ns > foot_params.gap_ns
+            pause = passed_ns > foot_params.contact_pause_ns
+        row.after_gap, row.after_contact_pause = 1 if gap else 0, 1 if pause else 0
         foot_state.run_count += row.after_gap
         buffer.run[i] = foot_state.run_count
         if foot_params.has_servo == 1:

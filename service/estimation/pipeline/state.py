@@ -115,7 +115,7 @@ class FrameRow(KernelRecord):
     seq: np.uint64  # number in the stream
     t_ns: int  # UTC
     after_gap: int  # 1: a gap precedes it
-    after_long_gap: int  # 1: so long that the foot may have been anywhere
+    after_contact_pause: int  # 1: a pause in which the candidate of contact was not observed
     flags: int  # bits of `EstimateFlag` of the frame by itself
     is_loaded: int  # 1: candidate of contact
 

@@ -199,6 +199,16 @@ def test_contact_is_dated_back_by_the_look_ahead(lag_ms: float, first_in_contact
     assert contact.tolist() == [0] * first_in_contact + [1] * (30 - first_in_contact)
 
 
+def test_a_pause_between_frames_does_not_end_contact_after_a_single_frame() -> None:
+    # 32 N, a frame of 0 N, 20 ms without a frame, 4 N (between the thresholds), and 32 N again
+    forces_n = np.concatenate(
+        [held([8] * 4, 20), held([0] * 4, 1), held([1] * 4, 2), held([8] * 4, 20)]
+    )
+    frames = loaded_frames(forces_n)
+    paused = replace(frames, t_mono_ns=frames.t_mono_ns + 20_000_000 * (frames.seq >= 21))
+    assert (estimate(newton_plan(array_at(SQUARE), lag_ms=100), paused).contact == 1).all()
+
+
 def test_contact_is_unknown_where_no_force_shows_it_and_goes_on_after_it() -> None:
     forces_n = held([8, 0, 0, 0], 20)
     forces_n[12:15, 0] = np.nan
