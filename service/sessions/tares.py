@@ -35,7 +35,7 @@ from storage.durable_files import (
 REASONS = {
     "lead": "unloaded lead of the emulation",
     "unloaded": "by hand",
-    "flight": "in flight",
+    "flight": "automatic, foot in the air",
 }
 _LINE = re.compile(
     rb'(\{"number": ([0-9]{1,9}), "of": ([0-9]{1,9}), [^\n]*?), "sha256": "([0-9a-f]{64})"\}'
@@ -309,14 +309,12 @@ class TareHistory:
         return next((t for t in reversed(fitting) if not t.is_automatic), (*fitting, None)[0])
 
     def is_automatic_paused(self, info: ArrayInfo) -> bool:
-        """Return whether an automatic tare was undone, with no other kind of tare since."""
+        """Return whether a tare was undone, with no tare by hand or from a lead since."""
         for recorded in reversed(self.all_tares):
             if not recorded.is_of_array(info):
                 continue
-            if recorded.is_automatic and recorded.undone:
-                return True
-            if not recorded.is_automatic and not recorded.undone:
-                return False
+            if recorded.undone or not recorded.is_automatic:
+                return recorded.undone
         return False
 
     def valid_tares(self, info: ArrayInfo) -> tuple[Tare, ...]:

@@ -104,12 +104,10 @@ export class Actions {
   }
 
   async undo(node) {
-    const automatic = node.tare.source === "flight";
     await api.undoTare(node.node, node.tare.id);
     this.setUndo(null);
-    notice(automatic
-      ? "Automatic tare undone: previous tare restored. Automatic tare stays off until you press Tare."
-      : "Tare undone: previous tare restored.");
+    const paused = node.auto_tare === "off" ? "" : " Automatic tare is paused until you press Tare.";
+    notice(`Tare undone: previous tare restored.${paused}`);
     byId("tare").focus();
   }
 

@@ -181,7 +181,7 @@ const clippedText = ({ serial }, gaugeKpa) => `${serial} stops rising ${Number.i
 
 const tareAge = (tare, serverNowMs) => roughly((serverNowMs - tare.t_ns / 1e6) / 1000);
 
-const SOURCES = { unloaded: "by hand", recognised: "recognised in flight", flight: "in flight" };
+const SOURCES = { unloaded: "by hand", recognised: "automatically, in the air", flight: "automatically, in the air" };
 const FOLLOWS = { paused: "automatic tare paused after an undo: press Tare to resume it", off: "automatic tare off" };
 
 /** Return age and kind of the tare as texts, both "" without one. */

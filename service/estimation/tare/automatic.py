@@ -239,11 +239,12 @@ def propose_flight_tare(
     if not has_shifted and not is_renewal:
         return NO_TARE
     most = int(np.argmax(np.abs(shift_kpa)))
-    reason = (
-        f"in flight; {serials[most]} {shift_kpa[most]:+.2f} kPa since the tare before"
+    change = (
+        f"{serials[most]} {shift_kpa[most]:+.2f} kPa from the tare before"
         if has_shifted
-        else f"in flight; nothing has moved in {since_s / 60:.0f} min"
+        else f"nothing has moved in {since_s / 60:.0f} min"
     )
+    reason = f"automatic, foot in the air; {change}"
     return FlightTareResult(replace(tare, source="flight"), reason)
 
 
@@ -278,7 +279,7 @@ def propose_first_flight_tare(recent: TareFrames) -> FlightTareResult:
         return NO_TARE
     return FlightTareResult(
         replace(recent.remove_recovery(tare), source="flight"),
-        "in flight, between two steps; there was none yet",
+        "automatic, between two steps; there was none yet",
     )
 
 

@@ -212,8 +212,8 @@ class NodeView(View):
         "or a baseline that does not fit the foot in the air."
     )
     auto_tare: AutoTare = Field(
-        description="State of automatic tares in flight. paused: one was undone, and there was no "
-        "tare by hand since; off: the scene has `auto_tare = false`."
+        description="State of automatic tares in flight. paused: a tare was undone, with no tare "
+        "by hand since; off: the scene has `auto_tare = false`."
     )
     drift: DriftView
     storage_problem: PublicText | None = Field(description="Reason why frames cannot be stored.")

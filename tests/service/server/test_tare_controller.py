@@ -276,7 +276,7 @@ def test_a_dome_that_warms_is_followed_between_steps_and_each_time_is_in_the_his
     assert 3 <= len(flights) <= 5
     t_s = np.array([t.tare.t_ns for t in foot.node.estimator.tare_history.all_tares]) * 1e-9
     assert (np.diff(t_s) >= 60.0 - 1e-6).all()
-    assert all(" kPa since the tare before" in t.reason for t in flights)
+    assert all(" kPa from the tare before" in t.reason for t in flights)
     assert foot.offset_counts == pytest.approx([COUNTS_PER_K * 2.0] * 2, abs=COUNTS_PER_K * 0.6)
     assert foot.due == list(range(len(foot.due))), "no frame was lost at a tare"
 

@@ -137,7 +137,7 @@ def test_every_tare_has_a_reason_in_words(tmp_path: Path) -> None:
     ]
 
 
-def test_an_undone_automatic_tare_pauses_them_until_somebody_tares(tmp_path: Path) -> None:
+def test_an_undone_tare_pauses_automatic_ones_until_somebody_tares(tmp_path: Path) -> None:
     tares = history(tmp_path, 1)
     assert not tares.is_automatic_paused(INFO)
     one = tares.store_tare(tare(2, source="flight"), INFO)
@@ -152,14 +152,8 @@ def test_an_undone_automatic_tare_pauses_them_until_somebody_tares(tmp_path: Pat
     assert not tares.is_automatic_paused(OTHERS[0]), "not for other tiles"
     by_hand = tares.store_tare(tare(4), INFO)
     assert not tares.is_automatic_paused(INFO)
-    tares.undo_tare(by_hand.id)  # it did not change anybody's mind
+    tares.undo_tare(by_hand.id)  # else the next automatic one would replace the one restored
     assert tares.is_automatic_paused(INFO)
-
-
-def test_a_tare_by_hand_that_is_undone_pauses_nothing(tmp_path: Path) -> None:
-    tares = history(tmp_path, 1, 2)
-    tares.undo_tare(tares.all_tares[-1].id)
-    assert not tares.is_automatic_paused(INFO)
 
 
 def test_automatic_tares_are_held_against_the_last_one_by_hand_or_the_oldest(

@@ -131,8 +131,8 @@ def test_a_dome_that_has_warmed_up_in_the_air_is_tared_anew_and_the_history_says
     assert found.tare.source == "flight"
     assert found.tare.t_ns == UTC_NS + 300 * SECOND_NS
     assert found.tare.baseline_kpa == pytest.approx([UNLOADED_KPA + 0.336] * 2, abs=0.1)
-    assert "in flight" in found.reason
-    assert "T01 +0.35 kPa since the tare before" in found.reason
+    assert "in the air" in found.reason
+    assert "T01 +0.35 kPa from the tare before" in found.reason
 
 
 def test_a_dome_that_warms_for_an_hour_is_followed(bench: Bench) -> None:
