@@ -80,7 +80,7 @@ interface TilePoint { timeS: number; tiles: Record<string, (number | null)[]> | 
 /** Of GET /sessions/ID/tiles. */
 interface ArrayInfo {
   node: string; tiles: Tile[]; servo: object | null; nominal_rate_hz: number; calibration: object | null; lag_ms: number | null;
-  estimates_problem: string | null;
+  estimates_problem: string | null; tares: { t_ns: number; source: string }[];
 }
 
 interface Overview {

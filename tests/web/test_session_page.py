@@ -75,7 +75,7 @@ def test_the_page_says_what_the_session_is_and_what_is_drawn(
     page = open_page(url_of(walk))
     expect(page.locator("h1")).to_have_text("walk")
     about = page.locator("#about")
-    for fact in ("bench", "leg 2", "#wet", f"{int(walk.now()['frames']):,}"):
+    for fact in ("bench", "leg 2", "#wet", "Tared", f"{int(walk.now()['frames']):,}"):
         expect(about).to_contain_text(fact)
     expect(page.locator("header")).to_contain_text("40 frames: link down longer")
     plots = settled(page)

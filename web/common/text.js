@@ -128,6 +128,9 @@ export function bytes(count) {
 /** @param {number} n */
 const two = (n) => String(n).padStart(2, "0");
 
+/** How a tare was taken, by its `source`. @type {Record<string, string>} */
+export const TARE_SOURCES = { unloaded: "by hand", recognised: "automatically, in the air", flight: "automatically, in the air" };
+
 /** Format local time, sortable. @param {Date} date */
 export function localTime(date) {
   return `${date.getFullYear()}-${two(date.getMonth() + 1)}-${two(date.getDate())} `

@@ -2,7 +2,7 @@
 
 import { ESTIMATE, FRAME, TILE } from "../common/flags.js";
 import { lossTexts } from "../common/losses.js";
-import { byId, el, localTime, number, roughly, setData, setText } from "../common/text.js";
+import { byId, el, localTime, number, roughly, setData, setText, TARE_SOURCES } from "../common/text.js";
 import { helpOf, whyOf } from "./why.js";
 
 const HOLD_MS = 3000;
@@ -181,13 +181,12 @@ const clippedText = ({ serial }, gaugeKpa) => `${serial} stops rising ${Number.i
 
 const tareAge = (tare, serverNowMs) => roughly((serverNowMs - tare.t_ns / 1e6) / 1000);
 
-const SOURCES = { unloaded: "by hand", recognised: "automatically, in the air", flight: "automatically, in the air" };
 const FOLLOWS = { paused: "automatic tare paused after an undo: press Tare to resume it", off: "automatic tare off" };
 
 /** Return age and kind of the tare as texts, both "" without one. */
 function tareTexts({ tare }, serverNowMs) {
   if (!tare || tare.undone) return ["", ""];
-  return [`Tared ${tareAge(tare, serverNowMs)} ago`, SOURCES[tare.source] ? `, ${SOURCES[tare.source]}` : ""];
+  return [`Tared ${tareAge(tare, serverNowMs)} ago`, TARE_SOURCES[tare.source] ? `, ${TARE_SOURCES[tare.source]}` : ""];
 }
 
 /** Return the facts about drift, calibration and clock. */

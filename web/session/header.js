@@ -1,6 +1,6 @@
 // Header of a session: name, state, facts, labels and notes.
 
-import { byId, duration, el, localTime, perSecond, setText } from "../common/text.js";
+import { byId, duration, el, localTime, perSecond, setText, TARE_SOURCES } from "../common/text.js";
 import { stateText } from "../sessions/state.js";
 
 /**
@@ -13,13 +13,19 @@ export function rateText(whole, nominalHz) {
   return `${perSecond(hz)} of ${perSecond(nominalHz)} frames/s`;
 }
 
+/** Return times and kinds of a session's tares, "" without one. @param {ArrayInfo["tares"]} tares */
+export function taresText(tares) {
+  const texts = tares.map(({ t_ns: t, source }) => (source === "lost" ? "one is lost" : `${localTime(new Date(t / 1e6))} ${TARE_SOURCES[source] ?? ""}`.trim()));
+  return texts.length > 3 ? `${texts[0]}, and ${texts.length - 1} more` : texts.join("; ");
+}
+
 /**
  * Draw the header.
  * @param {Session} session
  * @param {import("./bins.js").Bins | null} whole bins of the whole session, once loaded
- * @param {number | null} nominalHz rate of the node
+ * @param {ArrayInfo | null} array
  */
-export function drawHeader(session, whole = null, nominalHz = null) {
+export function drawHeader(session, whole = null, array = null) {
   setText(byId("name"), session.name || session.id);
   const [short, long, weight] = stateText(session);
   const state = byId("state");
@@ -31,9 +37,10 @@ export function drawHeader(session, whole = null, nominalHz = null) {
     ["Started", localTime(new Date(session.started_t_ns / 1e6))],
     ["Duration", duration(session.duration_s)],
     ["Frames", session.frames.toLocaleString("en-GB")],
-    ["Rate", rateText(whole, nominalHz)],
+    ["Rate", rateText(whole, array?.nominal_rate_hz ?? null)],
     ["Parts", session.parts.length > 1 ? String(session.parts.length) : ""],
     ["Scene", session.scene],
+    ["Tared", taresText(array?.tares ?? [])],
     ["Scale", session.absolute_scale === "assumed" ? "assumed: newtons are approximate" : ""],
     ["Subject", session.subject],
     ["Tags", session.tags.map((tag) => `#${tag}`).join(" ")],

@@ -82,7 +82,7 @@ async function editSession() {
 
 /** Draw the header with what is loaded. */
 function drawSessionHeader() {
-  drawHeader(current, plotted?.plots.whole ?? null, plotted?.replay.array?.nominal_rate_hz ?? null);
+  drawHeader(current, plotted?.plots.whole ?? null, plotted?.replay.array ?? null);
 }
 
 byId("edit").addEventListener("click", () => quietly(editSession));

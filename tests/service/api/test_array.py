@@ -25,6 +25,8 @@ def test_a_session_says_where_its_tiles_are_and_how_its_forces_were_estimated(
         assert said["node"] == node["node"]
         assert said["nominal_rate_hz"] == node["nominal_rate_hz"]
         assert said["estimates_problem"] is None
+        tare = node["tare"]
+        assert said["tares"] == [{"t_ns": tare["t_ns"], "source": tare["source"]}]
     assert (recording["lag_ms"], sealed["lag_ms"]) == (LIVE_LAG_MS, OFFLINE_LAG_MS)
     assert sealed["tiles"][0]["full_scale_n"] == pytest.approx(node["tiles"][0]["full_scale_n"])
     assert sealed["tiles"][0]["full_scale_n"] > 0

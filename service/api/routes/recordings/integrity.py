@@ -20,6 +20,7 @@ from service.api.routes.common import (
 )
 from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
+from service.estimation.tare.tare import TareSource
 from service.server.broadcast.views import (
     CalibrationView,
     TileView,
@@ -39,6 +40,16 @@ from storage.verify.session import verify_session
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 
 
+class SessionTareView(View):
+    """Tare that was in force during a session."""
+
+    t_ns: int = Field(description="End of the interval of the tare, node's UTC.")
+    source: TareSource = Field(
+        description="unloaded: by hand; flight, recognised: automatic; lead: of an emulation; "
+        "interval: of an estimate (`--tare-s`); lost: damaged on the disk."
+    )
+
+
 class ArrayView(View):
     """Array of a session, and facts of its estimates."""
 
@@ -48,6 +59,7 @@ class ArrayView(View):
     servo: ServoInfo | None
     nominal_rate_hz: float
     calibration: CalibrationView | None
+    tares: list[SessionTareView] = Field(description="Tares of the estimates, oldest first.")
     lag_ms: float | None = Field(
         description="Look-ahead of the estimates: each uses readings up to this time after its "
         "frame; null: no estimates."
@@ -73,7 +85,8 @@ async def list_tiles(session_id: str, server: ServerState) -> ArrayView:
     sources = server.recorder.collect_inputs(session_id)
     content = sources.calibration
     lag_ms = None if content is None else LIVE_LAG_MS
-    return _make_view(session_id, sources.info, content, lag_ms, sources.problem)
+    tares = [SessionTareView(t_ns=tare.t_ns, source=tare.source) for tare in sources.tares]
+    return _make_view(session_id, sources.info, content, tares, lag_ms, sources.problem)
 
 
 def _read_sealed_array(session_id: str, server: Server) -> ArrayView:
@@ -81,10 +94,12 @@ def _read_sealed_array(session_id: str, server: Server) -> ArrayView:
         info, notes, estimated = reader.info, reader.notes, reader.has_columns("grf_n")
     if not estimated:
         reason = str(notes.get("estimates", "no estimates")).removeprefix("no estimates: ")
-        return _make_view(session_id, info, _parse_calibration(notes), None, reason)
+        return _make_view(session_id, info, _parse_calibration(notes), [], None, reason)
     lag_ms = notes.get("lag_ms")
     known_ms = float(lag_ms) if isinstance(lag_ms, int | float) else None
-    return _make_view(session_id, info, _parse_calibration(notes), known_ms, None)
+    return _make_view(
+        session_id, info, _parse_calibration(notes), _parse_tares(notes), known_ms, None
+    )
 
 
 def _parse_calibration(notes: dict[str, Any]) -> Calibration | None:
@@ -94,10 +109,20 @@ def _parse_calibration(notes: dict[str, Any]) -> Calibration | None:
         return None
 
 
+def _parse_tares(notes: dict[str, Any]) -> list[SessionTareView]:
+    try:
+        return [
+            SessionTareView(t_ns=tare["t_ns"], source=tare["source"]) for tare in notes["tares"]
+        ]
+    except (KeyError, TypeError, ValueError):  # none, or of another version
+        return []
+
+
 def _make_view(
     session_id: str,
     info: ArrayInfo,
     calibration: Calibration | None,
+    tares: list[SessionTareView],
     lag_ms: float | None,
     problem: str | None,
 ) -> ArrayView:
@@ -118,6 +143,7 @@ def _make_view(
         servo=info.servo,
         nominal_rate_hz=info.nominal_rate_hz,
         calibration=calibration_view,
+        tares=tares,
         lag_ms=lag_ms,
         estimates_problem=problem,
     )
