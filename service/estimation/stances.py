@@ -42,6 +42,8 @@ STANCE_COLUMNS = (
 
 EDGE_NS = 10_000_000
 """Time over which the slope of the GRF at the edges of a stance is measured, within the stance."""
+COP_SHARE_MIN = 0.8
+"""Least share of a stance's frames with a COP, for an uncertainty of the COP's range."""
 _SLOPE_SIGMAS = 2.0
 """Least change of the GRF over `EDGE_NS` for a slope, in its sigmas."""
 
@@ -71,7 +73,8 @@ class Stance:
         cop_x_last_m: last known one.
         cop_x_range_m: largest less smallest.
         cop_x_range_sigma_m: standard uncertainty of the range, with independent errors of smallest
-            and largest.
+            and largest; NaN if fewer than `COP_SHARE_MIN` of the frames have a COP: the range is
+            then a lower bound.
         frames: number of frames from the first to the last.
         unknown_frames: number of these without a GRF.
         missing_frames: number of missing frames between the first and the last.
@@ -305,6 +308,8 @@ class _OpenStance:
     """First frames, up to one `EDGE_NS` after the first."""
     tail: _ForceSeries = field(default_factory=_ForceSeries.make_empty)
     """Last frames, from one `EDGE_NS` before the last."""
+    cop_frames: int = 0
+    """Number of frames with a COP."""
     cop_x_m: tuple[float, float] | None = None
     """First and last known COP."""
     extremes_x_m: Floats | None = None
@@ -334,6 +339,7 @@ class _OpenStance:
     def _add_cop(self, x_m: Floats, sigma_m: Floats) -> None:
         """Add known centres of pressure."""
         x_m, sigma_m = x_m.astype(np.float64), sigma_m.astype(np.float64)
+        self.cop_frames += len(x_m)
         first = float(x_m[0]) if self.cop_x_m is None else self.cop_x_m[0]
         self.cop_x_m = first, float(x_m[-1])
         bounds_m = x_m - SIGMAS_95 * sigma_m, x_m, x_m + SIGMAS_95 * sigma_m
@@ -401,7 +407,8 @@ class _OpenStance:
             return np.nan, np.nan
         low_m, x_m, high_m = self.extremes_x_m
         sigmas_m = (high_m - low_m) / (2.0 * SIGMAS_95)
-        return float(x_m[1] - x_m[0]), float(np.hypot(*sigmas_m))
+        is_bound = self.cop_frames < COP_SHARE_MIN * self.frames
+        return float(x_m[1] - x_m[0]), np.nan if is_bound else float(np.hypot(*sigmas_m))
 
     def to_stance(self, behind: _Frame | None) -> Stance:
         """Make the stance; `behind` is the next frame with known contact, if there is one."""

@@ -37,8 +37,15 @@ STORED_STANCE_COLUMNS = (
     Column("impulse_sigma_n_s", _F64, "N s", "its standard uncertainty"),
     Column("cop_x_first_m", _F64, "m", "cop_x_m where it is first stated"),
     Column("cop_x_last_m", _F64, "m", "cop_x_m where it is last stated"),
-    Column("cop_x_range_m", _F64, "m", "greatest cop_x_m less the least"),
-    Column("cop_x_range_sigma_m", _F64, "m", "its standard uncertainty"),
+    Column(
+        "cop_x_range_m", _F64, "m", "greatest cop_x_m less the least; a lower bound without a sigma"
+    ),
+    Column(
+        "cop_x_range_sigma_m",
+        _F64,
+        "m",
+        "its standard uncertainty; null if under 80 % of its frames have a COP",
+    ),
     Column("frames", pa.uint32(), "1", "frames that are there, first and last included"),
     Column("unknown_frames", pa.uint32(), "1", "of these, without a GRF"),
     Column("missing_frames", pa.uint32(), "1", "numbers in between that are not there"),

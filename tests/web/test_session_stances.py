@@ -252,6 +252,14 @@ def test_of_a_stance_that_was_not_seen_whole_the_line_says_so(
     expect(page.locator("#stance-flags")).to_be_empty()
     expect(page.locator("#stance-figures")).not_to_contain_text("≥")
     assert page.evaluate("document.documentElement.scrollWidth") == PHONE["width"]
+    # A COP travel without a sigma is a lower bound, too, and counts in no median.
+    code = """async (given) => {
+        const { FIGURES, valuesOf } = await import('/static/session/stances.js');
+        return valuesOf(given, FIGURES.find(({ key }) => key === "travel"));
+    }"""
+    whole = {"begun": True, "ended": True, "cop_x_range_m": 0.02}
+    given = [whole | {"cop_x_range_sigma_m": sigma_m} for sigma_m in (0.001, None)]
+    assert page.evaluate(code, given) == [0.02]
     assert complaints(page) == []
 
 

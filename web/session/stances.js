@@ -55,6 +55,13 @@ export function neighbour(stances, by, cursorS, view) {
 
 const Z95 = 1.96;
 
+/** Return whether a figure of a stance is a lower bound only. */
+const isLowerBound = (stance, { key, sigma }) => isCut(stance) || (key === "travel" && stance[sigma] === null);
+
+/** Return the values of a figure over stances, without unknown ones and lower bounds. */
+export const valuesOf = (stances, figure) => stances.filter((stance) => Number.isFinite(stance[figure.value]) && !isLowerBound(stance, figure))
+  .map((stance) => stance[figure.value]);
+
 /** Figures of a stance: label, value and sigma field, factor to the unit, decimals. */
 export const FIGURES = [
   { key: "peak", label: "Peak force", value: "peak_grf_n", sigma: "peak_sigma_n", unit: "N", factor: 1, decimals: 1 },
@@ -64,22 +71,23 @@ export const FIGURES = [
 ];
 
 /** Return value and half width of the 95 % interval, such as "25.6" and "± 1.0"; "≥ 25.6" of a part of a stance. */
-function figureOf(stance, { value, sigma, factor, decimals }) {
+function figureOf(stance, figure) {
+  const { value, sigma, factor, decimals } = figure;
   const [of, sigmaOf] = [stance[value] ?? null, stance[sigma] ?? null];
   return [
-    of === null ? "–" : `${isCut(stance) ? "≥\u00a0" : ""}${number(of * factor, decimals)}`,
+    of === null ? "–" : `${isLowerBound(stance, figure) ? "≥\u00a0" : ""}${number(of * factor, decimals)}`,
     of === null || sigmaOf === null ? "" : `±\u00a0${number(Z95 * sigmaOf * factor, decimals)}`,
   ];
 }
 
 /** Return the median of each figure over stances, as a stance. */
 export function medianOf(stances) {
-  const middle = (name) => {
-    const values = stances.map((stance) => stance[name]).filter((value) => value !== null).sort((a, b) => a - b);
+  const middle = (figure) => {
+    const values = valuesOf(stances, figure).sort((a, b) => a - b);
     const half = values.length >> 1;
     return values.length ? (values[half] + values[values.length - 1 - half]) / 2 : null;
   };
-  return Object.fromEntries(FIGURES.map(({ value }) => [value, middle(value)]));
+  return Object.fromEntries(FIGURES.map((figure) => [figure.value, middle(figure)]));
 }
 
 /** Table of stances. */

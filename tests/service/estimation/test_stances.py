@@ -56,7 +56,7 @@ def test_a_stance_has_peak_impulse_and_travel_of_its_frames() -> None:
         *recording(
             [0, 1, 5, 3, 1, 0],
             [0, 1, 1, 1, 1, 0],
-            cop_x_m=[NAN, NAN, -0.01, 0.02, 0.015, NAN],
+            cop_x_m=[NAN, -0.01, 0.0, 0.02, 0.015, NAN],
             estimate_flags=[128, 16, 4, 0, 0, 16],
         )
     )
@@ -81,6 +81,18 @@ def test_a_doubtful_frame_may_have_gone_furthest() -> None:
     assert one.cop_x_range_m == 10.0
     greatest_high, greatest_low = 9 + 1.96 * 2.0, 10 - 1.96 * 0.5
     assert one.cop_x_range_sigma_m == pytest.approx((greatest_high - greatest_low) / (2 * 1.96))
+
+
+def test_the_cop_range_is_a_lower_bound_where_a_fifth_of_the_frames_has_no_cop() -> None:
+    def sigma_m(x_m: list[float]) -> float:
+        (one,) = compute_stances(*recording([0, *[5] * 10, 0], [0, *[1] * 10, 0], cop_x_m=x_m))
+        assert one.cop_x_range_m == pytest.approx(0.009)
+        return one.cop_x_range_sigma_m
+
+    x_m = [NAN, *(0.001 * k for k in range(10)), NAN]
+    assert np.isfinite(sigma_m(x_m))
+    assert np.isfinite(sigma_m([*x_m[:4], NAN, NAN, *x_m[6:]]))
+    assert np.isnan(sigma_m([*x_m[:4], NAN, NAN, NAN, *x_m[7:]]))
 
 
 def test_the_trapezoids_are_as_wide_as_the_frames_are_apart() -> None:
