@@ -185,7 +185,8 @@ def save(page: Page, name: str) -> None:
 
 def main() -> None:
     """Take all pictures."""
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    names = ("chromium-headless-shell", "chromium", "chromium-browser")
+    chromium = next(filter(None, map(shutil.which, names)), None)
     if chromium is None:
         sys.exit("no Chromium; on Debian: sudo apt-get install chromium")
     FOLDER.mkdir(parents=True, exist_ok=True)

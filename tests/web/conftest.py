@@ -28,7 +28,7 @@ COMMAND = [sys.executable, "-c", "from service.cli.main import main; main()"]
 CHROMIUM = next(
     (
         path
-        for name in ("chromium", "chromium-browser", "google-chrome")
+        for name in ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
         if (path := shutil.which(name))
     ),
     None,

@@ -257,7 +257,7 @@ def test_of_a_stance_that_was_not_seen_whole_the_line_says_so(
         const { FIGURES, valuesOf } = await import('/static/session/stances.js');
         return valuesOf(given, FIGURES.find(({ key }) => key === "travel"));
     }"""
-    whole = {"begun": True, "ended": True, "cop_x_range_m": 0.02}
+    whole: dict[str, Any] = {"begun": True, "ended": True, "cop_x_range_m": 0.02}
     given = [whole | {"cop_x_range_sigma_m": sigma_m} for sigma_m in (0.001, None)]
     assert page.evaluate(code, given) == [0.02]
     assert complaints(page) == []
