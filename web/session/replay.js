@@ -130,8 +130,8 @@ export class Replay {
     setText(byId("replay-force"), frame && samples.whole.estimated ? `, ${forceText(frame, this.node)}` : "");
     setText(byId("replay-frame"), frame ? `, frame ${frame.seq.toLocaleString("en-GB")}` : "");
     if (!this.node) return;
-    this.foot.draw(this.node, frame);
     this.bars.draw(this.node, frame, performance.now());
+    this.foot.draw(this.node, frame, this.bars.shown);
     drawGrf(this.node, frame);
   }
 
