@@ -123,10 +123,10 @@ export class Compare {
     byId("align-choice").hidden = false;
     this.drawn = beside;
     this.apartS = (other.started_t_ns - this.session.started_t_ns) * 1e-9;
-    const both = [
-      { name: shortNameOf(this.session, other), stances: plots.stances }, { name: shortNameOf(other, this.session), stances: stances ?? [] },
-    ];
-    drawDifferences(...(this.apartS < 0 ? both.reverse() : both));
+    const own = { name: shortNameOf(this.session, other), stances: plots.stances };
+    const theirs = { name: shortNameOf(other, this.session), stances: stances ?? [] };
+    if (this.apartS < 0) drawDifferences(theirs, own);
+    else drawDifferences(own, theirs);
     this.page.setOverlay({ id, name: beside.name });
     this.moveTo(this.ways.some((way) => way.key === align) ? align : this.ways[0].key);
     this.show(beside);

@@ -38,7 +38,7 @@ function decimalsFor(own, other, least) {
 
 /**
  * State the certain differences, and fill the table with the whole stances of two sessions.
- * @typedef {{name: string, stances: object[]}} Compared
+ * @typedef {{name: string, stances: any[]}} Compared
  * @param {Compared} older @param {Compared} newer
  */
 export function drawDifferences(older, newer) {
