@@ -255,6 +255,12 @@ def test_of_a_stance_that_was_not_seen_whole_the_line_says_so(
     assert complaints(page) == []
 
 
+def test_of_a_cut_stance_a_bound_of_zero_is_left_out(server: Running, open_page: OpenPage) -> None:
+    asked = """import("/static/session/stances.js").then(({ FIGURES, figureOf }) =>
+      [0, 0.012].map((s) => figureOf({ begun: false, duration_s: s }, FIGURES[1])[0]))"""
+    assert open_page(f"{server.url}/nodes").evaluate(asked) == ["\u2013", "≥\u00a012"]
+
+
 def test_a_laptop_shows_four_rows_of_stances_and_the_foot(
     hops: Recording, open_page: OpenPage
 ) -> None:

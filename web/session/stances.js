@@ -63,11 +63,11 @@ export const FIGURES = [
   { key: "travel", label: "COP travel", value: "cop_x_range_m", sigma: "cop_x_range_sigma_m", unit: "mm", factor: 1e3, decimals: 1 },
 ];
 
-/** Return value and half width of the 95 % interval, such as "25.6" and "± 1.0"; "≥ 25.6" of a part of a stance. */
-function figureOf(stance, { value, sigma, factor, decimals }) {
+/** Return value and half width of the 95 % interval, such as "25.6" and "± 1.0"; "≥ 25.6" of a part of a stance, "–" for ≥ 0. */
+export function figureOf(stance, { value, sigma, factor, decimals }) {
   const [of, sigmaOf] = [stance[value] ?? null, stance[sigma] ?? null];
   return [
-    of === null ? "–" : `${isCut(stance) ? "≥\u00a0" : ""}${number(of * factor, decimals)}`,
+    of === null || (isCut(stance) && Number((of * factor).toFixed(decimals)) <= 0) ? "–" : `${isCut(stance) ? "≥\u00a0" : ""}${number(of * factor, decimals)}`,
     of === null || sigmaOf === null ? "" : `±\u00a0${number(Z95 * sigmaOf * factor, decimals)}`,
   ];
 }
