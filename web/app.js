@@ -258,7 +258,7 @@ function draw() {
     if (!isDue) foot.noteCop(node, frame);
   }
   if (isDue) { // all numbers, and the foot that contains some, are of one frame
-    foot.draw(node, frame);
+    foot.draw(node, frame, bars.shown);
     drawGrf(node, frame);
   }
   const drawn = trace.draw(nowMs, status.live);

@@ -34,7 +34,7 @@ from storage.sessions.time_axis import NODE_AXIS, TimeAxis
 
 OVERVIEW_NAME = "overview.arrow"
 _KEY, _CHECK_KEY = b"foottile.overview", b"foottile.overview_sha256"
-_VERSION = 2
+_VERSION = 3
 BinColumnTypes = Mapping[str, np.dtype[Any]]
 _PIECE_BINS = 4096
 """Bins that are read and verified at a time."""

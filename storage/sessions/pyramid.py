@@ -33,8 +33,15 @@ Bins = dict[str, Array]
 
 _COMMON_COLUMNS = (
     *("t_first_ns", "t_last_ns", "part", "frames", "missing", "frame_flags"),
-    *("grf_n_min", "grf_n_max", "grf_low_n_min", "grf_high_n_max", "grf_lower_bound_n_max"),
-    *("grf_unknown", "cop_x_m_min", "cop_x_m_max", "cop_y_m_min", "cop_y_m_max"),
+    *("grf_n_min", "grf_n_max", "grf_n_max_t_ns", "grf_low_n_min", "grf_high_n_max"),
+    *(
+        "grf_lower_bound_n_max",
+        "grf_unknown",
+        "cop_x_m_min",
+        "cop_x_m_max",
+        "cop_y_m_min",
+        "cop_y_m_max",
+    ),
     *("cop_x_low_m_min", "cop_x_high_m_max", "cop_y_low_m_min", "cop_y_high_m_max"),
     *("angle_rad_min", "angle_rad_max", "contact", "estimate_flags"),
 )
@@ -47,6 +54,7 @@ _BIT_COLUMNS = frozenset({"frame_flags", "contact", "estimate_flags"})
 _INTEGER_TYPES: Mapping[str, npt.DTypeLike] = {
     "t_first_ns": np.int64,
     "t_last_ns": np.int64,
+    "grf_n_max_t_ns": np.int64,
     "part": np.uint16,
     "frames": np.uint32,
     "missing": np.uint64,
@@ -123,6 +131,7 @@ def make_single_frame_bins(frames: Mapping[str, Array], previous_seq: int | None
     if estimated:
         contact = frames["contact"]
         bins |= {
+            "grf_n_max_t_ns": frames["t_ns"],
             "grf_lower_bound_n_max": frames["grf_lower_bound_n"].astype(np.float32),
             "grf_unknown": np.isnan(frames["grf_n"]).astype(np.uint32),
             "contact": np.select(
@@ -188,6 +197,8 @@ def _merge_groups(bins: Bins, starts: npt.NDArray[np.intp]) -> Bins:
     for name, values in bins.items():
         if name == "t_last_ns":
             found[name] = values[ends]
+        elif name == "grf_n_max_t_ns":
+            found[name] = values[_find_maxima(bins["grf_n_max"], starts)]
         elif name in {"t_first_ns", "part"}:
             found[name] = values[starts]
         elif name in _SUMMED_COLUMNS:
@@ -201,6 +212,14 @@ def _merge_groups(bins: Bins, starts: npt.NDArray[np.intp]) -> Bins:
     return found
 
 
+def _find_maxima(values: Array, starts: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+    """Return the index of the first maximum of each group; its first index if all are NaN."""
+    maxima = np.repeat(np.fmax.reduceat(values, starts), np.diff(np.r_[starts, len(values)]))
+    at = np.where(values == maxima, np.arange(len(values)), len(values))
+    found = np.minimum.reduceat(at, starts)
+    return np.where(found < len(values), found, starts)
+
+
 def concatenate_bins(pieces: list[Bins]) -> Bins:
     """Concatenate bins."""
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
@@ -208,7 +227,7 @@ def concatenate_bins(pieces: list[Bins]) -> Bins:
 
 def shift_bins_to_axis(bins: Bins, axis: TimeAxis) -> Bins:
     """Return bins with their instants on the session's time axis."""
-    names = ("t_first_ns", "t_last_ns")
+    names = ("t_first_ns", "t_last_ns", *({"grf_n_max_t_ns"} & bins.keys()))
     return bins | {name: axis.shift_to_axis(bins[name], bins["part"]) for name in names}
 
 
@@ -286,7 +305,7 @@ def build_levels(finest: Bins) -> list[Bins]:
 
 
 MAX_PREVIEW_BINS = 16_384
-"""Most stored bins: with eight tiles 154 bytes each, with 64 tiles 658."""
+"""Most stored bins: with eight tiles 178 bytes each, with 64 tiles 682."""
 _MIN_MERGED_FRAMES = 1024
 """Frames that are merged at a time."""
 

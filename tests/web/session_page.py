@@ -25,6 +25,7 @@ def recorded_walk(server: Running) -> Recording:
     for _ in range(6):
         node.send(200, [0.0, 0.0], alive=True)
         node.send(200, [20.0, 60.0], alive=True)
+    node.send(11, [20.0, 60.0], alive=True)  # the next frame is not the first of a bin
     node.send(1, [20.0, 70.0])
     node.send(200, [0.0, 0.0], alive=True)
     node.send(50, [20.0, 200.0], alive=True)

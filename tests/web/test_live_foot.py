@@ -143,8 +143,19 @@ def test_a_grid_is_a_heat_map_with_readable_numbers_on_a_phone(
         expect(page.locator(LIVE)).to_have_count(1)
         expect(page.locator("#foot rect.dome")).to_have_count(64)
         expect(page.locator("#range")).to_have_text("Range: auto")
-        number = page.locator("#foot .tile-symbol .name").first
+        number = page.locator("#foot .name").first
         expect(number).to_have_text("12")
+        on_top = """() => {
+          const all = [...document.querySelectorAll("#foot *")];
+          const last = (of) => all.findLastIndex((one) => one.matches(of));
+          return all.findIndex((one) => one.matches(".name")) > last("[class^=cop], .dome");
+        }"""
+        assert page.evaluate(on_top)  # the COP and its trail cover no number
+        page.click("#unit-kpa")
+        kpa = page.locator("#bars .tile").first.get_attribute("data-value") or ""
+        expect(number).to_have_text(f"{float(kpa):.1f}")
+        expect(page.locator("#foot .heat-legend")).to_contain_text("kPa")
+        page.click("#unit-n")
         cell = page.locator("#foot rect.dome").first.bounding_box()
         assert cell is not None
         assert cell["width"] >= 26

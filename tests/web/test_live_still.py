@@ -25,7 +25,7 @@ PLACES = """() => Object.fromEntries(
 COVERED = """() => {
   const at = document.querySelector("#notices .notice:last-child").getBoundingClientRect();
   const parts =
-    "#pause #foot #grf #trace #bars #record #marker #tare #recording-state".split(" ");
+    "#notes #pause #foot #grf #trace #bars #record #marker #tare #recording-state".split(" ");
   return parts.filter((name) => {
     const { left, right, top, bottom } = document.querySelector(name).getBoundingClientRect();
     return left < at.right && right > at.left && top < at.bottom && bottom > at.top;
@@ -49,10 +49,18 @@ def test_warnings_pauses_messages_and_recordings_leave_everything_where_it_is(
         page = open_page(scripted.url, *size)
         expect(page.locator(LIVE)).to_have_count(1)
         expect(page.locator("#last-session")).to_have_text("Not recording")
+        borders = [
+            page.locator(of).evaluate("(one) => getComputedStyle(one).borderColor")
+            for of in ("#undo", "#tare")
+        ]
+        assert page.locator("#undo").is_disabled()
+        assert borders[0] == "rgba(0, 0, 0, 0)" != borders[1]
         before = places(page)
         tell(scripted, "tile S0 (mux 0x70 channel 0) does not answer", "another trouble " * 9)
         expect(page.locator("#notes-more")).to_have_text("1 more")
         assert places(page) == before
+        cut = "(one) => one.scrollWidth > one.clientWidth || one.scrollHeight > one.clientHeight"
+        assert not page.locator("#notes .note-text").first.evaluate(cut)
         page.keyboard.press("p")
         expect(page.locator("#paused")).to_be_visible()
         expect(page.locator("#notes")).to_be_in_viewport()

@@ -185,7 +185,7 @@ COLOURS = """async () => {
     return (0.2126 * r + 0.7152 * g + 0.0722 * b) / 255;
   });
   canvas.remove();
-  return { light, top: foot.range.foot };
+  return { light, top: foot.range.ofFoot("N") };
 }"""
 """How light tiles of 0, 10, 17 and 21 N are on a card."""
 

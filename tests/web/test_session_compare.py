@@ -176,28 +176,42 @@ def test_the_difference_of_two_sessions_has_the_interval_of_a_welch_test(
     compared: Recording, other: Recording, open_page: OpenPage
 ) -> None:
     page = open_page(url_of(compared, **{"with": other.id}))
-    expect(page.locator("#beside-summary")).to_contain_text("same first contact")
-    expect(page.locator("#beside-summary")).to_contain_text(re.compile(r"\(recorded \d+ s later\)"))
+    says = re.compile(
+        r"\(recorded \d+ s later\): aligned at the first whole stance \(shifted by .* s\)\.$"
+    )
+    expect(page.locator("#beside-summary")).to_have_text(says)
     expect(page.locator("#differences-rows tr")).to_have_count(4)
     head = page.locator("#differences-card thead")
     expect(head).to_contain_text(
-        re.compile(r"This .*±\ssd.*Other .*±\ssd.*Other \u2212 this, ±\s95\s%")
+        re.compile(r"hops \(\d+\), ±\ssd.*others \(\d+\), ±\ssd.*Newer \u2212 older, ±\s95\s%")
     )
+    expect(head.get_by_title("others", exact=True)).to_be_visible()
+    verdict = page.locator("#differences-verdict")
+    expect(verdict).to_have_text("No differences: each session needs 3 whole stances.")
     values = ([9.6, 9.9, 9.1, 9.4], [10.2, 10.9, 9.8])
     found = page.evaluate(
         """([own, other]) => import("/static/session/differences.js").then((module) => {
-          const stances = (values) => values.map((n) => ({ is_whole: true, peak_grf_n: n }));
-          module.drawDifferences(stances(own), stances(other), "other");
+          const stances = (values) => values.map((n) => (
+            { is_whole: true, begun: true, ended: true, peak_grf_n: n }));
+          const draw = (older, newer) => module.drawDifferences(
+            { name: "A", stances: stances(older), tares: [{ t_ns: 0, source: "flight" }] },
+            { name: "B", stances: stances(newer), tares: [] });
+          const verdict = document.getElementById("differences-verdict");
+          draw([20, 21, 22], [11, 12, 13]);
+          const verdicts = [verdict.textContent];
+          draw([20, 21, 22], [20, 21, 23]);
+          verdicts.push(verdict.textContent);
+          draw(own, other);
           const { textContent } = document.querySelector("[data-figure=peak]");
-          module.drawDifferences(stances(own), stances(other.slice(1)), "other");
+          draw(own, other.slice(1));
           const cell = document.querySelector("[data-figure=peak] td:last-child").textContent;
-          const moments = (values) => module.momentsOf(stances(values), "peak_grf_n");
+          const moments = module.momentsOf;
           const { mean, half } = module.differenceOf(moments(own), moments(other));
-          const near = [[22.12, 22.14, 22.16], [22.15, 22.17, 22.19]].map(stances);
-          module.drawDifferences(...near, "other");
+          draw([22.12, 22.14, 22.16], [22.15, 22.17, 22.19]);
           const fine = document.querySelector("[data-figure=peak]").textContent;
           const same = module.differenceOf(moments([9, 9, 9]), moments([8, 8, 8])).half;
-          return { textContent, cell, mean, half, same, fine };
+          const tares = document.getElementById("differences-tares").textContent;
+          return { textContent, cell, mean, half, same, fine, verdicts, tares };
         })""",
         values,
     )
@@ -206,9 +220,32 @@ def test_the_difference_of_two_sessions_has_the_interval_of_a_welch_test(
     assert found["half"] == pytest.approx((welch.high - welch.low) / 2, rel=0.03)
     assert np.isnan(found["same"]), "no scatter is no certainty"
     assert f"0.8 ± {found['half']:.1f}" in found["textContent"]
+    assert re.search("Different tares.*A: .* automatically, in the air; B: none", found["tares"])
     # 22.1 and 22.2 with a difference of 0.0 contradict each other.
     assert re.search(r"22\.14 ± 0\.02.*22\.17 ± 0\.02.*0\.03 ± ", found["fine"])
+    assert found["verdicts"] == [
+        "Different at 95 %: peak force smaller by 9.0 N (B against A).",
+        "No figure differs at 95 %.",
+    ]
     assert not re.search(r"[0-9]", found["cell"])  # two stances do not bound their scatter
+
+
+def test_the_older_session_is_first_and_sessions_are_aligned_at_whole_stances(
+    compared: Recording, other: Recording, open_page: OpenPage
+) -> None:
+    page = open_page(url_of(other, **{"with": compared.id}))
+    head = page.locator("#differences-card thead")
+    expect(head).to_have_text(re.compile(r"hops.*others.*Newer"))
+    shift_s = page.evaluate(
+        """import("/static/session/align.js").then(({ alignments }) => {
+          const own = { beginNs: 0, durationS: 9, markers: [], offset: () => null,
+            stances: [{ from: 0, is_whole: false }, { from: 2, is_whole: true }] };
+          const other = { beginNs: 0, durationS: 9, events: [], clock: null,
+            stances: [{ begin_t_ns: 5e8, is_whole: true }] };
+          return alignments(own, other)[0].shiftS;
+        })"""
+    )
+    assert shift_s == 1.5
 
 
 def test_another_session_is_told_by_its_node_and_has_its_stances_and_tiles(

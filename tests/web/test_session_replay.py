@@ -180,7 +180,7 @@ def test_space_plays_after_a_click_on_a_button_and_presses_a_button_of_the_keybo
 ) -> None:
     page = opened(session, open_page, 0.0, 1.0)
     play = page.locator("#play")
-    for button in ("#zoom-in", "#stance-next", '[data-speed="0.1"]'):
+    for button in ('[data-speed="0.1"]', "#zoom-in", "#stance-next"):
         page.click(button)
         page.keyboard.press(" ")
         expect(play).to_have_attribute("data-going", "true")

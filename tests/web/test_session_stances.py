@@ -263,6 +263,12 @@ def test_of_a_stance_that_was_not_seen_whole_the_line_says_so(
     assert complaints(page) == []
 
 
+def test_of_a_cut_stance_a_bound_of_zero_is_left_out(server: Running, open_page: OpenPage) -> None:
+    asked = """import("/static/session/stances.js").then(({ FIGURES, figureOf }) =>
+      [0, 0.012].map((s) => figureOf({ begun: false, duration_s: s }, FIGURES[1])[0]))"""
+    assert open_page(f"{server.url}/nodes").evaluate(asked) == ["\u2013", "≥\u00a012"]
+
+
 def test_a_laptop_shows_four_rows_of_stances_and_the_foot(
     hops: Recording, open_page: OpenPage
 ) -> None:
@@ -376,6 +382,33 @@ def test_a_link_that_was_copied_leads_to_the_same_stance_and_cursor(
     expect(there.locator("#readout")).to_have_attribute("data-time-s", at_s)
     for name in ("data-from", "data-to"):
         expect(settled(there)).to_have_attribute(name, settled(page).get_attribute(name) or "")
+
+
+def test_playback_of_a_selected_stance_ends_with_the_view_and_a_link_names_it_only_in_view(
+    hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
+) -> None:
+    page = opened(open_page, hops)
+    page.locator("#stances-rows tr").nth(2).click()
+    says(page, stances[2])
+    plots, readout, play = (page.locator(of) for of in ("#plots", "#readout", "#play"))
+    shown = [float(settled(page).get_attribute(f"data-{of}") or "nan") for of in ("from", "to")]
+    page.evaluate("""() => {
+      window.read = [];
+      const readout = document.getElementById("readout");
+      new MutationObserver(() => window.read.push(Number(readout.dataset.timeS)))
+        .observe(readout, { attributeFilter: ["data-time-s"] });
+    }""")
+    for _ in range(2):  # the second begins at the start of the view
+        page.click("#play")
+        expect(play).to_have_attribute("data-going", "false")
+        until(lambda: float(readout.get_attribute("data-time-s") or 0) > shown[1] - 0.005)
+        expect(plots).to_have_attribute("data-from", f"{shown[0]:.4f}")
+    assert min(page.evaluate("window.read")) < shown[0] + 0.1
+    expect(page).to_have_url(re.compile("&stance=3$"))
+    for _ in range(4):
+        page.click("#later")
+    expect(page).not_to_have_url(re.compile("stance="))
+    says(page, stances[2])
 
 
 def test_the_chosen_stance_is_exported_from_its_first_frame_to_its_last(

@@ -95,6 +95,7 @@ def test_a_deleted_session_can_be_had_back_at_once_or_from_the_trash_until_it_is
     page.locator("#trash-card summary").click()
     trashed = page.locator(f'#trash [data-session-id="{session.id}"]')
     expect(trashed).to_contain_text("walk")
+    expect(page.locator("#sessions .none")).to_have_text("No sessions; 1 in the trash.")
     said = page.locator("#notices .notice", has_text="is in the trash")
     expect(said).to_have_count(1)
     trashed.get_by_role("button", name="Restore").click()

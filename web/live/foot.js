@@ -1,4 +1,4 @@
-// Foot: tiles coloured by force, from the side (line of tiles) or from above with toes up (heat map on a
+// Foot: tiles coloured by load, from the side (line of tiles) or from above with toes up (heat map on a
 // grid), with the centre of pressure.
 
 import { FRAME } from "../common/flags.js";
@@ -68,7 +68,7 @@ export class Foot {
     this.turning.append(this.plan ? this.outline() : svg("path", { class: "sole", d: this.layout.sole() }));
     this.symbols = this.tiles.map((tile, i) => this.addSymbol(tile, i));
     this.cop = new Cop(this.layout, this.cop?.past);
-    this.turning.append(...this.cop.parts);
+    this.turning.append(...this.cop.parts, ...this.symbols.flatMap(({ names }) => names)); // nothing covers the text
     this.ground = svg("line", { class: "ground", x1: 0, x2: widthPx });
     const hint = this.plan
       ? [svg("text", { class: "hint", x: widthPx - 4, y: 18, "text-anchor": "end" }, "↑"), svg("text", { class: "hint", x: widthPx - 4, y: 34, "text-anchor": "end" }, "toes")]
@@ -98,7 +98,7 @@ export class Foot {
     return group;
   }
 
-  /** Add the symbol of a tile: dome, force arrow, fault cross, name. */
+  /** Add the symbol of a tile: dome, force arrow, fault cross; return it with its name. */
   addSymbol(tile, i) {
     const { x, y } = this.layout.points[i];
     const cell = this.layout.pitch * this.layout.scale;
@@ -112,9 +112,8 @@ export class Foot {
     const isNamed = this.grid && 2 * r >= Math.max(NAMES_FROM_PX, LETTER_PX * tile.serial.length);
     const text = (cls, down, content) => svg("text", { class: cls, x, y: y + down, "text-anchor": "middle" }, content);
     const label = text("name", isNamed ? 10 : 4, this.grid ? "" : tile.serial);
-    const names = isNamed ? [label, text("name above", -5, tile.serial)] : [label];
+    const names = r < 13 ? [] : isNamed ? [label, text("name above", -5, tile.serial)] : [label];
     group.append(dome, arrow, cross, svg("title", {}, tile.serial));
-    if (r >= 13) group.append(...names);
     this.turning.append(group);
     setData(group, "reference", String(Boolean(tile.reference)));
     return { group, dome, arrow, number: this.grid && cell >= NUMBERS_FROM_PX ? label : null, names };
@@ -125,15 +124,15 @@ export class Foot {
     if (node?.node === this.shown) this.cop?.notePosition(frame);
   }
 
-  /** Draw a frame and write its numbers. */
-  draw(node, frame) {
+  /** Draw a frame and write its numbers. @param {"N" | "kPa"} unit */
+  draw(node, frame, unit) {
     this.fit(node);
     this.range.update(node, frame, performance.now());
-    const fullScale = this.range.foot;
-    setText(this.top, `${number(fullScale, fullScale < 10 && fullScale % 1 ? 1 : 0)} N`);
+    const fullScale = this.range.ofFoot(unit);
+    setText(this.top, `${number(fullScale, fullScale < 10 && fullScale % 1 ? 1 : 0)} ${unit}`);
     this.turn(node, frame);
     this.writeAngle(node, frame);
-    this.symbols.forEach((symbol, i) => this.drawTile(symbol, i, readTile(node, i, frame, "N"), fullScale));
+    this.symbols.forEach((symbol, i) => this.drawTile(symbol, i, readTile(node, i, frame, unit), fullScale));
     this.cop.draw(node, frame);
   }
 
@@ -144,8 +143,8 @@ export class Foot {
     const share = reading.state === "saturated" ? 1 : known ? Math.max(0, reading.value / fullScale) : 0;
     const { fill, ink } = known ? shadeOf(this.shades, share) : { fill: "none", ink: "" };
     place(dome, { fill });
-    for (const name of names) place(name, { fill: known ? ink : "currentColor" });
-    if (label) setText(label, known ? number(reading.value, 0) : reading.bound ? `≥${reading.bound}` : "");
+    for (const name of names) place(name, { fill: known ? ink : "currentColor", stroke: fill });
+    if (label) setText(label, known ? number(reading.value, reading.unit === "kPa" && reading.value < 9.95 ? 1 : 0) : reading.bound ? `≥${reading.bound}` : "");
     if (!this.plan) this.drawArrow(arrow, i, Math.min(1, share));
   }
 

@@ -29,7 +29,7 @@ export class Range {
   update(node, frame, nowMs) {
     const mode = this.chosen ?? (this.button && node.tiles.length && isPlan(node.tiles) ? "automatic" : "fixed");
     this.automatic = mode === "automatic";
-    this.full = Math.max(0, ...node.tiles.filter((tile) => !tile.reference).map((tile) => fullScale(tile, "N")));
+    this.tiles = node.tiles;
     this.tops.N.update(frame?.force_max_n, nowMs);
     this.tops.kPa.update(frame?.gauge_max_kpa, nowMs);
     this.show();
@@ -44,9 +44,9 @@ export class Range {
     return this.automatic ? this.tops[unit].value : fullScale(tile, unit);
   }
 
-  /** Full scale of the foot's colours, newtons. */
-  get foot() {
-    return this.automatic ? this.tops.N.value : this.full;
+  /** Return the full scale of the foot's colours. */
+  ofFoot(unit) {
+    return this.automatic ? this.tops[unit].value : Math.max(0, ...this.tiles.filter((tile) => !tile.reference).map((tile) => fullScale(tile, unit)));
   }
 }
 

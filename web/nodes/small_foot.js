@@ -98,7 +98,7 @@ export class SmallFoot {
     context.font = "600 12px system-ui, sans-serif";
     context.textAlign = "left";
     context.textBaseline = "alphabetic";
-    context.fillText(`${number(this.range.foot, 0)} N`, 0, 12);
+    context.fillText(`${number(this.range.ofFoot("N"), 0)} N`, 0, 12);
     context.fillText("0", 14, top + long);
   }
 
@@ -109,7 +109,7 @@ export class SmallFoot {
     const { state, value } = readTile(node, i, frame, "N");
     const fault = FAULT_STATES.has(state);
     const isKnown = value !== null && !tile.reference;
-    const share = state === "saturated" ? 1 : isKnown ? value / this.range.foot : 0;
+    const share = state === "saturated" ? 1 : isKnown ? value / this.range.ofFoot("N") : 0;
     const shade = shadeOf(colours.shades, share);
     context.fillStyle = fault ? colours.badFill : shade.fill;
     context.strokeStyle = fault ? colours.bad : state === "saturated" ? colours.warn : colours.text;

@@ -3,20 +3,20 @@
 import { offsetAt } from "./clock.js";
 
 /**
- * Return the possible alignments, the default first: first contact, else start.
- * @param {{beginNs: number, durationS: number, stances: {from: number, begun: boolean}[],
+ * Return the possible alignments, the default first: first whole stance, else start.
+ * @param {{beginNs: number, durationS: number, stances: {from: number, is_whole: boolean}[],
  *   markers: {label: string, timeS: number}[], offset: (tNs: number, ofServer: boolean) => number | null}} own
- * @param {{beginNs: number, durationS: number, stances: {begin_t_ns: number, begun: boolean}[],
+ * @param {{beginNs: number, durationS: number, stances: {begin_t_ns: number, is_whole: boolean}[],
  *   events: {label: string, t_ns: number}[], clock: Clock | null}} other
  * @returns {{key: string, label: string, meaning: string, shiftS: number}[]}
  */
 export function alignments(own, other) {
-  const found = [{ key: "start", label: "start", meaning: "each session from its own first frame", shiftS: 0 }];
-  const mine = own.stances.find((stance) => stance.begun);
-  const theirs = other.stances.find((stance) => stance.begun);
+  const found = [{ key: "start", label: "start", meaning: "each from its own first frame", shiftS: 0 }];
+  const mine = own.stances.find((stance) => stance.is_whole);
+  const theirs = other.stances.find((stance) => stance.is_whole);
   if (mine && theirs) {
     found.unshift({
-      key: "contact", label: "first contact", meaning: "same first contact",
+      key: "contact", label: "first whole stance", meaning: "aligned at the first whole stance",
       shiftS: mine.from - (theirs.begin_t_ns - other.beginNs) * 1e-9,
     });
   }
@@ -28,7 +28,7 @@ export function alignments(own, other) {
     labels.add(event.label);
     const theirsS = (event.t_ns - (offsetOf(event.t_ns, true) ?? 0) - other.beginNs) * 1e-9;
     found.push({
-      key: `marker:${event.label}`, label: `marker “${event.label}”`, meaning: `same first marker “${event.label}”`,
+      key: `marker:${event.label}`, label: `marker “${event.label}”`, meaning: `aligned at the first marker “${event.label}”`,
       shiftS: marker.timeS - theirsS,
     });
   }
@@ -36,7 +36,7 @@ export function alignments(own, other) {
   if (mineNs !== null && theirsNs !== null) {
     const shiftS = (other.beginNs + theirsNs - own.beginNs - mineNs) * 1e-9;
     if (shiftS < own.durationS && shiftS + other.durationS > 0) { // else they were not recorded together
-      found.push({ key: "clock", label: "clock", meaning: "same server clock", shiftS });
+      found.push({ key: "clock", label: "clock", meaning: "aligned by the server's clock", shiftS });
     }
   }
   return found;

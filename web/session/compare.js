@@ -25,6 +25,12 @@ function nameOf(other, session) {
   return isSame ? `${name}, ${localTime(new Date(other.started_t_ns / 1e6))}` : name;
 }
 
+/** Return a session's name; if the other one has the same, its node or start. */
+function shortNameOf(session, other) {
+  if (session.name !== other.name) return session.name || session.id;
+  return session.node === other.node ? localTime(new Date(session.started_t_ns / 1e6)) : session.node;
+}
+
 /** Controls of the overlay. */
 export class Compare {
   /**
@@ -96,8 +102,8 @@ export class Compare {
   /** Show another session, aligned as selected. */
   async with(id, align) {
     const wanted = this.wanted;
-    const [other, stances, events, clock] = await Promise.all([
-      api.getSession(id), unlessRefused(api.listStances(id)), unlessRefused(api.listMarkers(id)), unlessRefused(api.clockOf(id)),
+    const [other, stances, events, clock, array] = await Promise.all([
+      api.getSession(id), ...[api.listStances(id), api.listMarkers(id), api.clockOf(id), api.arrayOf(id)].map((asked) => unlessRefused(asked)),
     ]);
     const columns = Object.fromEntries(SHARED.map((key) => [key, [`${STEMS[key]}_min`, `${STEMS[key]}_max`]]));
     const beside = this.beside(nameOf(other, this.session), columns, (query, stop) => api.overview(id, query, stop));
@@ -117,7 +123,10 @@ export class Compare {
     byId("align-choice").hidden = false;
     this.drawn = beside;
     this.apartS = (other.started_t_ns - this.session.started_t_ns) * 1e-9;
-    drawDifferences(plots.stances, stances ?? [], beside.name);
+    const own = { name: shortNameOf(this.session, other), stances: plots.stances, tares: this.page.replay.array?.tares ?? [] };
+    const theirs = { name: shortNameOf(other, this.session), stances: stances ?? [], tares: array?.tares ?? [] };
+    if (this.apartS < 0) drawDifferences(theirs, own);
+    else drawDifferences(own, theirs);
     this.page.setOverlay({ id, name: beside.name });
     this.moveTo(this.ways.some((way) => way.key === align) ? align : this.ways[0].key);
     this.show(beside);
@@ -134,9 +143,9 @@ export class Compare {
     const way = this.ways.find((one) => one.key === key);
     this.align.value = key;
     this.drawn.move(way.shiftS);
-    const shift = way.shiftS === 0 ? "" : `shifted by ${number(way.shiftS, 3)} s, `;
+    const shift = way.shiftS === 0 ? "" : ` (shifted by ${number(way.shiftS, 3)} s)`;
     const apart = `recorded ${roughly(Math.abs(this.apartS))} ${this.apartS < 0 ? "earlier" : "later"}`;
-    this.showText(`${this.drawn.name} (${apart}): ${shift}${way.meaning}.`, way.shiftS);
+    this.showText(`${this.drawn.name} (${apart}): ${way.meaning}${shift}.`, way.shiftS);
     this.page.redraw();
   }
 

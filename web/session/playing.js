@@ -9,7 +9,7 @@ export class Playing {
   /**
    * @param {object} on
    * @param {() => number} on.at cursor, s
-   * @param {() => number} on.end end of the session, s
+   * @param {() => import("./view.js").View} on.range what is played
    * @param {() => boolean} on.ready the next frames are loaded
    * @param {(timeS: number) => void} on.go moves the cursor
    * @param {() => void} on.changed started or stopped
@@ -29,7 +29,8 @@ export class Playing {
   }
 
   start() {
-    if (this.on.at() >= this.on.end()) this.on.go(0);
+    const { from, to } = this.on.range();
+    if (this.on.at() < from || this.on.at() >= to) this.on.go(from);
     this.lastMs = null;
     this.request = requestAnimationFrame((nowMs) => this.tick(nowMs));
     this.on.changed();
@@ -48,8 +49,9 @@ export class Playing {
     this.lastMs = nowMs;
     if (!sinceMs || !this.on.ready()) return;
     const leapMs = Math.min(sinceMs, this.calm.matches ? 2 * CALM_MS : LEAP_MAX_MS);
-    const toS = Math.min(this.on.end(), this.on.at() + this.speed * leapMs * 1e-3);
+    const endS = this.on.range().to;
+    const toS = Math.min(endS, this.on.at() + this.speed * leapMs * 1e-3);
     this.on.go(toS);
-    if (toS >= this.on.end()) this.stop();
+    if (toS >= endS) this.stop();
   }
 }

@@ -48,6 +48,7 @@ export class Plotted {
       (query, stop) => api.overview(session.id, query, stop), (bins) => this.showDetail(bins), showRefusal);
     this.replay = new Replay({
       at: () => this.cursorS ?? this.view.from, go: (timeS) => this.cursorTo(timeS),
+      range: () => (this.shownStance ? this.view : { from: 0, to: this.durationS }),
       changed: () => this.draw(), failed: showRefusal,
     });
     this.downloads = new Downloads();
@@ -190,6 +191,12 @@ export class Plotted {
     new ResizeObserver(() => this.draw()).observe(byId("plots"));
   }
 
+  /** Number of the selected stance if the view shows a part of it; null: none. */
+  get shownStance() {
+    const stance = this.stances.stances[this.stances.current];
+    return stance && stance.from < this.view.to && stance.to > this.view.from ? stance.number : null;
+  }
+
   get middle() { return (this.view.from + this.view.to) / 2; }
 
   show(view) {
@@ -205,10 +212,11 @@ export class Plotted {
     this.linking = setTimeout(() => this.updateUrl(), SETTLED_MS);
   }
 
-  /** Write range, cursor and selected stance to the URL. */
+  /** Write range, cursor and selected stance to the URL; a stance that is not loaded yet stays. */
   updateUrl() {
     clearTimeout(this.linking);
-    history.replaceState(null, "", location.pathname + views.toLink(this.view, this.durationS, location.search, this.cursorS, this.stances.selected));
+    const stance = this.stances.current < 0 ? this.stances.selected : this.shownStance;
+    history.replaceState(null, "", location.pathname + views.toLink(this.view, this.durationS, location.search, this.cursorS, stance));
   }
 
   copyLink() {

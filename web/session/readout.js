@@ -120,7 +120,7 @@ export function drawSummary(bins, view, box) {
   const missing = bins.sum("missing", begin, end);
   if (missing) parts.push(`${missing.toLocaleString("en-GB")} lost`);
   const grf = bins.estimated ? bins.extremes("grf_n_min", "grf_n_max", begin, end) : null;
-  if (grf) parts.push(`largest frame ${number(grf.high)} N at ${time(bins.first[grf.at])}, smallest ${number(grf.low)} N`);
+  if (grf) parts.push(`largest frame ${number(grf.high)} N at ${time(bins.columns.grf_n_max_t_s[grf.at])}, smallest ${number(grf.low)} N`);
   const unknown = bins.estimated ? bins.sum("grf_unknown", begin, end) : 0;
   if (unknown) parts.push(`GRF unknown in ${unknown.toLocaleString("en-GB")} frames`);
   if (!bins.estimated) parts.push("no estimates, raw counts");

@@ -26,6 +26,7 @@ export class Replay {
   /**
    * @param {object} on
    * @param {() => number} on.at cursor, or start of playback, s
+   * @param {() => import("./view.js").View} on.range what is played
    * @param {(timeS: number) => void} on.go moves cursor and view
    * @param {() => void} on.changed requests a drawing
    * @param {(error: Error) => void} on.failed
@@ -38,7 +39,7 @@ export class Replay {
     this.range = this.foot = this.bars = null;
     this.walking = Promise.resolve();
     this.playing = new Playing({
-      at: on.at, go: on.go, end: () => this.samples.whole.durationS,
+      at: on.at, go: on.go, range: on.range,
       ready: () => this.samples.has(on.at(), 0), changed: () => { this.drawControls(); on.changed(); },
     });
     byId("play").addEventListener("click", () => this.toggle());
@@ -129,8 +130,8 @@ export class Replay {
     setText(byId("replay-force"), frame && samples.whole.estimated ? `, ${forceText(frame, this.node)}` : "");
     setText(byId("replay-frame"), frame ? `, frame ${frame.seq.toLocaleString("en-GB")}` : "");
     if (!this.node) return;
-    this.foot.draw(this.node, frame);
     this.bars.draw(this.node, frame, performance.now());
+    this.foot.draw(this.node, frame, this.bars.shown);
     drawGrf(this.node, frame);
   }
 

@@ -70,12 +70,13 @@ export const FIGURES = [
   { key: "travel", label: "COP travel", value: "cop_x_range_m", sigma: "cop_x_range_sigma_m", unit: "mm", factor: 1e3, decimals: 1 },
 ];
 
-/** Return value and half width of the 95 % interval, such as "25.6" and "± 1.0"; "≥ 25.6" of a part of a stance. */
-function figureOf(stance, figure) {
+/** Return value and half width of the 95 % interval, such as "25.6" and "± 1.0"; "≥ 25.6" of a lower bound, "–" for ≥ 0. */
+export function figureOf(stance, figure) {
   const { value, sigma, factor, decimals } = figure;
   const [of, sigmaOf] = [stance[value] ?? null, stance[sigma] ?? null];
+  const isBound = isLowerBound(stance, figure);
   return [
-    of === null ? "–" : `${isLowerBound(stance, figure) ? "≥\u00a0" : ""}${number(of * factor, decimals)}`,
+    of === null || (isBound && Number((of * factor).toFixed(decimals)) <= 0) ? "–" : `${isBound ? "≥\u00a0" : ""}${number(of * factor, decimals)}`,
     of === null || sigmaOf === null ? "" : `±\u00a0${number(Z95 * sigmaOf * factor, decimals)}`,
   ];
 }

@@ -34,6 +34,7 @@ export class Sessions {
     /** @type {{q?: string, complete?: string}} */
     this.filter = {}; // query of the server
     this.takeRows = new Map(); // take id -> row and key
+    this.trashed = 0; // sessions in the trash
     this.all = el("input", { type: "checkbox", "aria-label": "Select all" });
     this.head = head(this.all);
     this.chosen = new Chosen({ all: this.all, onSession, onDeleted, shown: () => [...this.sessions.values()] });
@@ -135,6 +136,11 @@ export class Sessions {
     return key;
   }
 
+  setTrashCount(count) {
+    this.trashed = count;
+    if (this.box.querySelector(".none")) this.draw();
+  }
+
   draw() {
     const sorted = [...this.sessions.values()].sort((a, b) => b.started_t_ns - a.started_t_ns).slice(0, SESSIONS_MAX);
     this.sessions = new Map(sorted.map((session) => [session.id, session]));
@@ -142,7 +148,7 @@ export class Sessions {
     if (!sorted.length) {
       this.rows.clear();
       this.box.setAttribute("role", "group"); // a table needs rows
-      this.box.replaceChildren(el("p", { cls: "none", text: emptyText(this.filter) }));
+      this.box.replaceChildren(el("p", { cls: "none", text: emptyText(this.filter, this.trashed) }));
       this.chosen.draw();
       return;
     }
@@ -273,10 +279,11 @@ function groupByTake(sessions) {
 const COMPLETENESS = { true: "complete ", lossy: "lossy ", false: "incomplete " };
 
 /** Return the text of an empty list. @param {{q?: string, complete?: string}} filter */
-function emptyText({ q, complete }) {
+function emptyText({ q, complete }, trashed) {
   const kind = COMPLETENESS[complete] ?? "";
   if (q) return `No ${kind}session matches “${q}”.`;
-  return kind ? `No ${kind}sessions.` : "No sessions yet. Press Record on the live page.";
+  if (kind) return `No ${kind}sessions.`;
+  return trashed ? `No sessions; ${trashed} in the trash.` : "No sessions yet. Press Record on the live page.";
 }
 
 /** Return true if the server would list a session. @param {Session} session @param {{q?: string, complete?: string}} filter */

@@ -21,7 +21,7 @@ function removeSession(id) {
   trash.load();
 }
 
-const trash = new Trash(updateSession);
+const trash = new Trash(updateSession, (count) => sessions.setTrashCount(count));
 const sessions = new Sessions({ onSession: updateSession, onDeleted: removeSession });
 
 const handlers = {

@@ -8,9 +8,10 @@ import { many } from "./chosen.js";
 
 /** List of deleted sessions. */
 export class Trash {
-  /** `onRestored(session)` receives a restored session. */
-  constructor(onRestored) {
+  /** `onRestored(session)` receives a restored session, `onCount(count)` the number of deleted ones. */
+  constructor(onRestored, onCount) {
     this.onRestored = onRestored;
+    this.onCount = onCount;
     /** @type {Session[]} */
     this.items = [];
     this.requests = this.answered = 0;
@@ -31,6 +32,7 @@ export class Trash {
       byId("trash").replaceChildren(...items.map((session) => this.row(session)));
       byId("trash-empty").hidden = !items.length;
       setText(byId("trash-legend"), items.length ? `${many(items.length)}, can be restored` : "empty");
+      this.onCount(items.length);
     });
     if (number === this.requests) this.answered = number;
   }

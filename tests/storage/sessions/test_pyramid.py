@@ -113,6 +113,9 @@ def check(found: Bins, at: int, some: dict[str, Any], before: Any, part: int) ->
             "missing": sum(b - a - 1 for a, b in itertools.pairwise(seq)),
             "grf_n_min": np.fmin.reduce(some["grf_n"]),
             "grf_n_max": np.fmax.reduce(some["grf_n"]),
+            "grf_n_max_t_ns": some["t_ns"][
+                0 if np.isnan(some["grf_n"]).all() else np.nanargmax(some["grf_n"])
+            ],
             "grf_low_n_min": np.fmin.reduce(some["grf_n"] - half_n),
             "grf_high_n_max": np.fmax.reduce(some["grf_n"] + half_n),
             "grf_unknown": np.isnan(some["grf_n"]).sum(),

@@ -200,8 +200,9 @@ def _times_to_seconds(seen: BinnedSlice) -> dict[str, Array]:
     """Convert times to seconds after the first frame: JSON has no integers of that size."""
     bins = dict(seen.bins)
     times = {
-        f"t_{which}_s": (bins.pop(f"t_{which}_ns") - seen.begin_ns) * 1e-9
-        for which in ("first", "last")
+        f"{name.removesuffix('_ns')}_s": (bins.pop(name) - seen.begin_ns) * 1e-9
+        for name in seen.bins
+        if name.endswith("_ns")
     }
     return times | bins
 
