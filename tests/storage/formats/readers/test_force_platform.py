@@ -406,6 +406,15 @@ def test_a_plate_without_channels_leaves_the_others_alone(tmp_path: Path) -> Non
     assert "plate 2 is not read" in found.notes[0]
 
 
+def test_a_single_plate_without_channels_is_refused(tmp_path: Path) -> None:
+    content = force_plate(2, 6)
+    del content["FORCE_PLATFORM"]["CHANNEL"]
+    path = tmp_path / "gait.c3d"
+    path.write_bytes(c3d_bytes(content, channels(2)))
+    with pytest.raises(FileFormatError, match="the channels of nothing"):
+        read(path)
+
+
 def test_a_plate_whose_sensors_are_nowhere_has_a_force_and_no_centre(tmp_path: Path) -> None:
     found = read(written(tmp_path / "gait.c3d", 3, ORIGIN=np.zeros((1, 3))))
     np.testing.assert_allclose(found.grf_n, LOAD_N, atol=1e-4)
