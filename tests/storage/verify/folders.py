@@ -78,10 +78,7 @@ def keep(data: Path, kept: Session, *, place: str = "sessions") -> Path:
 def sealed(data: Path, session_id: str = ID, **changes: Any) -> Path:
     """A sealed session of two parts, of which frames 20 to 24 of the first are lost."""
     begun = session(session_id, **changes)
-    journals = {
-        BOOTS[0]: journal(data, 0, (0, 19), (25, 60)),
-        BOOTS[1]: journal(data, 1, (0, 19)),
-    }
+    journals = {BOOTS[0]: journal(data, 0, (0, 19), (25, 60)), BOOTS[1]: journal(data, 1, (0, 19))}
     lost = {BOOTS[0]: Losses({"disk_full": [(20, 24)]})}
     states = {
         stream_id: StreamState(stored=held.stored, lost=lost.get(stream_id, Losses()))
