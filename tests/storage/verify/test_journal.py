@@ -27,11 +27,11 @@ from storage.wire import EncodedBatch, encode_frames
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.frames import make_frames
 
-BOOT = "a" * 32
+STREAM_ID = "a" * 32
 
 
 def array(**changes: Any) -> ArrayInfo:
-    return make_array(1, **{"stream_id": BOOT} | changes)
+    return make_array(1, **{"stream_id": STREAM_ID} | changes)
 
 
 def frames(first: int, last: int, *, at_ns: int = 0) -> FrameBatch:
@@ -41,7 +41,7 @@ def frames(first: int, last: int, *, at_ns: int = 0) -> FrameBatch:
 
 def stream(root: Path, *, next_seq: int | None = None) -> Path:
     """The journal of a stream of 40 frames in batches of 5, closed in order."""
-    folder = root / "journal" / "bench" / BOOT
+    folder = root / "journal" / "bench" / STREAM_ID
     journal = Journal(folder, array())
     for first in range(0, 40, 5):
         journal.append_new_frames(frames(first, first + 4))
@@ -87,7 +87,7 @@ def test_a_whole_journal_is_counted_and_nothing_is_touched(tmp_path: Path) -> No
 
 
 def test_a_journal_that_is_being_written_is_whole(tmp_path: Path) -> None:
-    folder = tmp_path / "journal" / "bench" / BOOT
+    folder = tmp_path / "journal" / "bench" / STREAM_ID
     journal = Journal(folder, array())
     StreamNotes(array_info=array()).save(folder)
     assert problems(folder) == ""
@@ -162,7 +162,7 @@ def test_a_flipped_bit_in_a_closed_segment_or_its_index_is_found(
     base = tmp_path_factory.getbasetemp() / "flipped_journal"
     if not base.exists():
         stream(base, next_seq=40)
-    folder = base / "journal" / "bench" / BOOT
+    folder = base / "journal" / "bench" / STREAM_ID
     path = data.draw(st.sampled_from([segment_of(folder), index_of(folder)]))
     whole = path.read_bytes()
     content = bytearray(whole)
@@ -274,7 +274,7 @@ def with_clock(folder: Path) -> Path:
     log = ClockLog(folder)
     for second in range(4):
         times = {"t_mono_ns": second * 10**9, "server_minus_node_ns": second}
-        log.append(ClockOffset(stream_id=BOOT, uncertainty_ns=500, **times))
+        log.append(ClockOffset(stream_id=STREAM_ID, uncertainty_ns=500, **times))
     return log.path
 
 

@@ -25,7 +25,7 @@ from storage.verify.sealed_file import find_ledger_contradictions, verify_sealed
 from tests.builders.arrays import UTC_NS, make_array
 from tests.builders.frames import make_frames
 
-BOOTS = ("a" * 32, "b" * 32)
+STREAM_IDS = ("a" * 32, "b" * 32)
 
 
 def frames(*numbers: int, offset_ns: int = UTC_NS) -> FrameBatch:
@@ -46,7 +46,7 @@ def frames(*numbers: int, offset_ns: int = UTC_NS) -> FrameBatch:
 def counted(first: int, last: int, boot: int = 0, **lost: int) -> PartLedger:
     length = last - first + 1
     return PartLedger(
-        stream_id=BOOTS[boot],
+        stream_id=STREAM_IDS[boot],
         seq_first=first,
         seq_last=last,
         recorded=length - sum(lost.values()),
@@ -65,7 +65,7 @@ def notes_of(*parts: PartLedger) -> dict[str, Any]:
 
 
 def write(path: Path, notes: dict[str, Any], *parts: FrameBatch) -> Path:
-    with SealedFileWriter(path, make_array(1, stream_id=BOOTS[0]), notes) as writer:
+    with SealedFileWriter(path, make_array(1, stream_id=STREAM_IDS[0]), notes) as writer:
         for number, batch in enumerate(parts):
             if len(batch):
                 writer.append_frames(batch, {"part": np.full(len(batch), number, np.uint16)})
@@ -76,7 +76,7 @@ def walk(path: Path) -> Path:
     """Two parts, 60 frames of 100 and three frames lost."""
     present = [n for n in range(10, 70) if n not in (20, 21, 40)]
     parts = (counted(10, 69, disk_full=3), counted(0, 39, boot=1))
-    lost = {"lost": {BOOTS[0]: {"disk_full": [[20, 21], [40, 40]]}}}
+    lost = {"lost": {STREAM_IDS[0]: {"disk_full": [[20, 21], [40, 40]]}}}
     batches = (frames(*present), frames(*range(40), offset_ns=5))
     return write(path, notes_of(*parts) | lost, *batches)
 
@@ -242,7 +242,7 @@ def test_numbers_named_lost_are_those_that_are_missing(tmp_path: Path) -> None:
     path = walk(tmp_path / "s.parquet")
     with SealedFileReader(path) as reader:
         notes = json.loads(json.dumps(reader.notes))
-    notes["lost"] = {BOOTS[0]: {"disk_full": [[20, 20], [40, 41]]}}
+    notes["lost"] = {STREAM_IDS[0]: {"disk_full": [[20, 20], [40, 41]]}}
     rewritten(path, pq.read_table(path), notes)
     assert "frames 21 are missing and not named lost" in problems(path)
 

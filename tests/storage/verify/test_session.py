@@ -20,10 +20,10 @@ from storage.verify.data_folder import find_verdict, verify_path
 from storage.verify.sealed_file import verify_sealed_file
 from storage.verify.session import SessionReport, verify_session
 from tests.storage.verify.folders import (
-    BOOTS,
     EVENTS,
     ID,
     OTHER_ID,
+    STREAM_IDS,
     array,
     edited,
     in_ledger,
@@ -51,7 +51,7 @@ def test_a_whole_session_is_proven_and_nothing_is_touched(tmp_path: Path) -> Non
     }
     assert (content["complete"], content["lossy"], content["id"]) == (False, True, ID)
     assert content["parts"][0] == {
-        "stream_id": BOOTS[0],
+        "stream_id": STREAM_IDS[0],
         "seq_first": 10,
         "seq_last": 49,
         "recorded": 35,
@@ -63,7 +63,7 @@ def test_a_whole_session_is_proven_and_nothing_is_touched(tmp_path: Path) -> Non
 
 
 def test_a_session_without_a_frame_is_whole(tmp_path: Path) -> None:
-    begun = session(parts=(Part(stream_id=BOOTS[0], seq_first=0, seq_last=-1),))
+    begun = session(parts=(Part(stream_id=STREAM_IDS[0], seq_first=0, seq_last=-1),))
     ledger = compute_ledger(begun.parts, {}, is_finished=True)
     folder = keep(tmp_path, begun)
     inputs = SessionInputs(begun, array(), {}, None, "none", (), {})
@@ -130,7 +130,7 @@ def test_a_session_that_waits_is_counted_from_the_journals(tmp_path: Path) -> No
 
 def test_a_session_that_is_recorded_reaches_to_the_newest_frame(tmp_path: Path) -> None:
     journal(tmp_path, 0, (0, 29))
-    parts = (Part(stream_id=BOOTS[0], seq_first=5),)
+    parts = (Part(stream_id=STREAM_IDS[0], seq_first=5),)
     folder = keep(tmp_path, session(state="recording", parts=parts, stopped_t_ns=None))
     report = verify_session(folder)
     assert report.ledger is not None
@@ -145,11 +145,11 @@ def test_a_session_that_is_recorded_reaches_to_the_newest_frame(tmp_path: Path) 
 
 def test_damage_in_a_journal_that_it_needs_is_its_own(tmp_path: Path) -> None:
     journal(tmp_path, 0, (0, 60))
-    (path,) = (tmp_path / "journal" / "bench" / BOOTS[0]).glob("*.arrows")
+    (path,) = (tmp_path / "journal" / "bench" / STREAM_IDS[0]).glob("*.arrows")
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
-    parts = (Part(stream_id=BOOTS[0], seq_first=0, seq_last=60),)
+    parts = (Part(stream_id=STREAM_IDS[0], seq_first=0, seq_last=60),)
     report = verify_session(keep(tmp_path, session(state="pending", parts=parts)))
     assert "do not agree with their checksum" in "; ".join(report.problems)
     assert report.ledger is not None
@@ -196,7 +196,7 @@ def test_a_data_folder_is_all_of_its_sessions_and_journals(tmp_path: Path) -> No
 
 def test_whatever_is_named_is_found(tmp_path: Path) -> None:
     folder = sealed(tmp_path)
-    stream = tmp_path / "journal" / "bench" / BOOTS[0]
+    stream = tmp_path / "journal" / "bench" / STREAM_IDS[0]
     for path in (folder, folder / "session.json", stream, stream / "stream.json", tmp_path):
         assert verify_path(path).to_json_dict()["problems"] == []
     for path in stream.glob("0*"):
@@ -205,6 +205,9 @@ def test_whatever_is_named_is_found(tmp_path: Path) -> None:
     for path in (tmp_path / "none", tmp_path / "empty"):
         with pytest.raises(FileFormatError):
             verify_path(path)
+
+
+# --- damage ---------------------------------------------------------------------------------------
 
 
 FILES = ("session.json", "frames.parquet", "markers.parquet", "clock.parquet")
