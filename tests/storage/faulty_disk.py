@@ -15,7 +15,7 @@ NO_SPACE = (OSError, errno.ENOSPC, "No space left on device")
 IO_ERROR = (OSError, errno.EIO, "Input/output error")
 
 
-def refusing(kind: type[Exception], *facts: object, **more: object) -> Callable[..., NoReturn]:
+def refusing(kind: type[BaseException], *facts: object, **more: object) -> Callable[..., NoReturn]:
     """A function that does nothing but fail with this error, each time with a new one."""
 
     def refuse(*_: object, **__: object) -> NoReturn:

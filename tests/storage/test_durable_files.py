@@ -9,6 +9,7 @@ import stat
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -36,7 +37,7 @@ def files_in(folder: Path) -> dict[str, bytes]:
 
 @settings(max_examples=20, deadline=None)
 @given(st.lists(st.binary(max_size=5000), min_size=1, max_size=4))
-def test_a_file_holds_what_was_written_last_and_nothing_lies_beside_it(
+def test_a_file_is_replaced_and_nothing_lies_beside_it(
     tmp_path_factory: pytest.TempPathFactory, contents: list[bytes]
 ) -> None:
     folder = tmp_path_factory.mktemp("whole")
@@ -45,9 +46,7 @@ def test_a_file_holds_what_was_written_last_and_nothing_lies_beside_it(
         assert files_in(folder) == {"file.json": content}
 
 
-def test_what_is_secret_is_never_readable_by_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_secret_is_closed_to_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     modes, fsync = set[int](), os.fsync
 
     def watched(descriptor: int) -> None:
@@ -60,7 +59,7 @@ def test_what_is_secret_is_never_readable_by_others(
     assert (tmp_path / "token").stat().st_mode & 0o777 == 0o600
 
 
-def test_the_content_is_on_the_disk_before_the_name_and_the_name_before_it_returns(
+def test_content_is_synced_before_its_name_and_its_name_at_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, events, fsync = tmp_path / "file", [], os.fsync
@@ -94,45 +93,31 @@ def test_a_full_disk_leaves_the_old_file_and_nothing_else(
     assert files_in(tmp_path) == ({} if before is None else {"file": before})
 
 
-def test_a_disk_that_does_not_sync_leaves_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_atomically(tmp_path / "file", b"old")
-    monkeypatch.setattr(os, "fsync", refusing(*IO_ERROR))
-    with pytest.raises(StorageError, match="Input/output error"):
-        write_atomically(tmp_path / "file", b"new")
-    assert files_in(tmp_path) == {"file": b"old"}
-
-
-def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupt(descriptor: int) -> None:
-        raise KeyboardInterrupt
-
-    write_atomically(tmp_path / "file", b"old")
-    monkeypatch.setattr(os, "fsync", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        write_atomically(tmp_path / "file", b"new")
-    assert files_in(tmp_path) == {"file": b"old"}
-
-
-def test_a_folder_that_is_not_there_or_is_no_folder_is_an_error_that_names_the_file(
+@pytest.mark.parametrize(
+    ("error", "raised"), [(IO_ERROR, StorageError), ((KeyboardInterrupt,), KeyboardInterrupt)]
+)
+def test_a_failed_or_interrupted_sync_leaves_the_old_file(
     tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    error: tuple[Any, ...],
+    raised: type[BaseException],
 ) -> None:
+    write_atomically(tmp_path / "file", b"old")
+    monkeypatch.setattr(os, "fsync", refusing(*error))
+    with pytest.raises(raised):
+        write_atomically(tmp_path / "file", b"new")
+    assert files_in(tmp_path) == {"file": b"old"}
+
+
+def test_a_file_that_cannot_be_made_is_an_error_that_names_it(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
-    for path in (tmp_path / "missing" / "x", tmp_path / "file" / "x", tmp_path / ("n" * 300)):
+    (tmp_path / "taken").mkdir()
+    names = ("missing/x", "file/x", "taken", "n" * 300)
+    for path in (tmp_path / name for name in names):
         with pytest.raises(StorageError) as caught:
             write_atomically(path, b"content")
         assert caught.value.where == str(path)
-    assert files_in(tmp_path) == {"file": b""}
-
-
-def test_a_folder_in_place_of_the_file_is_an_error_and_stays(tmp_path: Path) -> None:
-    (tmp_path / "taken").mkdir()
-    with pytest.raises(StorageError):
-        write_atomically(tmp_path / "taken", b"content")
-    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "taken"}
 
 
 def test_only_a_folder_can_be_synced_as_one(tmp_path: Path) -> None:
@@ -161,11 +146,8 @@ def folders_answer(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
 @pytest.mark.parametrize(
     "number", [errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF]
 )
-def test_a_file_system_that_cannot_sync_folders_is_used_and_warned_of_once(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-    number: int,
+def test_a_file_system_that_cannot_sync_folders_is_warned_of_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, number: int
 ) -> None:
     folders_answer(monkeypatch, number)
     with lock_folder(tmp_path):
@@ -220,9 +202,7 @@ def test_a_file_system_without_permissions_is_used(
         os.umask(umask)
 
 
-def test_a_folder_that_cannot_be_closed_to_others_is_an_error_that_names_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_chmod_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "chmod", refusing(*IO_ERROR))
     umask = os.umask(0o022)
     try:
@@ -234,16 +214,13 @@ def test_a_folder_that_cannot_be_closed_to_others_is_an_error_that_names_it(
     assert caught.value.where == str(tmp_path / "data")
 
 
-def test_an_error_of_the_system_becomes_one_that_names_the_path() -> None:
+def test_a_system_error_names_the_path_and_a_remedy() -> None:
     with pytest.raises(StorageError, match="No space left") as caught:  # noqa: SIM117  # it is the inner one's error
         with translate_storage_errors(Path("/data/x")):
             raise OSError(28, "No space left on device")
     assert caught.value.where == "/data/x"
     assert "Free space" in caught.value.remedy
     assert isinstance(caught.value.__cause__, OSError)
-
-
-def test_a_remedy_may_be_given() -> None:
     with (
         pytest.raises(StorageError, match="Plug it in"),
         translate_storage_errors(Path("x"), "Plug it in"),
@@ -260,9 +237,7 @@ def test_errors_that_say_enough_pass_as_they_are(error: Exception) -> None:
     assert caught.value is error
 
 
-def test_the_names_of_new_folders_are_on_the_disk_all_the_way_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_parents_of_new_folders_are_synced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     synced: list[str] = []
     monkeypatch.setattr(durable_files, "sync_folder", lambda folder: synced.append(folder.name))
     make_synced_folder(tmp_path / "sessions" / "one" / "two")
@@ -293,7 +268,7 @@ def first_line(process: subprocess.Popen[str]) -> Path:
 
 
 @pytest.mark.process
-def test_what_a_dead_process_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
+def test_files_of_a_dead_process_are_removed_and_no_others(tmp_path: Path) -> None:
     with temporary_of_another(tmp_path / "frames.parquet") as process:
         stale = first_line(process)
     mine = make_temporary_path(tmp_path / "session.json")
@@ -320,7 +295,7 @@ def test_what_a_living_process_is_writing_stays(tmp_path: Path) -> None:
         assert remove_dead_process_temporaries(tmp_path) == [writing]
 
 
-def test_a_number_that_was_given_to_another_process_is_no_sign_of_life(tmp_path: Path) -> None:
+def test_a_reused_process_number_is_no_sign_of_life(tmp_path: Path) -> None:
     mine = make_temporary_path(tmp_path / "x")
     parts = mine.name.split(".")
     stale = mine.with_name(".".join([*parts[:3], str(int(parts[3]) - 1), *parts[4:]]))

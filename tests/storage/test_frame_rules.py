@@ -55,9 +55,7 @@ def test_ordinary_frames_and_the_ends_of_every_range_keep_to_the_rules() -> None
         ("t_mono_ns", -UTC_NS - 1, "1970"),
     ],
 )
-def test_a_value_that_no_frame_has_is_named_with_its_frame(
-    column: str, wrong: Any, said: str
-) -> None:
+def test_an_impossible_value_is_named_with_its_frame(column: str, wrong: Any, said: str) -> None:
     batch = make_frames(5)
     values = getattr(batch, column).copy()
     values[3] = wrong
@@ -77,7 +75,7 @@ def test_an_offset_that_fits_only_because_it_wraps_is_seen() -> None:
 
 @settings(deadline=None, max_examples=60)
 @given(data=st.data())
-def test_what_is_taken_in_any_order_is_what_verify_calls_whole(
+def test_messages_taken_in_any_order_are_whole_for_verify(
     data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     """Messages in any order with any instants: those that a server takes, `verify` finds whole."""

@@ -44,13 +44,13 @@ def test_it_holds_what_was_added_in_whatever_order(added: list[tuple[int, int]])
 def test_within_missing_and_without_are_those_of_sets(
     added: list[tuple[int, int]], first: int, last: int
 ) -> None:
-    held, asked = Intervals(added), set(range(first, last + 1))
-    within, missing = held.restricted_to(first, last), held.missing_in(first, last)
+    stored, asked = Intervals(added), set(range(first, last + 1))
+    within, missing = stored.restricted_to(first, last), stored.missing_in(first, last)
     assert members(within) == members(added) & asked
     assert members(missing) == asked - members(added)
     assert_tidy(within)
     assert_tidy(missing)
-    assert members(held) == members(added)  # asking changes nothing
+    assert members(stored) == members(added)  # asking changes nothing
 
 
 @given(pairs, pairs)
@@ -81,16 +81,16 @@ def test_a_stream_that_came_in_any_order_is_one_interval(order: list[int]) -> No
 
 
 def test_numbers_may_be_as_large_as_a_stream_can_count() -> None:
-    held = Intervals([(0, 0), (2**62, 2**64)])
-    assert list(held.missing_in(0, 2**64)) == [(1, 2**62 - 1)]
-    assert held.number_count == 2**64 - 2**62 + 2
+    stored = Intervals([(0, 0), (2**62, 2**64)])
+    assert list(stored.missing_in(0, 2**64)) == [(1, 2**62 - 1)]
+    assert stored.number_count == 2**64 - 2**62 + 2
 
 
 def test_an_empty_interval_is_refused_and_changes_nothing() -> None:
-    held = Intervals([(3, 5)])
+    stored = Intervals([(3, 5)])
     with pytest.raises(ValueError, match="5 to 4 is empty"):
-        held.add(5, 4)
-    assert list(held) == [(3, 5)]
+        stored.add(5, 4)
+    assert list(stored) == [(3, 5)]
 
 
 def test_it_is_no_key_of_a_dictionary_and_no_tuple_is_equal_to_it() -> None:

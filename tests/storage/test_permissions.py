@@ -1,4 +1,4 @@
-"""What a process writes is its user's, whatever the umask was."""
+"""Files and folders are their user's, whatever the umask was; secrets are nobody else's."""
 
 from __future__ import annotations
 
@@ -6,11 +6,20 @@ import os
 import stat
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from devices.errors import DamagedFileError
 from storage.durable_files import make_synced_folder, write_atomically
-from storage.permissions import set_umask_and_restrict_folder
+from storage.permissions import (
+    SECRETS_NAME,
+    read_secrets_or_empty,
+    set_umask_and_restrict_folder,
+    write_secrets,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -48,9 +57,7 @@ def test_a_folder_that_is_made_is_its_users(tmp_path: Path) -> None:
     ],
     ids=str,
 )
-def test_a_folder_of_ours_that_all_could_read_is_closed(
-    tmp_path: Path, found: tuple[str, ...]
-) -> None:
+def test_an_open_folder_of_ours_is_closed(tmp_path: Path, found: tuple[str, ...]) -> None:
     for name in found:
         (tmp_path / name).touch()
     tmp_path.chmod(0o755)
@@ -59,7 +66,7 @@ def test_a_folder_of_ours_that_all_could_read_is_closed(
 
 
 @pytest.mark.parametrize("name", ["journal", "nodes", "sessions", "Documents"])
-def test_somebodys_home_stays_as_it_is_but_what_we_write_there_is_closed(
+def test_a_users_folder_stays_open_and_our_files_in_it_are_closed(
     tmp_path: Path, name: str
 ) -> None:
     (tmp_path / "thesis.tex").touch()
@@ -80,3 +87,30 @@ def test_a_group_that_the_owner_let_in_may_read(tmp_path: Path, mode: int) -> No
     assert mode_of(tmp_path) == mode
     folder, file = written(tmp_path)
     assert (folder & 0o777, file) == (0o750, 0o640)
+
+
+# --- secrets --------------------------------------------------------------------------------------
+
+
+@settings(max_examples=20)
+@given(st.dictionaries(st.text(), st.binary(min_size=32, max_size=32).map(bytes.hex), max_size=4))
+def test_secrets_are_read_back_and_only_by_their_owner(secrets: dict[str, str]) -> None:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "new" / SECRETS_NAME
+        assert read_secrets_or_empty(path) == {}
+        os.umask(0o027)  # a group may read the rest
+        write_secrets(path, secrets)
+        assert read_secrets_or_empty(path) == secrets
+        assert mode_of(path) == 0o600
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"\0" * 80, b"[]", b'{"secrets":[]}', b'{"secrets":{"leg":5}}', b'{"secrets":{"a":"5"}}'],
+)
+def test_another_file_is_no_file_of_secrets(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / SECRETS_NAME
+    path.write_bytes(content)
+    with pytest.raises(DamagedFileError) as refused:
+        read_secrets_or_empty(path)
+    assert SECRETS_NAME in str(refused.value)

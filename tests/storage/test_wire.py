@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -60,17 +59,7 @@ def test_frames_survive_the_wire_bit_by_bit(rows: int, tiles: int, seed: int, fi
     assert_same_bits(decode_message(memoryview(bytearray(payload)), schema), batch)
 
 
-@given(start=st.integers(0, 19), stop=st.integers(1, 20))
-def test_some_rows_of_a_message_are_a_message_again(start: int, stop: int) -> None:
-    schema, stop = schema_of(2), max(stop, start + 1)
-    received = decode_message(encode_frames(frames(20), schema), schema)
-    part = received.slice_rows(start, stop)
-    assert_same_bits(
-        decode_message(encode_frames(part, schema), schema), frames(20).slice_rows(start, stop)
-    )
-
-
-def test_the_same_frames_are_the_same_bytes_and_know_nothing_of_their_neighbours() -> None:
+def test_the_same_frames_are_the_same_bytes() -> None:
     schema, batch = schema_of(2), frames(20)
     alone = replace(batch.slice_rows(5, 9), seq=np.arange(5, 9, dtype=np.uint64))
     assert encode_frames(batch.slice_rows(5, 9), schema) == encode_frames(alone, schema)
@@ -110,7 +99,7 @@ def test_no_damage_does_more_than_be_refused() -> None:
     rng, schema = np.random.default_rng(1), schema_of(2)
     payload = encode_frames(frames(5), schema)
     refusals = 0
-    for _ in range(4000):
+    for _ in range(1500):
         damaged = bytearray(payload)
         for _ in range(int(rng.integers(1, 4))):
             begin = 0 if rng.random() < 0.1 else 8
@@ -134,14 +123,7 @@ def test_no_damage_does_more_than_be_refused() -> None:
             assert batch.pressure_raw.shape == batch.tile_flags.shape == (len(batch), 2)
             assert (np.diff(batch.seq) == 1).all()
             assert int(batch.pressure_raw.sum()) >= 0
-    assert refusals > 1000
-
-
-@settings(max_examples=200)
-@given(st.binary(max_size=400))
-def test_bytes_of_anything_else_are_refused(content: bytes) -> None:
-    with pytest.raises(FileFormatError):
-        decode_message(content, schema_of(2))
+    assert refusals > 400
 
 
 def test_a_message_that_is_no_batch_of_records_is_refused() -> None:
@@ -158,28 +140,24 @@ def test_frames_of_another_number_of_tiles_are_refused(sent: int, known: int) ->
         decode_message(payload, schema_of(known))
 
 
-def test_a_message_without_frames_is_refused() -> None:
-    refused(frames(0), "a message of 0 frames")
-
-
-def test_a_message_of_too_many_frames_is_refused() -> None:
-    refused(
-        frames(MAX_MESSAGE_FRAMES + 1, 1),
-        f"a message of {MAX_MESSAGE_FRAMES + 1} frames.*{MAX_MESSAGE_FRAMES}",
-    )
+@pytest.mark.parametrize("rows", [0, MAX_MESSAGE_FRAMES + 1])
+def test_a_message_of_no_or_too_many_frames_is_refused(rows: int) -> None:
+    refused(frames(rows, 1), f"a message of {rows} frames.*{MAX_MESSAGE_FRAMES}")
 
 
 @pytest.mark.parametrize(
-    "seq", [(0, 1, 3), (0, 0, 1), (2, 1, 0), (5, 6, 6), (0, 1, 0), (2**64 - 2, 2**64 - 1, 0)]
+    ("seq", "match"),
+    [
+        *(((n, n + 1, n + 2), r"less than 2\^53") for n in (2**53, 2**53 - 2, 2**63 - 2)),
+        *(
+            (seq, "do not follow one another")
+            for seq in ((0, 1, 3), (0, 0, 1), (2, 1, 0), (5, 6, 6))
+        ),
+        ((2**64 - 2, 2**64 - 1, 0), "do not follow one another|less than 2"),
+    ],
 )
-def test_numbers_that_do_not_rise_by_one_are_refused(seq: Sequence[int]) -> None:
-    batch = replace(frames(3), seq=np.array(seq, dtype=np.uint64))
-    refused(batch, "do not follow one another|less than 2")
-
-
-@pytest.mark.parametrize("first", [2**53, 2**53 - 1, 2**62, 2**63 - 1, 2**64 - 2])
-def test_a_number_that_no_stream_reaches_is_refused(first: int) -> None:
-    refused(frames(2, first=first), r"less than 2\^53")
+def test_numbers_that_no_stream_has_are_refused(seq: tuple[int, ...], match: str) -> None:
+    refused(replace(frames(3), seq=np.array(seq, dtype=np.uint64)), match)
 
 
 # --- refused before memory is taken ---------------------------------------------------------------
@@ -247,12 +225,7 @@ def test_a_message_in_the_form_of_arrow_before_015_is_refused() -> None:
 def test_a_dictionary_is_refused() -> None:
     words = pa.array(["a", "b"]).dictionary_encode()
     record = pa.RecordBatch.from_arrays([words], names=["seq"])
-    sink = pa.BufferOutputStream()
-    with pa.ipc.new_stream(sink, record.schema) as writer:
-        writer.write_batch(record)
-    stream = sink.getvalue()
-    begin = len(record.schema.serialize())
-    payload = stream.slice(begin, stream.size - begin - 8).to_pybytes()
+    payload = _written(record, pa.ipc.IpcWriteOptions())
     with pytest.raises(FileFormatError, match="no Arrow message of frames"):
         decode_message(payload, schema_of(2))
 

@@ -115,7 +115,7 @@ def _read_plate(file: C3dFile, i: int, values_max: int) -> PlateSignals:
     if kind not in _CHANNEL_COUNTS:
         raise FileFormatError(f"it is of type {kind}", where=file.where, expected=FORM)
     table = file.get_numbers_or_empty("FORCE_PLATFORM", "CHANNEL")
-    table = table.reshape(len(table), -1)
+    table = table.reshape(len(table), table.size // max(len(table), 1))
     numbers = (table[: _CHANNEL_COUNTS[kind], i : i + 1].astype(int) % 65536).ravel().tolist()
     if len(numbers) < _CHANNEL_COUNTS[kind] or not all(
         0 < n <= file.channel_count for n in numbers

@@ -1,8 +1,7 @@
-"""The bound holds the truth however lopsided the network is, and is no wider than it must be."""
+"""Bounds of a clock's offset: they hold the truth, are hardly wider, and part at steps."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from random import Random
 
@@ -19,7 +18,6 @@ from storage.clock.bounds import (
     RATE_TOLERANCE,
     ClockOffsets,
     OffsetRows,
-    OffsetStretch,
 )
 from storage.clock.table import UNCERTAINTY_END_NS
 from tests.storage.clock.clocks import (
@@ -37,24 +35,13 @@ from tests.storage.clock.clocks import (
 # --- the truth is within --------------------------------------------------------------------------
 
 
-@given(drawn=RATES, seed=st.integers(0, 2**32), slow_ms=st.sampled_from([0.0, 0.1, 3.0, 200.0]))
-def test_the_truth_is_within_the_bound_at_every_instant(
-    drawn: tuple[float, float, int, int], seed: int, slow_ms: float
-) -> None:
-    clock = wandering(drawn)
-    rows = clock.measured(every(10, drawn[2]), seed, slow_ns=slow_ms * 1e6)
-    t_mono_ns = anywhere(rows, seed)
-    offset, bound = ClockOffsets(rows).offset_and_bound_at(t_mono_ns)
-    assert (np.abs(offset - clock.at(t_mono_ns)) <= bound).all()
-
-
 @given(
     drift_ppm=st.floats(-99, 99),
     seed=st.integers(0, 2**32),
     n=st.integers(1, 30),
     hours=st.floats(0, 10),
 )
-def test_before_and_after_the_measurements_the_bound_grows_and_holds(
+def test_the_bound_grows_outside_of_the_measurements_and_holds(
     drift_ppm: float, seed: int, n: int, hours: float
 ) -> None:
     clock = Clock((drift_ppm,))
@@ -72,19 +59,23 @@ def test_before_and_after_the_measurements_the_bound_grows_and_holds(
 @given(
     drawn=RATES,
     seed=st.integers(0, 2**32),
+    slow_ms=st.sampled_from([0.0, 0.1, 3.0, 200.0]),
     steps=st.dictionaries(
         st.integers(-1, 13),  # half a minute apart: two in one gap could cancel
         st.tuples(st.integers(0, 10 * SECOND), st.sampled_from([-HOUR, HOUR, SECOND])),
         max_size=3,
     ),
 )
-def test_the_truth_is_within_the_bound_beside_steps_and_across_them(
-    drawn: tuple[float, float, int, int], seed: int, steps: dict[int, tuple[int, int]]
+def test_the_truth_is_within_the_bound_also_across_steps(
+    drawn: tuple[float, float, int, int],
+    seed: int,
+    slow_ms: float,
+    steps: dict[int, tuple[int, int]],
 ) -> None:
     plain = wandering(drawn)
     at = tuple((slot * 30 * SECOND + late_ns, by) for slot, (late_ns, by) in steps.items())
     clock = Clock(plain.rates_ppm, plain.offset_ns, at)
-    rows = clock.measured(every(10, drawn[2]), seed)
+    rows = clock.measured(every(10, drawn[2]), seed, slow_ns=slow_ms * 1e6)
     for after_ns, _ in at:  # a probe during which the clock is set says nothing
         assume((np.abs(rows.t_mono_ns - BEGIN_NS - after_ns) > rows.uncertainty_ns).all())
     t_mono_ns = anywhere(rows, seed)
@@ -99,7 +90,7 @@ def test_the_truth_is_within_the_bound_beside_steps_and_across_them(
     begin_s=st.floats(-100, 400),
     lasts_s=st.sampled_from([0.0, 1e-6, 1.0, 60.0, 300.0]),
 )
-def test_no_offset_between_two_instants_is_out_of_reach(
+def test_offsets_within_a_time_range_are_bounded(
     drawn: tuple[float, float, int, int],
     seed: int,
     jumps_ns: list[int],
@@ -116,15 +107,6 @@ def test_no_offset_between_two_instants_is_out_of_reach(
     offset, _ = clock.offset_and_bound_at(t_mono_ns)
     assert not sure[0] or (least[0] <= offset.min() and offset.max() <= greatest[0])
     assert sure[0] or len(clock.stretches) > 1
-
-
-def test_a_lopsided_network_does_not_become_a_small_bound_around_a_wrong_offset() -> None:
-    # Every way there takes 0.3 ms, every way back 9.3 ms: a mean would be 4.5 ms off, and sure.
-    t_mono_ns = every(10, 3600)
-    rows = OffsetRows(t_mono_ns, np.full(3600, -4_500_000), np.full(3600, 4_800_000))
-    offset, bound = ClockOffsets(rows).offset_and_bound_at(t_mono_ns)
-    assert (np.abs(offset) <= bound).all()
-    assert (bound >= 4_500_000).all()
 
 
 # --- and it is no wider than it must be -----------------------------------------------------------
@@ -165,7 +147,7 @@ def best_possible(rows: OffsetRows, t_mono_ns: int) -> float:
 
 @settings(max_examples=60)
 @given(drawn=RATES, seed=st.integers(0, 2**32), where=st.floats(0, 1))
-def test_the_bound_is_hardly_wider_than_the_best_there_can_be(
+def test_the_bound_is_hardly_wider_than_the_best_possible(
     drawn: tuple[float, float, int, int], seed: int, where: float
 ) -> None:
     rows = wandering(drawn).measured(every(10, min(drawn[2], 12)), seed)
@@ -177,30 +159,27 @@ def test_the_bound_is_hardly_wider_than_the_best_there_can_be(
     assert bound[0] < 3 * best + 200  # 1.1 in the median
 
 
-def test_many_measurements_are_better_than_the_median_of_them() -> None:
+def test_many_measurements_narrow_the_bound() -> None:
     clock = Clock((40.0,))
     rows = clock.measured(every(10, 360), 3)
     _, bound = ClockOffsets(rows).offset_and_bound_at(rows.t_mono_ns)
     assert np.median(bound) < 0.75 * np.median(rows.uncertainty_ns)
 
 
-def test_in_ten_minutes_without_link_a_known_drift_is_worth_more_than_a_crystal() -> None:
-    clock = Clock((40.0,))
-    rows = clock.measured(np.concatenate((every(10, 60), every(10, 60) + 1200 * SECOND)), 3)
-    middle = BEGIN_NS + 900 * SECOND
-    offset, bound = ClockOffsets(rows).offset_and_bound_at(np.array([middle]))
-    assert abs(offset[0] - clock.at(np.array([middle]))[0]) <= bound[0]
+def test_a_measured_drift_bounds_ten_minutes_without_a_link() -> None:
+    clock, first = Clock((40.0,)), every(10, 60)
+    between = ClockOffsets(clock.measured(np.concatenate((first, first + 1200 * SECOND)), 3))
+    middle = np.array([BEGIN_NS + 900 * SECOND])
+    offset, bound = between.offset_and_bound_at(middle)
+    assert abs(offset[0] - clock.at(middle)[0]) <= bound[0]
     assert bound[0] < 8_000_000 < 300 * SECOND * CRYSTAL_RATE_LIMIT
-
-
-def test_ten_minutes_after_the_link_is_gone_the_drift_is_still_worth_most_of_the_bound() -> None:
-    clock = ClockOffsets(Clock((40.0,)).measured(every(10, 60), 3))
-    end = clock.rows.t_mono_ns[-1]
-    _, bound = clock.offset_and_bound_at(end + np.array([0, 600 * SECOND]))
+    after = ClockOffsets(clock.measured(first, 3))
+    end = after.rows.t_mono_ns[-1]
+    _, bound = after.offset_and_bound_at(end + np.array([0, 600 * SECOND]))
     assert bound[1] - bound[0] < 16_000_000 < 600 * SECOND * CRYSTAL_RATE_LIMIT / 3
 
 
-def test_the_assumptions_are_those_that_users_are_told() -> None:
+def test_the_documents_state_the_assumed_rates() -> None:
     page = (Path(__file__).resolve().parents[3] / "docs" / "formats.md").read_text("utf-8")
     told = page.split("## Clocks")[1]
     for rate, where in (
@@ -214,22 +193,30 @@ def test_the_assumptions_are_those_that_users_are_told() -> None:
 # --- edges ----------------------------------------------------------------------------------------
 
 
-def test_two_rows_at_the_same_instant_are_intersected() -> None:
+def test_rows_of_one_instant_are_intersected_or_a_step_there() -> None:
     mapped = ClockOffsets(rows_of((BEGIN_NS, 0, 1000), (BEGIN_NS, 1500, 1000)))
     offset, bound = mapped.offset_and_bound_at(np.array([BEGIN_NS]))
     assert offset[0] == 750
     assert 250 <= bound[0] <= 255
-
-
-def test_two_rows_at_the_same_instant_that_contradict_each_other_are_a_step_there() -> None:
     mapped = ClockOffsets(rows_of((BEGIN_NS, 0, 10), (BEGIN_NS, HOUR, 10)))
     assert len(mapped.stretches) == 2
     offset, _ = mapped.offset_and_bound_at(BEGIN_NS + np.array([-1, 1]))
     assert np.abs(offset - [0, HOUR]).max() <= 1
 
 
+def test_any_split_into_batches_gives_the_same_bits() -> None:
+    clock = Clock((20.0,), steps=((305 * SECOND, HOUR), (505 * SECOND, 1000)))
+    rows = clock.measured(every(10, 60), 1)
+    mapped = ClockOffsets(rows)
+    t_mono_ns = np.sort(anywhere(rows, 1, beyond_ns=100 * SECOND))
+    batches = np.split(t_mono_ns, [0, 0, *range(1, 100), 200])
+    pieces = [mapped.offset_and_bound_at(batch) for batch in batches]
+    for i, whole in enumerate(mapped.offset_and_bound_at(t_mono_ns)):
+        assert (np.concatenate([piece[i] for piece in pieces]) == whole).all()
+
+
 @given(st.randoms(use_true_random=False))
-def test_the_order_in_which_rows_came_does_not_matter(random: Random) -> None:
+def test_the_order_of_rows_does_not_matter(random: Random) -> None:
     rows = Clock((20.0,), steps=((95 * SECOND, HOUR),)).measured(every(10, 20), 1)
     order = np.array(random.sample(range(20), 20))
     shuffled = OffsetRows(rows.t_mono_ns[order], rows.offset_ns[order], rows.uncertainty_ns[order])
@@ -242,7 +229,7 @@ def test_the_order_in_which_rows_came_does_not_matter(random: Random) -> None:
         assert (a == b).all()
 
 
-def test_rows_without_uncertainty_are_met_to_the_nanosecond() -> None:
+def test_exact_rows_are_met_to_the_nanosecond() -> None:
     t_mono_ns = every(10, 100)
     rows = OffsetRows(t_mono_ns, np.full(100, 12345), np.zeros(100, dtype=np.int64))
     offset, bound = ClockOffsets(rows).offset_and_bound_at(t_mono_ns)
@@ -252,7 +239,7 @@ def test_rows_without_uncertainty_are_met_to_the_nanosecond() -> None:
 
 
 @pytest.mark.parametrize("end", [OFFSET_NS_END - 1, -OFFSET_NS_END + 1])
-def test_the_largest_numbers_there_may_be_do_not_overflow(end: int) -> None:
+def test_the_largest_numbers_do_not_overflow(end: int) -> None:
     late, wide = T_MONO_NS_END - 1, UNCERTAINTY_END_NS - 1
     mapped = ClockOffsets(rows_of((0, end, wide), (late, -end, wide), (5, 0, 0)))
     with np.errstate(all="raise"):
@@ -261,30 +248,101 @@ def test_the_largest_numbers_there_may_be_do_not_overflow(end: int) -> None:
     assert abs(int(offset[1])) <= int(bound[1])
 
 
-@pytest.mark.parametrize(
-    "batches",
-    [lambda n: [n], lambda n: [1] * n, lambda n: [7] * (n // 7) + [n % 7]],
-    ids=["all", "one by one", "by seven"],
-)
-def test_any_split_into_batches_gives_the_same_bits(batches: Callable[[int], list[int]]) -> None:
-    clock = Clock((20.0,), steps=((305 * SECOND, HOUR), (505 * SECOND, 1000)))
+# --- drift ----------------------------------------------------------------------------------------
+
+
+@given(drift_ppm=st.floats(-99, 99), n=st.integers(2, 60), seed=st.integers(0, 2**32))
+def test_the_drift_is_within_its_bounds(drift_ppm: float, n: int, seed: int) -> None:
+    (stretch,) = ClockOffsets(Clock((drift_ppm,)).measured(every(10, n), seed)).stretches
+    slowest, fastest = stretch.mean_rate_bounds
+    assert slowest - 1e-12 <= drift_ppm * 1e-6 <= fastest + 1e-12
+
+
+def test_the_drift_of_ten_hours_is_known_to_0_3_ppm() -> None:
+    (stretch,) = ClockOffsets(Clock((40.0,)).measured(every(10, 3600), 1)).stretches
+    assert stretch.narrowed_mean_rate_bounds is not None
+    slowest, fastest = stretch.narrowed_mean_rate_bounds
+    assert slowest < 40e-6 < fastest
+    assert fastest - slowest < 0.3e-6
+
+
+def test_the_bound_of_one_row_grows_by_a_crystals_rate() -> None:
+    clock = ClockOffsets(rows_of((BEGIN_NS, 5, 1000)))
+    assert clock.stretches[0].narrowed_mean_rate_bounds is None
+    offset, bound = clock.offset_and_bound_at(BEGIN_NS + np.array([-100, 0, 100]) * SECOND)
+    assert offset.tolist() == [5, 5, 5]
+    assert bound[1] in (1001, 1002)
+    assert bound[0] == bound[2] == pytest.approx(1001 + 100 * SECOND * CRYSTAL_RATE_LIMIT, abs=2)
+
+
+def test_a_rate_that_wanders_more_than_assumed_is_no_step() -> None:
+    rates = (*(30.0,) * 30, *(-30.0,) * 30)  # the node has gone from the sun into the mud
+    clock = Clock(rates)
+    rows = clock.measured(every(10, 60), 1, slow_ns=1e4)
+    mapped = ClockOffsets(rows)
+    assert len(mapped.stretches) == 1
+    assert not mapped.stretches[0].is_steady
+    t_mono_ns = anywhere(rows, 1)
+    offset, bound = mapped.offset_and_bound_at(t_mono_ns)
+    assert (np.abs(offset - clock.at(t_mono_ns)) <= bound).all()
+
+
+@pytest.mark.parametrize("drift_ppm", [-400.0, 150.0, 480.0])
+def test_a_fast_but_steady_clock_has_not_stepped(drift_ppm: float) -> None:
+    clock = Clock((drift_ppm,))
+    rows = clock.measured(every(10, 200), 1)
+    mapped = ClockOffsets(rows)
+    assert len(mapped.stretches) == 1
+    slowest, fastest = mapped.stretches[0].mean_rate_bounds
+    assert slowest < drift_ppm * 1e-6 < fastest
+    t_mono_ns = anywhere(rows, 1)
+    offset, bound = mapped.offset_and_bound_at(t_mono_ns)
+    assert (np.abs(offset - clock.at(t_mono_ns)) <= bound).all()
+
+
+# --- steps ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("jump_ns", [HOUR, -HOUR, 50_000_000, -(10**18)])
+def test_a_step_parts_two_stretches(jump_ns: int) -> None:
+    clock = Clock((20.0,), steps=((305 * SECOND, jump_ns),))
     rows = clock.measured(every(10, 60), 1)
     mapped = ClockOffsets(rows)
-    t_mono_ns = np.sort(anywhere(rows, 1, beyond_ns=100 * SECOND))
-    whole = mapped.offset_and_bound_at(t_mono_ns)
-    ends = np.cumsum(batches(len(t_mono_ns)))
-    pieces = [mapped.offset_and_bound_at(piece) for piece in np.split(t_mono_ns, ends[:-1])]
-    for i in range(2):
-        assert (np.concatenate([piece[i] for piece in pieces]) == whole[i]).all()
-
-
-def test_no_instants_give_no_offsets() -> None:
-    offset, bound = ClockOffsets(rows_of((BEGIN_NS, 5, 1000))).offset_and_bound_at(
-        np.array([], dtype=np.int64)
+    one, other = mapped.stretches
+    assert (len(one.rows), len(other.rows)) == (31, 29)
+    middle = (one.end_t_mono_ns + other.begin_t_mono_ns) // 2
+    offset, bound = mapped.offset_and_bound_at(
+        np.array([one.end_t_mono_ns, middle, other.begin_t_mono_ns])
     )
-    assert len(offset) == len(bound) == 0
+    assert bound[0] < 10_000_000
+    assert bound[2] < 10_000_000
+    assert bound[1] > abs(jump_ns) / 2  # it is not known where the step was
+    assert abs((offset[2] - offset[0]) - jump_ns) < 20_000_000
 
 
-def test_a_stretch_counts_its_rows_from_its_own_begin_to_its_own_end() -> None:
-    stretch = OffsetStretch(rows_of((BEGIN_NS, 5, 10), (BEGIN_NS + 1, 5, 10)))
-    assert (stretch.begin_t_mono_ns, stretch.end_t_mono_ns) == (BEGIN_NS, BEGIN_NS + 1)
+def test_vague_rows_leave_open_where_the_step_was() -> None:
+    ms = 1_000_000
+    rows = rows_of(
+        *((BEGIN_NS + i * 10 * SECOND, 0, ms) for i in range(5)),
+        *((BEGIN_NS + i * 10 * SECOND, 0, 900 * ms) for i in range(5, 8)),
+        *((BEGIN_NS + i * 10 * SECOND, 500 * ms, ms) for i in range(8, 12)),
+    )
+    mapped = ClockOffsets(rows)
+    one, other = mapped.stretches
+    assert (len(one.rows), len(other.rows)) == (5, 4)
+    _, bound = mapped.offset_and_bound_at(rows.t_mono_ns)
+    assert (bound[5:8] > 250 * ms).all()
+    assert (bound[5:8] < 255 * ms).all()
+
+
+def test_a_step_between_the_first_two_rows_is_no_fast_clock() -> None:
+    clock = Clock((20.0,), steps=((5 * SECOND, 4_000_000),))
+    mapped = ClockOffsets(clock.measured(every(10, 60), 1, slow_ns=1e4))
+    assert [len(stretch.rows) for stretch in mapped.stretches] == [1, 59]
+    _, bound = mapped.offset_and_bound_at(BEGIN_NS - np.array([100 * SECOND]))
+    assert bound[0] < 100 * SECOND * CRYSTAL_RATE_LIMIT + 2_000_000
+
+
+def test_a_step_at_each_row_is_a_stretch_for_each_row() -> None:
+    rows = OffsetRows(every(10, 2000), np.arange(2000) % 2 * HOUR, np.full(2000, 1000))
+    assert len(ClockOffsets(rows).stretches) == 2000

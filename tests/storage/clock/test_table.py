@@ -1,205 +1,129 @@
-"""Two nodes' sessions on one time axis, with the uncertainty that is stated."""
+"""Clock tables: the server's time of frames, summaries of streams, and `clock.parquet`."""
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+from typing import Any
+
 import numpy as np
+import pyarrow as pa
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devices.errors import FileFormatError
+from devices.errors import FileFormatError, UsageError
 from devices.types import OFFSET_NS_END, T_MONO_NS_END, T_NS_END
-from storage.clock.bounds import OffsetRows
+from storage.clock.bounds import ClockOffsets, OffsetRows
 from storage.clock.log import ClockOffset
-from storage.clock.table import ClockTable, StreamClockFacts, group_rows_by_stream
+from storage.clock.table import (
+    ClockTable,
+    StreamClockFacts,
+    group_rows_by_stream,
+    read_clock_file,
+    write_clock_file,
+)
+from storage.parquet_hash import write_hashed_table
 from storage.schema import UNKNOWN_T_NS
-
-SECOND = 1_000_000_000
-HOUR = 3600 * SECOND
-SERVER_NS = 1_767_225_600 * SECOND
-"""The server's UTC when the experiment begins: 2026."""
-
-
-class NodeClock:
-    """A node's clock with its drift, and the rows its server has of it.
-
-    Args:
-        booted_ns: how long it had been running when the experiment began.
-        wrong_ns: what its UTC is behind the server's then.
-        drift_ppm: how much faster the server's clock is.
-    """
-
-    def __init__(self, booted_ns: int, wrong_ns: int, drift_ppm: float) -> None:
-        self.booted_ns = booted_ns
-        self.rate = 1 + drift_ppm * 1e-6
-        self.utc_offset_ns = SERVER_NS - wrong_ns - booted_ns
-
-    def t_mono_ns(self, since_ns: int) -> int:
-        """What it reads so long after the beginning, by the server's clock."""
-        return self.booted_ns + round(since_ns / self.rate)
-
-    def rows(self, stream_id: str, seed: int, *, n: int = 30) -> list[ClockOffset]:
-        random = np.random.default_rng(seed)
-        rows = []
-        for i in range(n):
-            go, back = random.exponential((2e6, 7e6)) + 3e5
-            asked_ns = i * 10 * SECOND
-            sent, came = self.t_mono_ns(asked_ns), self.t_mono_ns(asked_ns + round(go + back))
-            middle = (sent + came) // 2
-            read_ns = SERVER_NS + asked_ns + round(go)
-            rows.append(
-                ClockOffset(
-                    stream_id=stream_id,
-                    t_mono_ns=middle,
-                    server_minus_node_ns=read_ns - middle - self.utc_offset_ns,
-                    uncertainty_ns=(came - sent + 1) // 2,
-                )
-            )
-        return rows
-
-    def table(self, stream_id: str, seed: int, *, clock_set: bool = True) -> ClockTable:
-        facts = StreamClockFacts(stream_id, self.utc_offset_ns, clock_set)
-        return ClockTable(group_rows_by_stream(self.rows(stream_id, seed)), [facts], [stream_id])
-
-    def server_ns(self, table: ClockTable, since_ns: int) -> tuple[int, int]:
-        """Server's time and bound of a frame that was taken then."""
-        t_mono_ns = np.array([self.t_mono_ns(since_ns)])
-        columns = table.compute_server_time_columns(t_mono_ns, t_mono_ns + self.utc_offset_ns, None)
-        return int(columns["t_server_ns"][0]), int(columns["t_server_uncertainty_ns"][0])
+from storage.sessions.metadata import load_clock_table
+from storage.sessions.reader import SealedFileReader
+from storage.sessions.writer import SealedFileWriter
+from tests.builders.arrays import UTC_NS, make_array
+from tests.builders.frames import make_frames
+from tests.storage.clock.clocks import BEGIN_NS, HOUR, SECOND, Clock, every, rows_of
 
 
-@given(seed=st.integers(0, 2**32), since_s=st.floats(-20, 320))
-def test_two_nodes_that_saw_the_same_event_agree_on_when_it_was(seed: int, since_s: float) -> None:
-    # One is an hour behind, and its crystal slow; nobody ever set the other's, and it is fast.
-    since_ns = round(since_s * SECOND)
-    told = []
-    for number, node in enumerate(
-        (
-            NodeClock(booted_ns=300 * SECOND, wrong_ns=HOUR, drift_ppm=40.0),
-            NodeClock(booted_ns=900_000 * SECOND, wrong_ns=SERVER_NS - 5 * SECOND, drift_ppm=-25.0),
-        )
-    ):
-        table = node.table(f"boot-{number}", seed + number, clock_set=number == 0)
-        t_server_ns, bound_ns = node.server_ns(table, since_ns)
-        assert abs(t_server_ns - (SERVER_NS + since_ns)) <= bound_ns
-        assert bound_ns < 12_000_000
-        told.append((t_server_ns, bound_ns))
-    (one_ns, one_bound_ns), (other_ns, other_bound_ns) = told
-    assert abs(one_ns - other_ns) <= one_bound_ns + other_bound_ns
+def table_of(rows: OffsetRows) -> ClockTable:
+    return ClockTable({"b": rows}, [StreamClockFacts("b", UTC_NS, True)], ["b"])
 
 
-def test_a_summary_says_drift_and_offset_of_every_stream() -> None:
-    node = NodeClock(booted_ns=300 * SECOND, wrong_ns=HOUR, drift_ppm=40.0)
-    (stream,) = node.table("b", 1).summarize_streams().streams
+@given(
+    drifts_ppm=st.tuples(st.floats(-40, 40), st.floats(-40, 40)),
+    behind_ns=st.sampled_from([0, HOUR, UTC_NS]),
+    seed=st.integers(0, 2**32),
+    since_s=st.floats(-20, 320),
+)
+def test_frames_of_each_part_have_the_servers_time_within_its_bound(
+    drifts_ppm: tuple[float, float], behind_ns: int, seed: int, since_s: float
+) -> None:
+    """The second stream's date is behind the server's by up to all of it."""
+    clocks = [Clock((ppm,), n * behind_ns) for n, ppm in enumerate(drifts_ppm)]
+    rows = {name: c.measured(every(10, 30), seed) for name, c in zip("ab", clocks, strict=True)}
+    facts = [StreamClockFacts(name, UTC_NS, name == "a") for name in "ab"]
+    table = ClockTable(rows, facts, ["a", "b"])
+    assert [stream.steps for stream in table.summarize_streams().streams] == [(), ()]
+    t_mono_ns = np.full(2, BEGIN_NS + round(since_s * SECOND))
+    found = table.compute_server_time_columns(
+        t_mono_ns, t_mono_ns + UTC_NS, np.array([0, 1], dtype=np.uint16)
+    )
+    true_ns = t_mono_ns + UTC_NS + np.concatenate([c.at(t_mono_ns[:1]) for c in clocks])
+    assert (np.abs(found["t_server_ns"] - true_ns) <= found["t_server_uncertainty_ns"]).all()
+    assert (found["t_server_uncertainty_ns"] < 20_000_000).all()
+
+
+def test_a_summary_has_drift_and_offset_of_a_stream() -> None:
+    rows = Clock((40.0,), HOUR).measured(every(10, 30), 1, slow_ns=1e5)
+    (stream,) = table_of(rows).summarize_streams().streams
     assert (stream.stream_id, stream.state, stream.rows, stream.steps) == ("b", "measured", 30, ())
     (stretch,) = stream.stretches
     assert stretch.drift_ppm is not None
     assert stretch.drift_uncertainty_ppm is not None
-    assert abs(stretch.drift_ppm - 40.0) <= stretch.drift_uncertainty_ppm < 20
+    bounds = ClockOffsets(rows).stretches[0].narrowed_mean_rate_bounds or (0.0, 0.0)
+    middle, half = stretch.drift_ppm, stretch.drift_uncertainty_ppm
+    assert (middle - half, middle + half) == pytest.approx((1e6 * bounds[0], 1e6 * bounds[1]))
+    assert abs(middle - 40.0) <= half < 10
     assert abs(stretch.offset_ns - HOUR - 145 * SECOND * 40e-6) < stretch.uncertainty_ns
-    assert stretch.begin_t_ns is not None
-    assert stretch.end_t_ns is not None
-    assert abs(stretch.begin_t_ns - (SERVER_NS - HOUR)) < SECOND
-    assert stretch.end_t_ns - stretch.begin_t_ns == pytest.approx(290 * SECOND, rel=1e-3)
+    ends_ns = (rows.t_mono_ns[[0, -1]] + UTC_NS).tolist()
+    assert [stretch.begin_t_ns, stretch.end_t_ns] == ends_ns
 
 
-def test_the_servers_clock_set_by_an_hour_is_a_step_in_the_summary() -> None:
-    node = NodeClock(booted_ns=300 * SECOND, wrong_ns=0, drift_ppm=-25.0)
-    rows = [
-        row.model_copy(update={"server_minus_node_ns": row.server_minus_node_ns + (i >= 12) * HOUR})
-        for i, row in enumerate(node.rows("b", 1))
-    ]
-    table = ClockTable(
-        group_rows_by_stream(rows), [StreamClockFacts("b", node.utc_offset_ns)], ["b"]
-    )
-    (stream,) = table.summarize_streams().streams
+def test_a_server_set_by_an_hour_is_a_step_in_the_summary() -> None:
+    rows = Clock((-25.0,), steps=((115 * SECOND, HOUR),)).measured(every(10, 30), 1)
+    (stream,) = table_of(rows).summarize_streams().streams
     assert [stretch.rows for stretch in stream.stretches] == [12, 18]
     (step,) = stream.steps
     assert abs(step.jump_ns - HOUR) <= step.jump_uncertainty_ns < 30_000_000
-    assert step.after_t_ns == rows[11].t_mono_ns + node.utc_offset_ns
-    assert step.before_t_ns == rows[12].t_mono_ns + node.utc_offset_ns
-    _, before = node.server_ns(table, 105 * SECOND)
-    _, torn = node.server_ns(table, 115 * SECOND)
-    assert before < 20_000_000
-    assert torn > HOUR / 2
-
-
-def test_a_node_that_was_started_anew_an_hour_off_has_two_streams_and_no_step() -> None:
-    first = NodeClock(booted_ns=300 * SECOND, wrong_ns=0, drift_ppm=40.0)
-    second = NodeClock(booted_ns=20 * SECOND, wrong_ns=HOUR, drift_ppm=40.0)
-    table = ClockTable(
-        group_rows_by_stream([*second.rows("two", 2), *first.rows("one", 1)]),
-        [
-            StreamClockFacts("one", first.utc_offset_ns),
-            StreamClockFacts("two", second.utc_offset_ns),
-        ],
-        ["one", "two"],
-    )
-    assert [len(stream.steps) for stream in table.summarize_streams().streams] == [0, 0]
-    t_mono_ns = np.array([first.t_mono_ns(SECOND), second.t_mono_ns(SECOND)])
-    t_ns = t_mono_ns + np.array([first.utc_offset_ns, second.utc_offset_ns])
-    columns = table.compute_server_time_columns(t_mono_ns, t_ns, np.array([0, 1], dtype=np.uint16))
-    errors = columns["t_server_ns"] - (SERVER_NS + SECOND)
-    assert (np.abs(errors) <= columns["t_server_uncertainty_ns"]).all()
-    assert t_ns[0] - t_ns[1] == HOUR  # raw stays as it was
+    ends_ns = (rows.t_mono_ns[11:13] + UTC_NS).tolist()
+    assert [step.after_t_ns, step.before_t_ns] == ends_ns
 
 
 @pytest.mark.parametrize(
-    ("clock_set", "state"),
-    [(True, "unmeasured"), (None, "unmeasured"), (False, "unsynchronised")],
+    ("clock_set", "state"), [(True, "unmeasured"), (None, "unmeasured"), (False, "unsynchronised")]
 )
-def test_a_stream_that_nobody_measured_gets_no_time(clock_set: bool | None, state: str) -> None:
-    node = NodeClock(booted_ns=300 * SECOND, wrong_ns=0, drift_ppm=0.0)
-    table = ClockTable(
-        group_rows_by_stream(node.rows("other", 1)),
-        [StreamClockFacts("other", node.utc_offset_ns), StreamClockFacts("mine", 0, clock_set)],
-        ["other", "mine"],
-    )
+def test_an_unmeasured_stream_has_no_servers_time(clock_set: bool | None, state: str) -> None:
+    rows = {"other": rows_of((BEGIN_NS, 5, 1000))}
+    facts = [StreamClockFacts("other", UTC_NS, False), StreamClockFacts("mine", 0, clock_set)]
+    table = ClockTable(rows, facts, ["other", "mine"])
     assert [stream.state for stream in table.summarize_streams().streams] == ["measured", state]
-    t_mono_ns = np.array([node.t_mono_ns(0)] * 3)
+    at_ns = np.full(3, BEGIN_NS)
     part = np.array([0, 1, 7], dtype=np.uint16)
-    columns = table.compute_server_time_columns(t_mono_ns, t_mono_ns, part)
-    for values in columns.values():
+    for values in table.compute_server_time_columns(at_ns, at_ns, part).values():
         assert (values == UNKNOWN_T_NS).tolist() == [False, True, True]
 
 
-def test_an_unsynchronised_node_that_was_measured_is_measured() -> None:
-    node = NodeClock(booted_ns=300 * SECOND, wrong_ns=0, drift_ppm=0.0)
-    table = node.table("b", 1, clock_set=False)
-    assert table.summarize_streams().streams[0].state == "measured"
+def test_times_out_of_range_have_no_servers_time() -> None:
+    table, zeros = table_of(rows_of((0, 2**60 - 1, 0))), np.zeros(6, dtype=np.int64)
+    for end, is_t_ns in ((T_NS_END, True), (T_MONO_NS_END, False)):
+        ends = np.array([-(2**63), 2**63 - 1, end, -end, end - 1, 0])
+        t_mono_ns, t_ns = (zeros, ends) if is_t_ns else (ends, zeros)
+        t_server_ns = table.compute_server_time_columns(t_mono_ns, t_ns, None)["t_server_ns"]
+        assert (t_server_ns == UNKNOWN_T_NS).tolist() == [True] * 4 + [False] * 2
+        assert t_server_ns[-1] == 2**60 - 1
 
 
-def test_instants_that_are_none_get_no_servers_time() -> None:
-    rows = {"b": OffsetRows(np.array([0]), np.array([2**60 - 1]), np.array([0]))}
-    table = ClockTable(rows, [StreamClockFacts("b")], ["b"])
-    end = T_NS_END
-    ends = np.array([-(2**63), 2**63 - 1, end, -end, end - 1, 0])
-    columns = table.compute_server_time_columns(np.zeros(6, dtype=np.int64), ends, None)
-    assert (columns["t_server_ns"] == UNKNOWN_T_NS).tolist() == [True] * 4 + [False] * 2
-    assert columns["t_server_ns"][-1] == 2**60 - 1
-    end = T_MONO_NS_END
-    ends = np.array([-(2**63), 2**63 - 1, end, -end, end - 1, 0])
-    columns = table.compute_server_time_columns(ends, np.zeros(6, dtype=np.int64), None)
-    assert (columns["t_server_ns"] == UNKNOWN_T_NS).tolist() == [True] * 4 + [False] * 2
-
-
-def test_a_sum_that_is_no_instant_is_none() -> None:
+def test_a_sum_out_of_range_is_no_time() -> None:
     begin_ns = 2**62 - 3 * 10**9
-    rows = OffsetRows(np.array([0, 10**14]), begin_ns + np.array([0, 2 * 10**9]), np.array([0, 0]))
-    table = ClockTable({"b": rows}, [StreamClockFacts("b")], ["b"])
-    t_ns = np.array([2**62 - 1, 0])
-    columns = table.compute_server_time_columns(np.array([2**59, 2**59]), t_ns, None)
-    assert (columns["t_server_ns"] == UNKNOWN_T_NS).tolist() == [True, False]
-    assert (columns["t_server_uncertainty_ns"] == UNKNOWN_T_NS).tolist() == [True, False]
+    table = table_of(rows_of((0, begin_ns, 0), (10**14, begin_ns + 2 * 10**9, 0)))
+    found = table.compute_server_time_columns(np.full(2, 2**59), np.array([2**62 - 1, 0]), None)
+    for values in found.values():
+        assert (values == UNKNOWN_T_NS).tolist() == [True, False]
 
 
-def test_frames_without_parts_are_of_the_first() -> None:
-    rows = {
-        name: OffsetRows(np.array([0]), np.array([i]), np.array([0])) for i, name in enumerate("ab")
-    }
+def test_frames_without_parts_are_of_the_first_stream() -> None:
+    rows = {"a": rows_of((0, 0, 0)), "b": rows_of((0, 1, 0))}
     table = ClockTable(rows, [StreamClockFacts("a"), StreamClockFacts("b")], ["a", "b"])
-    columns = table.compute_server_time_columns(np.array([0]), np.array([7]), None)
-    assert columns["t_server_ns"].tolist() == [7]
+    found = table.compute_server_time_columns(np.array([0]), np.array([7]), None)
+    assert found["t_server_ns"].tolist() == [7]
 
 
 @pytest.mark.parametrize(
@@ -207,7 +131,6 @@ def test_frames_without_parts_are_of_the_first() -> None:
     [
         (-T_MONO_NS_END, 0, 0, "t_mono_ns"),
         (T_MONO_NS_END, 0, 0, "t_mono_ns"),
-        (2**63 - 1, 0, 0, "t_mono_ns"),
         (0, -(2**63), 0, "server_minus_node_ns"),
         (0, OFFSET_NS_END, 0, "server_minus_node_ns"),
         (0, 0, -1, "uncertainty_ns"),
@@ -215,14 +138,117 @@ def test_frames_without_parts_are_of_the_first() -> None:
         (0, 2**63, 0, "out of range"),
     ],
 )
-def test_a_row_that_cannot_be_is_refused_by_name(
+def test_a_row_out_of_range_is_refused_by_column(
     t_mono_ns: int, offset_ns: int, uncertainty_ns: int, named: str
 ) -> None:
-    row = ClockOffset(
-        stream_id="b",
+    row = row_of("b", t_mono_ns, offset_ns, uncertainty_ns)
+    with pytest.raises(FileFormatError, match=named):
+        ClockTable(group_rows_by_stream([row]), [StreamClockFacts("b")], ["b"])
+
+
+# --- clock.parquet --------------------------------------------------------------------------------
+
+
+def row_of(stream_id: str, t_mono_ns: int, offset_ns: int, uncertainty_ns: int = 50) -> ClockOffset:
+    return ClockOffset(
+        stream_id=stream_id,
         t_mono_ns=t_mono_ns,
         server_minus_node_ns=offset_ns,
         uncertainty_ns=uncertainty_ns,
     )
-    with pytest.raises(FileFormatError, match=named):
-        ClockTable(group_rows_by_stream([row]), [StreamClockFacts("b")], ["b"])
+
+
+def measured(stream_id: str, n: int) -> list[ClockOffset]:
+    return [row_of(stream_id, i * 10 * SECOND, 1000 + i) for i in range(n)]
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "clock.parquet"
+
+
+@pytest.mark.parametrize("counts", [(3, 2), (0, 0)], ids=["two streams", "no rows"])
+def test_the_file_gives_back_rows_and_facts(path: Path, counts: tuple[int, int]) -> None:
+    rows = [*measured("one", counts[0]), *measured("two", counts[1])]
+    facts = [StreamClockFacts("one", 5, True), StreamClockFacts("two")]
+    facts.append(StreamClockFacts("three", -7, False))
+    write_clock_file(path, rows, facts)
+    stored = read_clock_file(path)
+    assert stored.offsets == tuple(rows)
+    assert [len(own) for own in stored.rows_by_stream.values()] == [n for n in counts if n]
+    for name, own in stored.rows_by_stream.items():
+        expected = [row.server_minus_node_ns for row in rows if row.stream_id == name]
+        assert own.offset_ns.tolist() == expected
+    assert list(stored.facts.values()) == facts
+
+
+def numbers(**changed: pa.Array[Any]) -> dict[str, pa.Array[Any]]:
+    names = ("t_mono_ns", "server_minus_node_ns", "uncertainty_ns")
+    columns: dict[str, pa.Array[Any]] = {"stream_id": pa.array(["b"])}
+    return columns | {name: pa.array([1], pa.int64()) for name in names} | changed
+
+
+@pytest.mark.parametrize(
+    ("columns", "streams"),
+    [
+        ({"stream_id": pa.array(["b"])}, "[]"),
+        (numbers(t_mono_ns=pa.array([None], pa.int64())), "[]"),
+        (numbers(stream_id=pa.array([None], pa.string())), "[]"),
+        (numbers(uncertainty_ns=pa.array(["much"])), "[]"),
+        (numbers(uncertainty_ns=pa.array([0.5])), "[]"),
+        (numbers(), json.dumps([1])),
+        (numbers(), None),
+    ],
+    ids=["columns missing", "no instant", "no stream", "text", "fraction", "bad facts", "no facts"],
+)
+def test_another_table_is_refused(
+    path: Path, columns: dict[str, pa.Array[Any]], streams: str | None
+) -> None:
+    metadata = None if streams is None else {"foottile.streams": streams}
+    write_hashed_table(path, pa.table(columns).replace_schema_metadata(metadata))
+    with pytest.raises(FileFormatError, match=r"clock\.parquet.*clock table"):
+        read_clock_file(path)
+
+
+def sealed(path: Path, notes: dict[str, object]) -> SealedFileReader:
+    """Frames of two parts beside this clock file."""
+    info = make_array(1, stream_id="one", nominal_rate_hz=1.0, utc_offset_ns=7, clock_set=False)
+    with SealedFileWriter(path.with_name("frames.parquet"), info, notes) as writer:
+        frames = make_frames(4, 1, period_ns=SECOND, utc_offset_ns=7)
+        writer.append_frames(frames, {"part": np.array([0, 0, 1, 1], dtype=np.uint16)})
+    return SealedFileReader(path.with_name("frames.parquet"))
+
+
+def test_each_part_of_a_session_has_the_clock_of_its_stream(path: Path) -> None:
+    facts = [StreamClockFacts("one", 7, False), StreamClockFacts("two", 9, True)]
+    write_clock_file(path, measured("two", 3), facts)
+    parts = [{"stream_id": "one"}, {"stream_id": "two"}]
+    with sealed(path, {"session": {"parts": parts}}) as reader:
+        one, two = load_clock_table(reader).summarize_streams().streams
+    assert (one.stream_id, one.state, one.rows) == ("one", "unsynchronised", 0)
+    assert (two.stream_id, two.state, two.rows) == ("two", "measured", 3)
+    assert two.stretches[0].begin_t_ns == 9
+
+
+def test_a_file_of_no_session_is_of_one_stream(path: Path) -> None:
+    write_clock_file(path, measured("one", 3), [StreamClockFacts("one", 7, False)])
+    with sealed(path, {}) as reader:
+        (stream,) = load_clock_table(reader).summarize_streams().streams
+    assert (stream.stream_id, stream.state) == ("one", "measured")
+    assert stream.stretches[0].begin_t_ns == 7
+
+
+def test_a_lone_file_says_that_its_clock_is_missing(path: Path) -> None:
+    missing = r"no clock\.parquet beside frames\.parquet"
+    with sealed(path, {}) as reader, pytest.raises(UsageError, match=missing):
+        load_clock_table(reader)
+
+
+@pytest.mark.parametrize("session", [1, {"parts": 5}, {"parts": [{}]}, {}])
+def test_notes_without_streams_are_refused(path: Path, session: object) -> None:
+    write_clock_file(path, measured("one", 3), [])
+    with (
+        sealed(path, {"session": session}) as reader,
+        pytest.raises(FileFormatError, match="which streams"),
+    ):
+        load_clock_table(reader)

@@ -110,10 +110,7 @@ def read(content: bytes, to: str) -> pa.Table:
         io.BytesIO(content),
         # A row of which the one column asked for is not known is an empty line.
         parse_options=pacsv.ParseOptions(ignore_empty_lines=False),
-        convert_options=pacsv.ConvertOptions(
-            null_values=[""],
-            strings_can_be_null=False,
-        ),
+        convert_options=pacsv.ConvertOptions(null_values=[""], strings_can_be_null=False),
     )
     return table.drop_columns(["about"]) if "about" in table.column_names else table
 

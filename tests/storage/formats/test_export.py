@@ -49,7 +49,7 @@ from tests.storage.formats.exports import (
         unique=True,
     ),
 )
-def test_every_format_says_the_same_of_a_slice(
+def test_a_slice_is_the_same_in_each_table(
     every: int, start: int | None, length: int | None, columns: list[str]
 ) -> None:
     end = None if length is None else (start or 0) + length
@@ -70,31 +70,13 @@ def test_every_format_says_the_same_of_a_slice(
 
 
 @pytest.mark.parametrize("to", TABLES)
-def test_a_slice_of_a_gap_has_a_header_and_no_rows(to: str) -> None:
-    def with_a_gap() -> Iterator[Piece]:
-        yield frames().slice_rows(0, 10), {}
-        yield frames().slice_rows(40, ROWS), {}
-
-    part = Slice(20 * PERIOD_NS * 1e-9, 30 * PERIOD_NS * 1e-9, ("seq",))
-    found = read(
-        b"".join(export(make_one_pass_frame_source(with_a_gap()), make_array(), NOTES, to, part)),
-        to,
-    )
-    assert found.column_names == ["seq"]
-    assert found.num_rows == 0
-
-
-@pytest.mark.parametrize("to", TABLES)
-def test_a_slice_that_begins_after_the_end_is_refused_before_the_first_chunk(to: str) -> None:
-    chunks = export(
-        make_one_pass_frame_source(cut(frames(), extra(), 20)),
-        make_array(),
-        NOTES,
-        to,
-        Slice(ROWS * 2e-3 + 1),
-    )
+def test_no_frames_and_a_slice_after_the_end_are_refused_first(to: str) -> None:
+    content = make_one_pass_frame_source(cut(frames(), extra(), 20))
+    chunks = export(content, make_array(), NOTES, to, Slice(ROWS * 2e-3 + 1))
     with pytest.raises(UsageError, match=r"starts at 1\.1 s, and the session ends at 0\.098 s"):
         next(chunks)
+    with pytest.raises(UsageError, match="no frames"):
+        next(export(make_one_pass_frame_source([]), make_array(), {}, to, Slice()))
 
 
 @pytest.mark.parametrize(
@@ -105,14 +87,12 @@ def test_a_slice_that_begins_after_the_end_is_refused_before_the_first_chunk(to:
         *[(2.0, 1.0), (1.0, 1.0), (0.0, 0.0)],
     ],
 )
-def test_a_slice_that_can_hold_nothing_is_refused(
-    start_s: float | None, end_s: float | None
-) -> None:
+def test_a_slice_of_no_time_is_refused(start_s: float | None, end_s: float | None) -> None:
     with pytest.raises(UsageError, match=r"the slice"):
         Slice(start_s, end_s)
 
 
-def test_values_are_those_of_the_session_and_what_is_not_known_is_null() -> None:
+def test_values_are_the_sessions_and_unknown_ones_are_null() -> None:
     batch, columns = frames(), extra()
     table = read(exported("arrow"), "arrow")
     pressure_raw = [None if v == NOT_READ else v for v in batch.pressure_raw[:, 1].tolist()]
@@ -172,12 +152,8 @@ def clock() -> ClockTable:
 def on_servers_axis(to: str, part: Slice | None = None, *, every: int = 20) -> bytes:
     columns = extra()
     columns["part"][30:] = 1
-    pieces = cut(frames(), columns, every)
-    return b"".join(
-        export(
-            make_one_pass_frame_source(pieces), make_array(), NOTES, to, part or Slice(), clock()
-        )
-    )
+    content = make_one_pass_frame_source(cut(frames(), columns, every))
+    return b"".join(export(content, make_array(), NOTES, to, part or Slice(), clock()))
 
 
 @pytest.mark.parametrize("to", TABLES)
@@ -196,16 +172,15 @@ def test_the_servers_time_is_added_and_raw_time_stays(to: str) -> None:
 
 
 @pytest.mark.parametrize("to", TABLES)
-@pytest.mark.parametrize("every", [1, 7])
-def test_any_pieces_give_the_same_servers_time(to: str, every: int) -> None:
+def test_any_pieces_give_the_same_servers_time(to: str) -> None:
     part = Slice(columns=("t_server_ns", "t_server_uncertainty_ns"))
-    found = read(on_servers_axis(to, part, every=every), to)
+    found = read(on_servers_axis(to, part, every=7), to)
     assert found.column_names == list(part.columns)
     assert values(found) == values(read(on_servers_axis(to, part, every=ROWS), to))
 
 
 @pytest.mark.parametrize("to", ["parquet", "arrow"])
-def test_notes_say_how_the_servers_time_was_found(to: str) -> None:
+def test_notes_have_the_clock_of_the_servers_time(to: str) -> None:
     schema = read(on_servers_axis(to, Slice(columns=("t_server_ns",))), to).schema
     assert schema.field("t_server_ns").type == pa.int64()
     assert schema.field("t_server_ns").nullable
@@ -218,7 +193,7 @@ def test_notes_say_how_the_servers_time_was_found(to: str) -> None:
     assert notes == NOTES
 
 
-def test_the_servers_time_is_not_there_unless_it_is_asked_for() -> None:
+def test_the_servers_time_has_to_be_asked_for() -> None:
     assert "t_server_ns" not in names(Slice())
     with pytest.raises(UsageError, match="clock `server`"):
         exported("csv", Slice(columns=("t_server_ns",)))
@@ -228,7 +203,7 @@ def test_the_servers_time_is_not_there_unless_it_is_asked_for() -> None:
 
 
 @pytest.mark.parametrize("to", TABLES)
-def test_chunks_come_while_frames_are_read_and_are_no_larger_than_a_piece(to: str) -> None:
+def test_chunks_come_while_frames_are_read(to: str) -> None:
     """Of an endless session the beginning comes, and what was given away is kept no longer."""
     rows, asked = 500, 0
     piece = frames(rows)
@@ -252,21 +227,14 @@ def test_chunks_come_while_frames_are_read_and_are_no_larger_than_a_piece(to: st
 @pytest.mark.parametrize("to", TABLES)
 def test_frames_outside_of_a_slice_make_no_chunks(to: str) -> None:
     part = Slice(0.09, None, ("seq",))
-    chunks = list(
-        export(make_one_pass_frame_source(cut(frames(), extra(), 1)), make_array(), {}, to, part)
-    )
+    content = make_one_pass_frame_source(cut(frames(), extra(), 1))
+    chunks = list(export(content, make_array(), {}, to, part))
     assert len(chunks) <= 1 + 5 + 1
     assert read(b"".join(chunks), to).num_rows == 5
 
 
 @pytest.mark.parametrize("to", TABLES)
-def test_a_session_without_frames_is_refused(to: str) -> None:
-    with pytest.raises(UsageError, match="no frames"):
-        next(export(make_one_pass_frame_source([]), make_array(), {}, to, Slice()))
-
-
-@pytest.mark.parametrize("to", TABLES)
-def test_an_error_on_the_way_is_not_the_end_of_a_file(to: str) -> None:
+def test_a_failing_source_is_no_end_of_file(to: str) -> None:
     def broken() -> Iterator[Piece]:
         yield frames(), {}
         raise OSError("the disk is gone")
@@ -275,3 +243,73 @@ def test_an_error_on_the_way_is_not_the_end_of_a_file(to: str) -> None:
     next(chunks)
     with pytest.raises(OSError, match="the disk is gone"):
         list(chunks)
+
+
+# --- rows -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("start_s", "end_s", "first", "last"),
+    [
+        (0.0, 0.02, 0, 9),
+        (0.02, 0.04, 10, 19),  # what ends where another begins shares no frame with it
+        (0.021, 0.0399, 11, 19),
+        (None, 0.002, 0, 0),
+        (0.098, None, 49, 49),
+        (0.0, 1e9, 0, 49),
+    ],
+)
+def test_a_slice_has_its_start_and_not_its_end(
+    start_s: float | None, end_s: float | None, first: int, last: int
+) -> None:
+    table = read(exported("arrow", Slice(start_s, end_s, ("seq",))), "arrow")
+    assert table.column("seq").to_pylist() == [2**60 + i for i in range(first, last + 1)]
+
+
+@pytest.mark.parametrize("to", TABLES)
+@pytest.mark.parametrize("every", [20, ROWS])
+def test_a_slice_between_two_frames_still_has_a_header(to: str, every: int) -> None:
+    part = Slice(0.051, 0.0515, ("t_ns", "force_n"))
+    table = read(exported(to, part, every=every), to)
+    assert table.num_rows == 0
+    assert table.column_names == ["t_ns", "force_n_0", "force_n_1"]
+
+
+def test_only_a_slice_of_everything_is_unrestricted() -> None:
+    slices = (Slice(), Slice(start_s=0.0), Slice(columns=("seq",)))
+    assert [each.is_unrestricted for each in slices] == [True, False, False]
+
+
+# --- columns --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("to", TABLES)
+@pytest.mark.parametrize(
+    ("asked", "expected"),
+    [
+        (("grf_n",), "grf_n"),
+        (("force_n",), "force_n_0 force_n_1"),
+        (("force_n_1",), "force_n_1"),
+        (("t_ns", "seq"), "t_ns seq"),
+        (("force_n_1", "seq", "force_n_0"), "force_n_1 seq force_n_0"),
+        (("force_n_1", "grf_n", "force_n"), "force_n_1 grf_n force_n_0"),
+        (("grf_n", "grf_n", "seq", "grf_n"), "grf_n seq"),
+        (("phase", "pressure_raw", "phase"), "phase pressure_raw_0 pressure_raw_1"),
+    ],
+)
+def test_columns_are_of_one_tile_or_of_all_in_the_order_asked_for(
+    to: str, asked: tuple[str, ...], expected: str
+) -> None:
+    assert names(Slice(columns=asked), to) == expected.split()
+
+
+@pytest.mark.parametrize(
+    "unknown", ["magic", "force_n_2", "force_n_", "FORCE_N", "", "true_grf_n", "x" * 10_000, "a\0"]
+)
+def test_an_unknown_column_is_refused_before_the_first_chunk(unknown: str) -> None:
+    content = make_one_pass_frame_source(cut(frames(), extra(), 20))
+    chunks = export(content, make_array(), {}, "csv", Slice(columns=("seq", unknown)))
+    with pytest.raises(UsageError, match="no column") as caught:
+        next(chunks)
+    assert len(str(caught.value)) < 1000
+    assert "force_n" in caught.value.expected

@@ -10,8 +10,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from devices.emulation.ground.load_trace import LoadTrace
 from devices.errors import LoadTraceError
@@ -67,9 +65,7 @@ def rows(header: str, *lines: str) -> str:
 # --- what is read ---------------------------------------------------------------------------------
 
 
-def test_a_total_force_with_its_centre_is_read_and_empty_centres_stay_undefined(
-    read: Read,
-) -> None:
+def test_a_force_and_its_cop_are_read_and_empty_cops_are_nan(read: Read) -> None:
     trace = read(GOOD)
     assert trace.time_s.tolist() == [0.0, 0.01, 0.02]
     assert trace.fz_n is not None
@@ -99,30 +95,16 @@ def test_cells_are_put_in_the_order_of_their_numbers(read: Read) -> None:
     assert trace.cells_n[1].tolist() == [10.0 * i for i in range(1, 11)]
 
 
-def test_cells_beside_a_total_force_are_both_kept(read: Read) -> None:
-    trace = read(rows("time_s,fz_n,cell1_n,cell2_n", "0,3,1,2", "1,7,3,4"))
+def test_cells_force_and_angle_are_read_and_other_columns_ignored(read: Read) -> None:
+    trace = read(rows("time_s,who,cell1_n,angle_rad,fz_n", '0,"a\nb",1,0.5,3', "1,=1+1,2,-0.5,4"))
     assert trace.fz_n is not None
     assert trace.cells_n is not None
-    assert trace.cells_n.shape == (2, 2)
-
-
-def test_an_angle_is_read_and_other_columns_are_ignored(read: Read) -> None:
-    trace = read(rows("time_s,who,cell1_n,angle_rad,mz_nm", "0,me,1,0.5,", "1,you,2,-0.5,x"))
     assert trace.angle_rad is not None
     assert trace.angle_rad.tolist() == [0.5, -0.5]
 
 
-def test_a_mark_of_byte_order_as_spreadsheets_write_it_does_no_harm(read: Read) -> None:
-    assert len(read(b"\xef\xbb\xbf" + GOOD.replace("\n", "\r\n").encode()).time_s) == 3
-
-
-def test_time_may_begin_anywhere_and_steps_may_differ(read: Read) -> None:
-    trace = read(rows("time_s,cell1_n", "-5.5,1", "-5.4999999,2", "1e3,3"))
-    assert trace.time_s.tolist() == [-5.5, -5.4999999, 1000.0]
-
-
 @pytest.mark.parametrize("type_", [pa.float32(), pa.float64(), pa.int16(), pa.uint8()])
-def test_parquet_is_read_whatever_its_numbers_are_kept_in(
+def test_parquet_is_read_of_any_type(
     read_parquet: Callable[..., LoadTrace], type_: pa.DataType
 ) -> None:
     trace = read_parquet(
@@ -137,39 +119,7 @@ def test_parquet_is_read_whatever_its_numbers_are_kept_in(
     np.testing.assert_array_equal(trace.cop_m, [[np.nan, np.nan], [0.25, 0.25], [0.5, np.nan]])
 
 
-def test_parquet_in_several_row_groups_is_read_whole(tmp_path: Path) -> None:
-    path = tmp_path / "TRACE.PARQUET"
-    table = pa.table({"time_s": np.arange(100.0), "cell1_n": np.arange(100.0)})
-    pq.write_table(table, path, row_group_size=7)
-    trace = read_load_trace(path)
-    assert trace.cells_n is not None
-    assert trace.cells_n[:, 0].tolist() == list(range(100))
-
-
-@settings(max_examples=30, deadline=None)
-@given(
-    st.lists(
-        st.tuples(st.floats(1e-6, 10.0), st.floats(0, 2000), st.floats(-1, 1)),
-        min_size=2,
-        max_size=20,
-    )
-)
-def test_numbers_survive_csv_bit_by_bit(
-    tmp_path_factory: pytest.TempPathFactory, made: list[tuple[float, float, float]]
-) -> None:
-    time_s = np.cumsum([step for step, _, _ in made])
-    lines = [f"{t!r},{f!r},{c!r},0" for t, (_, f, c) in zip(time_s.tolist(), made, strict=True)]
-    path = tmp_path_factory.mktemp("csv") / "trace.csv"
-    path.write_text(rows("time_s,fz_n,cop_x_m,cop_y_m", *lines))
-    trace = read_load_trace(path)
-    assert trace.fz_n is not None
-    assert trace.cop_m is not None
-    assert trace.time_s.tolist() == time_s.tolist()
-    assert trace.fz_n.tolist() == [f for _, f, _ in made]
-    assert trace.cop_m[:, 0].tolist() == [c for _, _, c in made]
-
-
-def test_a_plate_that_reads_a_little_below_zero_in_flight_is_not_upside_down(read: Read) -> None:
+def test_a_plate_a_little_below_zero_in_flight_is_not_upside_down(read: Read) -> None:
     # A hop: most of it in flight, where a drifted plate reads -0.5 N, and a stance of 800 N.
     lines = [f"{i / 100},{800 if 60 <= i < 80 else -0.5},0,0" for i in range(100)]
     trace = read(rows("time_s,fz_n,cop_x_m,cop_y_m", *lines))
@@ -180,28 +130,20 @@ def test_a_plate_that_reads_a_little_below_zero_in_flight_is_not_upside_down(rea
 # --- files that are refused -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["nothing.csv", "nothing.parquet", "no/such/folder.csv"])
-def test_a_file_that_is_not_there_is_refused_by_name(tmp_path: Path, name: str) -> None:
-    with pytest.raises(LoadTraceError, match="cannot be read") as caught:
-        read_load_trace(tmp_path / name)
-    assert name in str(caught.value)
-
-
 @pytest.mark.parametrize("suffix", ["", ".csv", ".parquet"])
-def test_a_folder_is_refused(tmp_path: Path, suffix: str) -> None:
-    folder = tmp_path / f"folder{suffix}"
-    folder.mkdir()
+def test_a_folder_and_a_missing_file_are_refused_by_name(tmp_path: Path, suffix: str) -> None:
+    with pytest.raises(LoadTraceError, match=rf"nothing{suffix}.*cannot be read"):
+        read_load_trace(tmp_path / f"nothing{suffix or '.csv'}")
+    (tmp_path / f"folder{suffix}").mkdir()
     with pytest.raises(LoadTraceError, match="folder"):
-        read_load_trace(folder)
+        read_load_trace(tmp_path / f"folder{suffix}")
 
 
 @pytest.mark.parametrize(
     "content",
     [
         b"",
-        b"\n",
         bytes(range(256)) * 4,
-        b"PAR1 and then nothing",
         "time_s,fz_n,cop_x_m,cop_y_m\n0,1,0,0\n1,1,0\n",  # a short line
         "0,1,0,0\n1,1,0,0\n",  # numbers without names
     ],
@@ -221,7 +163,7 @@ def test_a_csv_that_is_called_parquet_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("column", ["time_s", "cop_x_m", "cop_y_m"])
-def test_a_missing_column_is_named_with_those_that_there_are(read: Read, column: str) -> None:
+def test_a_missing_column_is_named(read: Read, column: str) -> None:
     refused(read, GOOD.replace(column, "other"), f"column {column} is missing", "other")
 
 
@@ -231,18 +173,9 @@ def test_a_table_without_any_load_is_refused_with_what_it_has(read: Read) -> Non
 
 @pytest.mark.parametrize(
     ("wrong", "right"),
-    [
-        ("time_ms", "time_s"),
-        ("time", "time_s"),
-        ("fz_kN", "fz_n"),
-        ("Fz", "fz_n"),
-        ("cop_x_mm", "cop_x_m"),
-        ("cop_y_cm", "cop_y_m"),
-    ],
+    [("time_ms", "time_s"), ("time", "time_s"), ("Fz", "fz_n"), ("cop_y_cm", "cop_y_m")],
 )
-def test_a_column_in_another_unit_is_recognised_and_both_names_are_said(
-    read: Read, wrong: str, right: str
-) -> None:
+def test_a_column_in_another_unit_is_refused_by_name(read: Read, wrong: str, right: str) -> None:
     refused(read, GOOD.replace(right, wrong), f"{right}, converted from {wrong.lower()!r}")
 
 
@@ -252,12 +185,9 @@ def test_a_column_that_is_there_twice_is_refused(read: Read, names: str) -> None
 
 
 @pytest.mark.parametrize(
-    ("numbers", "said"),
-    [((1, 2, 4), "1, 2, 4"), ((2, 3), "2, 3"), ((0, 1), "0, 1"), ((3,), "3")],
+    ("numbers", "said"), [((1, 2, 4), "1, 2, 4"), ((2, 3), "2, 3"), ((0, 1), "0, 1"), ((3,), "3")]
 )
-def test_cells_numbered_with_a_gap_are_refused(
-    read: Read, numbers: tuple[int, ...], said: str
-) -> None:
+def test_cells_with_a_gap_are_refused(read: Read, numbers: tuple[int, ...], said: str) -> None:
     header = "time_s," + ",".join(f"cell{i}_n" for i in numbers)
     line = ",".join("1" for _ in numbers)
     refused(read, rows(header, f"0,{line}", f"1,{line}"), f"numbered {said}", "without a gap")
@@ -282,16 +212,11 @@ def test_fewer_than_two_rows_are_refused(read: Read, lines: list[str], said: str
 def test_times_that_do_not_rise_are_refused_with_the_row(
     read: Read, times: tuple[float, ...], row: int, said: str
 ) -> None:
-    refused(
-        read,
-        rows("time_s,cell1_n", *(f"{t},1" for t in times)),
-        f"at row {row};",
-        said,
-        "Sort the rows",
-    )
+    text = rows("time_s,cell1_n", *(f"{t},1" for t in times))
+    refused(read, text, f"at row {row};", said, "Sort the rows")
 
 
-@pytest.mark.parametrize("value", ["", "NaN", "nan", "inf", "-inf"])
+@pytest.mark.parametrize("value", ["", "NaN", "-inf"])
 @pytest.mark.parametrize(
     ("header", "line", "column"),
     [
@@ -301,15 +226,11 @@ def test_times_that_do_not_rise_are_refused_with_the_row(
         ("time_s,cell1_n,cell2_n,angle_rad", "1,1,1,{}", "angle_rad"),
     ],
 )
-def test_what_is_no_number_where_there_must_be_one_is_refused_with_column_and_row(
+def test_a_cell_without_a_number_is_refused_with_column_and_row(
     read: Read, header: str, line: str, column: str, value: str
 ) -> None:
-    refused(
-        read,
-        rows(header, "0,0,0,0", line.format(value), "2,0,0,0"),
-        f"column {column} is",
-        "at row 2",
-    )
+    text = rows(header, "0,0,0,0", line.format(value), "2,0,0,0")
+    refused(read, text, f"column {column} is", "at row 2")
 
 
 def test_an_infinite_centre_of_pressure_is_refused_and_an_empty_one_is_not(read: Read) -> None:
@@ -324,15 +245,10 @@ def test_a_column_of_words_is_refused_by_name(read: Read, value: str) -> None:
 
 @pytest.mark.parametrize(
     "time_s",
-    [
-        pa.array(["a", "b"]),
-        pa.array([0, 1], pa.timestamp("ms")),
-        pa.array([[0.0], [1.0]]),
-        pa.array([b"\x00", b"\x01"], pa.binary()),
-        pa.array([0, 2**60 + 1]),
-    ],
+    [pa.array(["a", "b"]), pa.array([0, 1], pa.timestamp("ms")), pa.array([0, 2**60 + 1])],
+    ids=["text", "instants", "too large for a float"],
 )
-def test_a_parquet_column_that_is_no_number_is_refused_by_name(
+def test_a_parquet_column_of_no_numbers_is_refused_by_name(
     read_parquet: Callable[..., LoadTrace], time_s: pa.Array[Any]
 ) -> None:
     with pytest.raises(LoadTraceError, match="column time_s is not numeric"):
@@ -346,7 +262,7 @@ def test_a_parquet_column_that_is_no_number_is_refused_by_name(
         rows("time_s,cell1_n,cell2_n", "0,0,0", "1,-300,-10", "2,-700,-30", "3,-1,2"),
     ],
 )
-def test_a_load_that_is_mostly_negative_is_refused_as_upside_down(read: Read, content: str) -> None:
+def test_a_negative_load_is_refused_as_upside_down(read: Read, content: str) -> None:
     # Pressed as it is, it would be clipped to no load at all without a word.
     refused(read, content, "negative", "Change its sign")
 
@@ -354,9 +270,7 @@ def test_a_load_that_is_mostly_negative_is_refused_as_upside_down(read: Read, co
 # --- size -----------------------------------------------------------------------------------------
 
 
-def test_a_small_file_with_very_many_rows_is_refused_before_they_are_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_too_many_rows_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "trace.parquet"
     table = pa.table({"time_s": np.zeros(4_000_000), "fz_n": np.zeros(4_000_000)})
     with pq.ParquetWriter(path, table.schema, compression="zstd") as file:
@@ -378,14 +292,6 @@ def test_a_text_that_is_too_long_is_refused_before_it_is_read(tmp_path: Path) ->
         file.truncate(300 << 20)  # a hole: it takes no room
     with pytest.raises(LoadTraceError, match="314572800 bytes"):
         read_load_trace(path)
-
-
-def test_columns_that_are_no_load_are_not_read(tmp_path: Path) -> None:
-    path = tmp_path / "trace.csv"
-    path.write_text('time_s,Fz_N,cop_x_m,cop_y_m,note\n0,1,0,0,"a\nb"\n1,2,0,0,=1+1\n')
-    trace = read_load_trace(path)
-    assert trace.fz_n is not None
-    assert trace.fz_n.tolist() == [1.0, 2.0]
 
 
 def test_a_plate_of_several_is_named_and_its_unit_stated(tmp_path: Path) -> None:

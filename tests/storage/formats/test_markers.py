@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,13 +16,13 @@ from storage.clock.bounds import OffsetRows
 from storage.clock.table import ClockTable, StreamClockFacts
 from storage.formats.export import make_one_pass_frame_source
 from storage.formats.markers import DISTANCE_MAX_NS, PLACEMENT_COLUMNS, PlacedMarkers, place_markers
-from storage.formats.slice import FormatOptions, Slice
+from storage.formats.slice import Slice
 from storage.schema import Array
 from storage.sessions.folder import Marker
 from storage.sessions.footer import NOTES_KEY
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.frames import make_frames
-from tests.storage.formats.exports import NO_TIMES, TABLES, export
+from tests.storage.formats.exports import TABLES, export, read
 
 UTC_NS = 10**18
 OFFSET_NS = 7_000_000_000
@@ -79,22 +76,19 @@ def frames_of(markers: PlacedMarkers) -> list[tuple[int, int] | None]:
     return [marker.frame for marker in markers.markers]
 
 
-def test_a_mark_is_at_the_frame_nearest_to_it_in_the_servers_time() -> None:
-    near = int(0.4 * PERIOD_NS)
-    markers = placed(at(0, 5 * PERIOD_NS + near, 6 * PERIOD_NS - near, GAP_NS + 30 * PERIOD_NS))
-    assert frames_of(markers) == [(0, 0), (0, 5), (0, 6), (1, 0)]
-    assert [marker.distance_ns for marker in markers.markers] == [0, near, near, 0]
+def test_a_mark_is_at_the_nearest_frame_in_the_servers_time() -> None:
+    near, half = int(0.4 * PERIOD_NS), PERIOD_NS // 2  # of two at the same distance, the earlier
+    places = (5 * PERIOD_NS + near, 5 * PERIOD_NS + half, 6 * PERIOD_NS - near)
+    markers = placed(at(0, *places, GAP_NS + 30 * PERIOD_NS))
+    assert frames_of(markers) == [(0, 0), (0, 5), (0, 5), (0, 6), (1, 0)]
+    assert [marker.distance_ns for marker in markers.markers] == [0, near, half, near, 0]
     assert markers.excluded == ()
     assert all(
         marker.uncertainty_ns and marker.uncertainty_ns >= 1000 for marker in markers.markers
     )
 
 
-def test_of_two_frames_that_are_as_near_the_earlier_one_has_the_mark() -> None:
-    assert frames_of(placed(at(5 * PERIOD_NS + PERIOD_NS // 2))) == [(0, 5)]
-
-
-def test_marks_before_between_and_after_frames_are_at_one_within_a_second_or_at_none() -> None:
+def test_a_mark_is_at_a_frame_within_a_second_or_at_none() -> None:
     last = 29 * PERIOD_NS
     end = GAP_NS + (ROWS - 1) * PERIOD_NS
     markers = placed(
@@ -105,9 +99,8 @@ def test_marks_before_between_and_after_frames_are_at_one_within_a_second_or_at_
         )
     )
     assert frames_of(markers) == [None, (0, 0), (0, 29), None, (1, 19), None]
-    assert [marker.exclusion_reason for marker in markers.excluded] == [
-        "no frame within a second of it"
-    ] * 3
+    reasons = [marker.exclusion_reason for marker in markers.excluded]
+    assert reasons == ["no frame within a second of it"] * 3
 
 
 def test_marks_at_the_ends_of_time_are_at_no_frame() -> None:
@@ -115,7 +108,7 @@ def test_marks_at_the_ends_of_time_are_at_no_frame() -> None:
     assert frames_of(placed(far)) == [None, None]
 
 
-def test_several_marks_at_one_frame_are_joined_in_the_order_of_their_instants() -> None:
+def test_marks_at_one_frame_are_joined_in_order_of_time() -> None:
     markers = placed(
         at(3 * PERIOD_NS + 9, 3 * PERIOD_NS + 5, 3 * PERIOD_NS + 5, labels=["c", "a", "b"])
     )
@@ -129,15 +122,11 @@ def test_a_mark_outside_the_slice_is_said_to_be() -> None:
     part = Slice(10 * PERIOD_NS * 1e-9, 20 * PERIOD_NS * 1e-9)
     markers = placed(at(9 * PERIOD_NS, 10 * PERIOD_NS, 19 * PERIOD_NS, 20 * PERIOD_NS), part)
     assert frames_of(markers) == [(0, 9), (0, 10), (0, 19), (0, 20)]
-    assert [bool(marker.exclusion_reason) for marker in markers.markers] == [
-        True,
-        False,
-        False,
-        True,
-    ]
+    is_excluded = [bool(marker.exclusion_reason) for marker in markers.markers]
+    assert is_excluded == [True, False, False, True]
 
 
-def test_without_a_measured_clock_a_mark_is_at_no_frame_and_the_reason_says_so() -> None:
+def test_without_a_measured_clock_a_mark_is_at_no_frame() -> None:
     (marker,) = place_markers(at(0), times(), clock(measured=False), Slice()).excluded
     assert marker.frame is None
     assert "clock" in marker.exclusion_reason
@@ -148,7 +137,7 @@ def test_without_a_measured_clock_a_mark_is_at_no_frame_and_the_reason_says_so()
     every=st.integers(1, ROWS),
     t_ns=st.lists(st.integers(-2 * DISTANCE_MAX_NS, GAP_NS + 2 * DISTANCE_MAX_NS), max_size=8),
 )
-def test_any_pieces_give_the_frames_that_a_search_of_all_frames_gives(
+def test_marks_in_pieces_are_where_a_search_of_all_frames_finds_them(
     every: int, t_ns: list[int]
 ) -> None:
     frames, part = session()
@@ -164,59 +153,29 @@ def test_any_pieces_give_the_frames_that_a_search_of_all_frames_gives(
 # --- in a file ------------------------------------------------------------------------------------
 
 
-def exported(
-    to: str,
-    markers: PlacedMarkers | None,
-    columns: tuple[str, ...] = (),
-    options: FormatOptions = NO_TIMES,
-) -> bytes:
+def exported(to: str, markers: PlacedMarkers | None, *columns: str) -> bytes:
     frames, part = session()
     pieces = (
         (frames.slice_rows(a, a + 20), {"part": part[a : a + 20]}) for a in range(0, ROWS, 20)
     )
-    return b"".join(
-        export(
-            make_one_pass_frame_source(pieces),
-            make_array(),
-            {},
-            to,
-            Slice(columns=columns),
-            None,
-            markers,
-            options=options,
-        )
-    )
+    content = make_one_pass_frame_source(pieces)
+    return b"".join(export(content, make_array(), {}, to, Slice(columns=columns), markers=markers))
 
 
-def read(content: bytes, to: str) -> pa.Table:
-    if to == "parquet":
-        return pq.read_table(io.BytesIO(content))
-    return pa.ipc.open_file(content).read_all()
-
-
-@pytest.mark.parametrize("to", ["parquet", "arrow"])
-def test_the_column_is_the_last_one_and_all_others_keep_their_bits(to: str) -> None:
+@pytest.mark.parametrize("to", TABLES)
+def test_the_column_is_the_last_and_the_others_stay(to: str) -> None:
     table = read(exported(to, placed(at(3 * PERIOD_NS, labels=["stone"]))), to)
     plain = read(exported(to, None), to)
     assert table.column_names == [*plain.column_names, "marker"]
     assert table.drop_columns(["marker"]).equals(plain)
     labels = table.column("marker").to_pylist()
     assert labels[3] == "stone"
-    assert labels.count(None) == ROWS - 1
-
-
-def test_in_csv_the_other_columns_keep_their_bytes() -> None:
-    whole = FormatOptions(times=False, about=False)
-    marked = placed(at(3 * PERIOD_NS, labels=["stone"]))
-    lines = exported("csv", marked, options=whole).splitlines()
-    plain = exported("csv", None, options=whole).splitlines()
-    ends = [line.removeprefix(other) for line, other in zip(lines, plain, strict=True)]
-    assert ends == [b',"marker"', *[b',"stone"' if row == 3 else b"," for row in range(ROWS)]]
+    assert labels.count("" if to == "csv" else None) == ROWS - 1
 
 
 @pytest.mark.parametrize("to", TABLES)
 def test_without_any_mark_the_column_is_there_and_empty(to: str) -> None:
-    content = exported(to, PlacedMarkers(()), ("marker",))
+    content = exported(to, PlacedMarkers(()), "marker")
     if to == "csv":
         assert content == b'"marker"\n' + b"\n" * ROWS
     else:
@@ -225,10 +184,10 @@ def test_without_any_mark_the_column_is_there_and_empty(to: str) -> None:
 
 def test_a_column_that_was_not_asked_for_says_how_to_have_it() -> None:
     with pytest.raises(UsageError, match="markers"):
-        exported("arrow", None, ("marker",))
+        exported("arrow", None, "marker")
 
 
-def test_the_notes_say_where_each_mark_is_and_why_one_is_at_no_frame() -> None:
+def test_notes_have_the_frame_of_each_mark_or_the_reason() -> None:
     markers = placed(at(3 * PERIOD_NS, -5 * DISTANCE_MAX_NS, labels=["stone", "early"]))
     metadata = read(exported("arrow", markers), "arrow").schema.metadata
     early, stone = json.loads(metadata[NOTES_KEY])["markers"]

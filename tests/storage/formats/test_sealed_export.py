@@ -38,15 +38,8 @@ SECOND_NS = 1_000_000_000
 PERIOD_NS = SECOND_NS // 10
 UTC_NS = 10**18
 COLUMNS = (
-    "seq",
-    "t_ns",
-    "t_mono_ns",
-    "part",
-    "pressure_raw",
-    "pressure_raw_1",
-    "grf_n",
-    "force_n_0",
-    "phase",
+    *("seq", "t_ns", "t_mono_ns", "part", "pressure_raw", "pressure_raw_1"),
+    *("grf_n", "force_n_0", "phase"),
 )
 
 
@@ -170,7 +163,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("sliced")
 
 
-@settings(max_examples=80)
+@settings(max_examples=40)
 @given(
     parts=st.lists(boots, min_size=1, max_size=3),
     group_ns=st.sampled_from([PERIOD_NS, 7 * PERIOD_NS, SECOND_NS, 60 * SECOND_NS]),
@@ -182,7 +175,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     steps=st.lists(st.sampled_from([0, 0, 1, 3 * SECOND_NS]), max_size=5),
     options=st.sampled_from([{}, {}, {"write_statistics": False}]),
 )
-def test_a_slice_by_statistics_is_the_slice_of_the_whole_table(
+def test_a_slice_by_statistics_is_that_of_the_whole_table(
     folder: Path,
     parts: list[Boot],
     group_ns: int,
@@ -216,7 +209,7 @@ def test_a_slice_by_statistics_is_the_slice_of_the_whole_table(
     assert same(found, of_the_whole(path, frames, extra, part, clock, events)), found
 
 
-def test_why_a_mark_stands_nowhere_is_known_from_the_whole_file(tmp_path: Path) -> None:
+def test_why_a_mark_is_at_no_frame_is_found_in_the_whole_file(tmp_path: Path) -> None:
     """Two streams that no clock was compared with share a row group: it may hold the marker."""
     parts = [Boot(6, at_s * SECOND_NS, UTC_NS, 0, 0) for at_s in (0, 100, 110)]
     frames, extra = recorded(parts)
@@ -257,7 +250,7 @@ def table_of(path: Path, part: Slice) -> pa.Table:
     return pa.ipc.open_file(content).read_all()
 
 
-def test_a_slice_reads_its_own_row_groups_and_columns_and_no_page_besides(tmp_path: Path) -> None:
+def test_a_slice_reads_no_page_but_its_own(tmp_path: Path) -> None:
     path = ten_groups(tmp_path / "s.parquet")
     part = Slice(4.2, 5.1, ("force_n_1",))
     right = table_of(path, part)
@@ -289,34 +282,29 @@ def refused_or(path: Path, part: Slice, right: pa.Table) -> str:
         return "refused"
 
 
-def flips(size: int, headers: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Byte and bit: every bit of what stands before the pages' content, and some everywhere."""
-    everywhere = [(at, 1 << at % 8) for at in range(0, size, 61)]
-    return everywhere + [
-        (at, 1 << bit) for a, b in headers for at in range(a, b) for bit in range(8)
-    ]
-
-
-@pytest.mark.parametrize("name", ["force_n_1", "pressure_raw_0", "phase"])
+@pytest.mark.parametrize("every_bit", [False, pytest.param(True, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("name", ["force_n_1", "phase"])
 def test_a_slice_of_a_file_with_a_flipped_bit_is_refused_or_right(
-    tmp_path: Path, name: str
+    tmp_path: Path, name: str, every_bit: bool
 ) -> None:
-    path = ten_groups(tmp_path / "s.parquet")
-    part = Slice(4.2, 5.1, (name,))
+    path, part = ten_groups(tmp_path / "s.parquet"), Slice(4.2, 5.1, (name,))
     right, whole = table_of(path, part), path.read_bytes()
     begins = [place_of(path, 4, column)[0] for column in ("t_ns", name)]
+    headers = [at for begin in begins for at in range(begin, begin + 48)]
+    flips = [(at, at % 8) for at in (*range(0, len(whole), 211), *headers)]
+    if every_bit:
+        flips = [(at, bit) for at in (*range(len(whole)), *headers) for bit in range(8)]
     found = {}
-    for at, bit in flips(len(whole), [(begin, begin + 48) for begin in begins]):
+    for at, bit in flips:
         content = bytearray(whole)
-        content[at] ^= bit
+        content[at] ^= 1 << bit
         path.write_bytes(content)
         found[at, bit] = refused_or(path, part, right)
-    assert set(found.values()) == {"refused", "right"}, [
-        k for k, v in found.items() if v == "wrong"
-    ]
+    wrong = [place for place, what in found.items() if what == "wrong"]
+    assert (wrong, set(found.values())) == ([], {"refused", "right"})
 
 
-def test_a_page_that_says_it_is_of_another_kind_is_not_left_out(tmp_path: Path) -> None:
+def test_a_page_of_another_kind_is_not_left_out(tmp_path: Path) -> None:
     """Arrow skips what it does not know: a slice would begin at another instant."""
     t_mono_ns = np.arange(30_000) * 1_000_000
     frames = make_frames(30_000, 2, t_mono_ns=t_mono_ns)

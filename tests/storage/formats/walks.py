@@ -13,7 +13,7 @@ from storage.clock.bounds import OffsetRows
 from storage.clock.table import ClockTable, StreamClockFacts
 from storage.formats.export import Export, FrameSource, make_one_pass_frame_source
 from storage.formats.slice import Slice
-from storage.schema import CONTACT_UNKNOWN, Array
+from storage.schema import Array
 from tests.builders.arrays import UTC_NS, make_array, make_tile
 from tests.builders.frames import make_frames, with_columns
 
@@ -81,13 +81,6 @@ def saturated(columns: dict[str, Array], rows: slice) -> dict[str, Array]:
     for name in ("grf_n", "cop_x_m", "cop_y_m"):
         changed[name][rows] = np.nan
     changed["estimate_flags"][rows] |= 1 | 16
-    return changed
-
-
-def unseen(columns: dict[str, Array], rows: slice) -> dict[str, Array]:
-    """The same where nothing is known of contact, either."""
-    changed = saturated(columns, rows)
-    changed["contact"][rows] = CONTACT_UNKNOWN
     return changed
 
 

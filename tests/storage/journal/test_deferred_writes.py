@@ -6,7 +6,7 @@ import threading
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import StorageError
@@ -33,7 +33,7 @@ def later(folder: Path) -> Journal:
     return OPENED[-1]
 
 
-def test_what_is_appended_is_held_and_not_in_the_file_before_it_is_synced(tmp_path: Path) -> None:
+def test_appended_frames_are_in_the_file_after_a_sync(tmp_path: Path) -> None:
     journal = later(tmp_path)
     journal.append_new_frames(part(0, 29))
     (path,) = segments(tmp_path)
@@ -57,14 +57,13 @@ def test_what_waits_is_written_before_anything_is_read(tmp_path: Path) -> None:
     assert [m.seq_first for m in journal.read_overlapping_messages(0, 59)] == [0, 30, 40, 50]
 
 
+@settings(max_examples=40)
 @given(
     st.lists(st.tuples(st.integers(0, 199), st.integers(1, 30)), max_size=12),
     st.lists(st.booleans(), min_size=12, max_size=12),
 )
 def test_files_are_the_same_whenever_they_are_written(
-    tmp_path_factory: pytest.TempPathFactory,
-    parts: list[tuple[int, int]],
-    synced: list[bool],
+    tmp_path_factory: pytest.TempPathFactory, parts: list[tuple[int, int]], synced: list[bool]
 ) -> None:
     at_once, afterwards = tmp_path_factory.mktemp("at_once"), tmp_path_factory.mktemp("afterwards")
     first = Journal(at_once, make_array())
@@ -100,7 +99,7 @@ def test_what_the_disk_refuses_goes_on_waiting(tmp_path: Path, room: int) -> Non
     assert_holds(reopened(tmp_path), set(range(50)))
 
 
-def test_what_was_refused_and_disowned_is_not_held_and_can_come_again(tmp_path: Path) -> None:
+def test_refused_and_invalidated_frames_can_come_again(tmp_path: Path) -> None:
     journal = later(tmp_path)
     journal.append_new_frames(part(0, 9))
     journal.sync()
@@ -116,9 +115,7 @@ def test_what_was_refused_and_disowned_is_not_held_and_can_come_again(tmp_path: 
     assert_holds(reopened(tmp_path), set(range(20)))
 
 
-def test_who_appends_does_not_wait_for_a_disk_that_is_busy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_busy_disk_blocks_no_append(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     journal = later(tmp_path)
     journal.append_new_frames(part(0, 9))
     begun, may_go_on = threading.Event(), threading.Event()
@@ -140,9 +137,7 @@ def test_who_appends_does_not_wait_for_a_disk_that_is_busy(
     assert_holds(reopened(tmp_path), set(range(20)))
 
 
-def test_more_than_a_bound_does_not_wait_in_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_waiting_bytes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(segment_writer, "_MAX_WAITING_BYTES", 1)
     journal = later(tmp_path)
     journal.append_new_frames(part(0, 9))
@@ -154,9 +149,7 @@ def test_more_than_a_bound_does_not_wait_in_memory(
     at_once.close()
 
 
-def test_a_segment_that_was_closed_by_another_thread_does_not_stop_who_reads(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_closed_segment_stops_no_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     journal = later(tmp_path)
     journal.append_new_frames(part(0, 29))
     write = SegmentWriter.write_waiting

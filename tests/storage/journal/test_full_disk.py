@@ -29,9 +29,7 @@ from tests.storage.journal.journals import (
 
 
 @pytest.mark.parametrize("short", [1, 500, 2000])
-def test_a_full_disk_holds_nothing_of_the_batch_and_goes_on_when_there_is_room(
-    tmp_path: Path, short: int
-) -> None:
+def test_a_full_disk_stores_nothing_of_the_batch(tmp_path: Path, short: int) -> None:
     journal = filled(tmp_path, (0, 9))
     (path,) = segments(tmp_path)
     needed = len(encode_frames(part(10, 39), SCHEMA))
@@ -51,9 +49,7 @@ def test_a_full_disk_holds_nothing_of_the_batch_and_goes_on_when_there_is_room(
 
 
 @pytest.mark.parametrize("room", [0, 100, HEADER - 1, HEADER, HEADER + 500])
-def test_a_disk_that_is_full_from_the_beginning_leaves_nothing_that_is_in_the_way(
-    tmp_path: Path, room: int
-) -> None:
+def test_a_disk_full_from_the_beginning_leaves_nothing(tmp_path: Path, room: int) -> None:
     journal = begun(tmp_path)
     for _ in range(2):
         with pytest.raises(StorageError), disk_with_room_for(room):
@@ -65,9 +61,7 @@ def test_a_disk_that_is_full_from_the_beginning_leaves_nothing_that_is_in_the_wa
     assert_holds(reopened(tmp_path), set(range(60)))
 
 
-def test_a_disk_that_neither_takes_nor_gives_back_leaves_all_whole_messages(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_half_batch_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A write that stops halfway and cannot be taken back: the next begins another segment."""
     journal = filled(tmp_path, (0, 9))
     whole = segment_writer.write_all_or_none
@@ -90,11 +84,11 @@ def test_a_disk_that_neither_takes_nor_gives_back_leaves_all_whole_messages(
 
 
 @pytest.mark.parametrize("written", [0, 1, 2])
-def test_a_disk_that_fills_between_the_gaps_of_a_batch_holds_what_was_written_and_no_more(
+def test_a_disk_that_fills_within_a_batch_stores_what_was_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int
 ) -> None:
     """A batch that fills three gaps is three writes."""
-    journal, held = filled(tmp_path, (5, 9), (15, 19)), {*range(5, 10), *range(15, 20)}
+    journal, stored = filled(tmp_path, (5, 9), (15, 19)), {*range(5, 10), *range(15, 20)}
     writes = itertools.count(1)  # of each gap a header, a batch and a record
     full = failing_if(
         lambda *_: next(writes) > 3 * written, segment_writer.write_all_or_none, *NO_SPACE
@@ -103,17 +97,15 @@ def test_a_disk_that_fills_between_the_gaps_of_a_batch_holds_what_was_written_an
         patch.setattr(segment_writer, "write_all_or_none", full)
         with pytest.raises(StorageError):
             journal.append_new_frames(part(0, 29))
-    assert_holds(journal, held | set(range(10 * written)))
-    assert members(journal.append_new_frames(part(0, 29))) == set(range(30)) - held - set(
+    assert_holds(journal, stored | set(range(10 * written)))
+    assert members(journal.append_new_frames(part(0, 29))) == set(range(30)) - stored - set(
         range(10 * written)
     )
     journal.close()
     assert_holds(reopened(tmp_path), set(range(30)))
 
 
-def test_appending_never_waits_for_the_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_appending_does_not_sync(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     synced: list[int] = []
     real = os.fsync
 
@@ -133,9 +125,7 @@ def test_appending_never_waits_for_the_disk(
     assert len(synced) == 3 * 9 + 2 + 1
 
 
-def test_a_disk_that_does_not_sync_is_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_sync_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     journal = filled(tmp_path, (0, 9))
     with monkeypatch.context() as patch:
         patch.setattr("os.fsync", refusing(*IO_ERROR))
@@ -153,9 +143,7 @@ def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path: Path) -> None
         begun(tmp_path / "file" / "journal")
 
 
-def test_what_a_full_disk_has_no_room_to_set_aside_leaves_nothing_however_often_it_is_tried(
-    tmp_path: Path,
-) -> None:
+def test_recovery_on_a_full_disk_leaves_nothing(tmp_path: Path) -> None:
     filled(tmp_path, (0, 9)).close()
     (path,) = segments(tmp_path)
     path.write_bytes(path.read_bytes() + bytes(5000))

@@ -21,21 +21,21 @@ from tests.builders.frames import make_frames, with_columns
 def test_messages_of_any_size_in_any_order_are_judged_without_a_look_at_the_disk(
     sizes: list[int], random: Random
 ) -> None:
-    held = Intervals()
+    stored = Intervals()
     instants = TimeIndex(lambda seq, is_upper: pytest.fail(f"{seq} was looked up"))
     spans = list(pairwise(accumulate(sizes, initial=0)))
     random.shuffle(spans)
     for begin, end in spans:
         frames = make_frames(np.arange(begin, end))
-        before, after = held.nearest_outside(begin, end - 1)
-        assert instants.describe_time_conflict(frames, held) == ""
+        before, after = stored.nearest_outside(begin, end - 1)
+        assert instants.describe_time_conflict(frames, stored) == ""
         for neighbour, side in ((before, -1), (after, 1)):
             if neighbour is not None:
                 leap_ns = (neighbour - begin + side * len(spans) * 5) * PERIOD_NS
                 moved = with_columns(frames, t_ns=frames.t_ns + leap_ns)
-                assert "time runs back" in instants.describe_time_conflict(moved, held)
-        held.add(begin, end - 1)
-        instants.register_message(EncodedBatch.from_frames_and_payload(frames, b""), held)
+                assert "time runs back" in instants.describe_time_conflict(moved, stored)
+        stored.add(begin, end - 1)
+        instants.register_message(EncodedBatch.from_frames_and_payload(frames, b""), stored)
 
 
 def test_when_something_is_not_held_any_more_the_disk_is_asked_once() -> None:
@@ -45,9 +45,9 @@ def test_when_something_is_not_held_any_more_the_disk_is_asked_once() -> None:
         asked.append((seq, is_upper))
         return int(make_frames([seq]).t_ns[0])
 
-    instants, held = TimeIndex(look_up), Intervals([(0, 9)])
-    instants.register_message(EncodedBatch.from_frames_and_payload(make_frames(10), b""), held)
+    instants, stored = TimeIndex(look_up), Intervals([(0, 9)])
+    instants.register_message(EncodedBatch.from_frames_and_payload(make_frames(10), b""), stored)
     instants.clear()
     for _ in range(3):
-        assert instants.describe_time_conflict(make_frames(np.arange(10, 12)), held) == ""
+        assert instants.describe_time_conflict(make_frames(np.arange(10, 12)), stored) == ""
     assert asked == [(9, True)]

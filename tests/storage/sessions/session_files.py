@@ -10,9 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from devices.errors import FileFormatError
-from devices.frames import (
-    FrameBatch,
-)
+from devices.frames import FrameBatch
 from storage.parquet_hash import (
     FILE_HASH_KEY,
     FOOTER_HASH_KEY,

@@ -28,20 +28,12 @@ from storage.sessions.folder import (
 from tests.storage.faulty_disk import NO_SPACE, failing_if, refusing
 
 ID = "20200131T235959Z-0a1b2c"
-BOOT = "f" * 32
+STREAM_ID = "f" * 32
 
 BAD_IDS = [
     *("", ".", "..", "../x", "../" + ID, "/" + ID, "/etc/passwd", ID + "/..", ID + "/", "a/" + ID),
-    *(
-        ID + "\0",
-        "\0" + ID,
-        ID + "\n",
-        " " + ID,
-        ID + "0",
-        ID[:-1],
-        ID.upper(),
-        ID.replace("Z", ""),
-    ),
+    *(ID + "\0", "\0" + ID, ID + "\n", " " + ID, ID + "0", ID[:-1], ID.upper()),
+    ID.replace("Z", ""),
     *("\u0662" + ID[1:], ID[:9] + "\uff12" + ID[10:], "%2e%2e%2fx", "x" * 100_000),
 ]
 
@@ -53,7 +45,7 @@ def session(session_id: str = ID, **changes: Any) -> Session:
         "node": "bench",
         "state": "recording",
         "started_t_ns": 10**18,
-        "parts": (Part(stream_id=BOOT, seq_first=0),),
+        "parts": (Part(stream_id=STREAM_ID, seq_first=0),),
         "scene": "mud",
     }
     return Session(**content | changes)
@@ -64,7 +56,7 @@ def whole() -> Session:
         state="sealed",
         stopped_t_ns=10**18 + 1,
         parts=(
-            Part(stream_id=BOOT, seq_first=5, seq_last=9),
+            Part(stream_id=STREAM_ID, seq_first=5, seq_last=9),
             Part(stream_id="0" * 32, seq_first=0, seq_last=2**62),
         ),
         subject='Ärmel \'n "Söhne"\n\u2028',
@@ -72,17 +64,19 @@ def whole() -> Session:
         tags=("a", "b", ""),
         markers=(Marker(id="e1", label="slip", t_ns=10**18 + 7),),
         clock=(
-            ClockOffset(stream_id=BOOT, t_mono_ns=1, server_minus_node_ns=-2, uncertainty_ns=3),
+            ClockOffset(
+                stream_id=STREAM_ID, t_mono_ns=1, server_minus_node_ns=-2, uncertainty_ns=3
+            ),
         ),
         missed_slots_at_start=4,
-        max_lost_tail_frames={BOOT: 17},
+        max_lost_tail_frames={STREAM_ID: 17},
         problem="none",
         ledger=Ledger(
             complete=False,
             lossy=True,
             parts=(
                 PartLedger(
-                    stream_id=BOOT,
+                    stream_id=STREAM_ID,
                     seq_first=5,
                     seq_last=9,
                     recorded=3,
@@ -117,9 +111,9 @@ def test_what_is_no_id_is_no_session_and_no_path(tmp_path: Path, bad: str) -> No
     assert list(tmp_path.iterdir()) == []
 
 
-@settings(max_examples=300)
+@settings(max_examples=60)
 @given(st.one_of(st.text(max_size=40), st.from_regex(r"\A\d{8}T\d{6}Z-[0-9a-f]{6}\Z")))
-def test_a_path_is_directly_in_the_folder_and_its_name_is_plain(text: str) -> None:
+def test_a_sessions_path_is_directly_in_the_folder(text: str) -> None:
     try:
         path = SessionsFolder(Path("/data/sessions")).get_path(text)
     except UnknownError:
@@ -204,18 +198,6 @@ def test_a_session_that_is_not_there_is_unknown(tmp_path: Path) -> None:
         folder.load(ID)
 
 
-def test_a_file_that_is_cut_off_anywhere_is_damaged(tmp_path: Path) -> None:
-    folder = SessionsFolder(tmp_path)
-    folder.save(session())
-    path = folder.get_path(ID) / "session.json"
-    content = path.read_bytes()
-    for length in range(len(content)):
-        path.write_bytes(content[:length])
-        with pytest.raises(FileFormatError) as caught:
-            folder.load(ID)
-        assert caught.value.where == str(path)
-
-
 @pytest.mark.parametrize(
     ("old", "new"),
     [
@@ -226,9 +208,7 @@ def test_a_file_that_is_cut_off_anywhere_is_damaged(tmp_path: Path) -> None:
         (b"{", b'{"further": 1,'),
     ],
 )
-def test_what_is_not_a_session_is_refused_with_its_path(
-    tmp_path: Path, old: bytes, new: bytes
-) -> None:
+def test_what_is_no_session_is_refused_by_path(tmp_path: Path, old: bytes, new: bytes) -> None:
     folder = SessionsFolder(tmp_path)
     folder.save(session())
     path = folder.get_path(ID) / "session.json"
@@ -246,15 +226,7 @@ def test_what_is_not_a_session_is_refused_with_its_path(
     assert caught.value.where == str(path)
 
 
-def test_a_folder_in_place_of_the_file_is_damage_too(tmp_path: Path) -> None:
-    (tmp_path / ID / "session.json").mkdir(parents=True)
-    with pytest.raises(DamagedFileError, match="not a file"):
-        SessionsFolder(tmp_path).load(ID)
-
-
-def test_a_session_that_cannot_be_written_stays_what_it_was(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_save_keeps_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = SessionsFolder(tmp_path)
     folder.save(session())
     monkeypatch.setattr("os.fsync", refusing(*NO_SPACE))
@@ -271,7 +243,7 @@ def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("sync", range(4))
-def test_a_session_that_a_full_disk_did_not_take_leaves_no_folder(
+def test_a_failed_first_save_leaves_no_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sync: int
 ) -> None:
     real, calls = os.fsync, itertools.count()
@@ -289,19 +261,7 @@ def test_a_session_that_a_full_disk_did_not_take_leaves_no_folder(
     assert folder.load(ID) == session()
 
 
-def test_a_session_that_was_there_before_stays_when_the_disk_is_full(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = SessionsFolder(tmp_path)
-    folder.save(session())
-    with monkeypatch.context() as context:
-        context.setattr(os, "fsync", refusing(*NO_SPACE))
-        with pytest.raises(StorageError):
-            folder.save(session(name="another"))
-    assert folder.load(ID) == session()
-
-
-def test_a_folder_in_which_nothing_was_written_whole_is_no_session(tmp_path: Path) -> None:
+def test_a_folder_without_a_whole_file_is_no_session(tmp_path: Path) -> None:
     # As a kill leaves it between making the folder and writing into it.
     folder = SessionsFolder(tmp_path)
     (tmp_path / ID).mkdir()

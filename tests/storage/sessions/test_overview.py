@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 from pathlib import Path
 
-import numpy as np
 import pyarrow as pa
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -40,9 +39,7 @@ def test_every_level_is_read_as_it_was_written(tmp_path: Path) -> None:
             assert overview.estimate_bin_count(number, None, None) == len(level["part"])
 
 
-def test_no_thread_of_arrow_reads_through_python(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_arrow_reads_without_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # It would abort a process that ends meanwhile.
     levels, _ = content(1000)
     write_overview(tmp_path / "overview.arrow", levels, tile_count=TILES, frames_sha256=HASH)
@@ -106,15 +103,3 @@ def test_another_file_is_refused_and_none_is_none(tmp_path: Path) -> None:
         OverviewReader(pa.BufferReader(sink.getvalue()), where="here")
     with pytest.raises(FileNotFoundError):
         open_overview(tmp_path / "overview.arrow")
-
-
-def test_extremes_are_those_of_the_frames() -> None:
-    columns = frames(50_000)
-    levels = gathered(columns).finish()
-    written = encode_overview(levels, tile_count=TILES, frames_sha256=HASH)
-    with OverviewReader(pa.BufferReader(written), where="here") as overview:
-        for level in range(overview.index.level_count):
-            bins = overview.read_bins(level, None, None)
-            assert np.nanmax(bins["grf_n_max"]) == np.nanmax(columns["grf_n"])
-            assert np.nanmin(bins["force_n_0_min"]) == columns["force_n"][:, 0].min()
-            assert bins["frames"].sum() == 50_000

@@ -1,4 +1,4 @@
-"""Bins of frames at every zoom: exact, whatever the pieces, and never over a part's end."""
+"""Bins of frames at each zoom: exact in any pieces, within a part, bounded in a preview."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.frames import NOT_READ
+from storage.schema import Array
 from storage.sessions.pyramid import (
     BINS_PER_COARSER_BIN,
     CONTACT_ABSENT,
@@ -20,11 +21,14 @@ from storage.sessions.pyramid import (
     FRAMES_PER_FINEST_BIN,
     MAX_COARSEST_BINS,
     Bins,
+    PreviewBins,
     PyramidBuilder,
     bin_column_types,
     build_levels,
+    make_single_frame_bins,
     merge_bins,
     required_frame_columns,
+    select_and_downsample_bins,
 )
 
 TILES = 2
@@ -80,7 +84,7 @@ def same(one: Bins, other: Bins) -> None:
     cuts=st.sets(st.integers(0, 300)),
     seed=st.integers(0, 9),
 )
-def test_however_frames_are_cut_the_bins_are_those_worked_out_one_by_one(
+def test_bins_of_any_pieces_are_those_computed_one_by_one(
     parts: list[int], cuts: set[int], seed: int
 ) -> None:
     n = sum(parts)
@@ -139,7 +143,7 @@ def check(found: Bins, at: int, some: dict[str, Any], before: Any, part: int) ->
         np.testing.assert_array_equal(found[name][at], value, err_msg=name)
 
 
-def test_each_level_has_the_extremes_of_the_frames_whatever_is_in_between() -> None:
+def test_each_level_has_the_extremes_of_the_frames() -> None:
     columns = frames(
         FRAMES_PER_FINEST_BIN * MAX_COARSEST_BINS * 3,
         parts=(
@@ -161,14 +165,14 @@ def test_each_level_has_the_extremes_of_the_frames_whatever_is_in_between() -> N
     same(levels[1], merge_bins(finest, BINS_PER_COARSER_BIN))
 
 
-def test_parts_of_a_bin_each_do_not_go_on_for_ever() -> None:
+def test_levels_end_where_parts_have_one_bin_each() -> None:
     columns = frames(MAX_COARSEST_BINS + 10, parts=(1,) * (MAX_COARSEST_BINS + 10))
     finest = gathered(columns).get_finest_level()
     assert finest is not None
     assert [len(level["part"]) for level in build_levels(finest)] == [MAX_COARSEST_BINS + 10]
 
 
-def test_frames_without_estimates_have_their_counts_and_what_was_not_read_is_no_extreme() -> None:
+def test_unread_counts_are_no_extremes() -> None:
     n = 100
     columns = {
         name: values
@@ -206,3 +210,78 @@ def test_every_column_of_a_bin_has_its_type(estimated: bool) -> None:
     assert found is not None
     for name, type_ in bin_column_types(TILES, has_estimates=estimated).items():
         assert np.can_cast(found[name].dtype, type_, casting="same_kind"), name
+
+
+# --- preview --------------------------------------------------------------------------------------
+
+
+def raw_frames(first: int, n: int, part: int = 0) -> dict[str, Array]:
+    """Raw raw_frames of two tiles, a peak in one of them every 997 raw_frames."""
+    seq = np.arange(first, first + n, dtype=np.uint64)
+    pressure_raw = np.stack([500 - seq % 7, np.where(seq % 997 == 0, 300, 500)], axis=1)
+    return {
+        "seq": seq,
+        "t_ns": seq.astype(np.int64) * 2_000_000 + part * 10**12,
+        "tile_flags": np.zeros((n, 2), np.uint8),
+        "frame_flags": np.zeros(n, np.uint8),
+        "pressure_raw": pressure_raw.astype(np.uint16),
+        "part": np.full(n, part, np.uint16),
+    }
+
+
+@pytest.mark.parametrize("pieces", [(1500,), (64, 3, 7)])
+def test_a_longer_preview_is_coarser_and_keeps_extremes(pieces: tuple[int, ...]) -> None:
+    so_far = PreviewBins(max_bins=500)
+    at, i, sizes = 0, 0, set()
+    while at < 12_000:
+        n = pieces[i % len(pieces)]
+        so_far.add_frames(raw_frames(at, n))
+        at, i = at + n, i + 1
+        sizes.add(so_far.frames_in_bin)
+    bins = so_far.get_bins()
+    assert bins is not None
+    assert sizes >= {4, 16, 64}
+    # At most so many, and what was not merged yet.
+    assert len(bins["part"]) <= 500 + 1024 // 64 + 1
+    assert so_far.frame_count == bins["frames"].sum() == at
+    assert bins["t_first_ns"][0] == 0
+    assert bins["t_last_ns"][-1] == (at - 1) * 2_000_000
+    whole = make_single_frame_bins(raw_frames(0, at))
+    for tile in (0, 1):
+        assert bins[f"pressure_raw_{tile}_min"].min() == whole[f"pressure_raw_{tile}_min"].min()
+        assert bins[f"pressure_raw_{tile}_max"].max() == whole[f"pressure_raw_{tile}_max"].max()
+    for row in range(len(bins["part"])):
+        begin, end = (int(bins[f"t_{which}_ns"][row]) // 2_000_000 for which in ("first", "last"))
+        assert bins["frames"][row] == end - begin + 1
+        assert (bins["pressure_raw_1_min"][row] == 300) == any(
+            s % 997 == 0 for s in range(begin, end + 1)
+        )
+
+
+def test_preview_bins_end_with_their_part_and_count_lost_frames() -> None:
+    so_far = PreviewBins(max_bins=100)
+    so_far.add_frames(raw_frames(0, 1030))
+    so_far.add_frames(raw_frames(1040, 1030))
+    so_far.add_frames(raw_frames(0, 2000, part=1))
+    bins = so_far.get_bins()
+    assert bins is not None
+    assert bins["missing"].sum() == 10
+    assert bins["frames"][bins["part"] == 0].sum() == 2060
+    assert bins["frames"][bins["part"] == 1].sum() == 2000
+    assert (np.diff(bins["t_first_ns"]) > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("begin_ns", "end_ns", "most", "expected"),
+    [
+        (None, None, 1000, (1000, 1)),
+        (None, None, 999, (250, 4)),
+        (400_000_000, None, 900, (800, 1)),
+    ],
+)
+def test_bins_of_a_time_are_merged_until_few_enough(
+    begin_ns: int | None, end_ns: int | None, most: int, expected: tuple[int, int]
+) -> None:
+    bins: Any = make_single_frame_bins(raw_frames(0, 1000))
+    found, count = select_and_downsample_bins(bins, begin_ns, end_ns, most)
+    assert (len(found["part"]), count) == expected

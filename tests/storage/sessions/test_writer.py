@@ -1,9 +1,8 @@
-"""What is in the file of a sealed session, column by column."""
+"""The file of a sealed session: columns and groups, when it appears, what a failure leaves."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,18 +14,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.frames import (
-    NO_SERVO_AGE,
-    NO_SERVO_COUNTS,
-    NOT_READ,
-    FrameBatch,
-)
+from devices.errors import FileFormatError
+from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, NOT_READ, FrameBatch
+from storage.durable_files import remove_dead_process_temporaries
 from storage.schema import CONTACT_UNKNOWN
 from storage.sessions import reader
 from storage.sessions.reader import SealedFileReader
 from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import make_array
 from tests.builders.frames import any_frames, assert_same_bits
+from tests.storage.faulty_disk import disk_with_room_for
 from tests.storage.sessions.session_files import frames, read, write
 
 
@@ -76,29 +73,13 @@ def test_the_columns_are_flat_and_those_of_the_contract_in_order(tmp_path: Path)
     assert types["reference_force_n"] == "float"
 
 
-def test_units_survive_the_file(tmp_path: Path) -> None:
-    schema = pq.read_schema(write(tmp_path / "s.parquet", frames(5)))
-    said = {field.name: field.metadata or {} for field in schema}
-    assert all(metadata[b"unit"] and metadata[b"description"] for metadata in said.values())
-    assert said["t_ns"][b"unit"] == b"ns"
-    assert said["pressure_raw_1"][b"unit"] == b"counts"
-
-
 DELTA = {
-    "seq",
-    "t_mono_ns",
-    "t_ns",
-    "pressure_raw_0",
-    "pressure_raw_1",
-    "servo_counts",
-    "servo_age_us",
-    "part",
+    *("seq", "t_mono_ns", "t_ns", "pressure_raw_0", "pressure_raw_1", "servo_counts"),
+    *("servo_age_us", "part"),
 }
 
 
-def test_integers_are_delta_encoded_or_have_a_dictionary_and_only_floats_are_split_into_their_bytes(
-    tmp_path: Path,
-) -> None:
+def test_integers_are_delta_encoded_or_in_dictionaries_floats_split(tmp_path: Path) -> None:
     path = tmp_path / "s.parquet"
     write(
         path,
@@ -130,22 +111,7 @@ def test_integers_are_delta_encoded_or_have_a_dictionary_and_only_floats_are_spl
     assert len({encoding for each in expected.values() for encoding in each}) == 3
 
 
-def as_noisy_integers_were_split(schema: pa.Schema) -> dict[str, Any]:
-    steady = {"servo_counts", "part"}
-    return {
-        "compression": "zstd",
-        "use_dictionary": False,
-        "write_page_checksum": True,
-        "column_encoding": {
-            field.name: "DELTA_BINARY_PACKED"
-            if field.type in (pa.int64(), pa.uint64()) or field.name in steady
-            else "BYTE_STREAM_SPLIT"
-            for field in schema
-        },
-    }
-
-
-def as_all_integers_were_delta_encoded(schema: pa.Schema) -> dict[str, Any]:
+def delta_encoded(schema: pa.Schema) -> dict[str, Any]:
     floats = [pa.types.is_floating(field.type) for field in schema]
     names = ["BYTE_STREAM_SPLIT" if is_float else "DELTA_BINARY_PACKED" for is_float in floats]
     return {
@@ -156,16 +122,9 @@ def as_all_integers_were_delta_encoded(schema: pa.Schema) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize(
-    "older_options", [as_all_integers_were_delta_encoded, as_noisy_integers_were_split]
-)
-def test_a_file_with_the_encodings_of_an_older_version_is_read_as_ever(
-    older_options: Callable[[pa.Schema], dict[str, Any]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_older_encodings_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = write(tmp_path / "now.parquet", frames(500))
-    monkeypatch.setattr("storage.sessions.writer.parquet_options", older_options)
+    monkeypatch.setattr("storage.sessions.writer.parquet_options", delta_encoded)
     before = write(tmp_path / "before.parquet", frames(500))
     with SealedFileReader(now) as one, SealedFileReader(before) as other:
         assert_same_bits(one.read_frames(), other.read_frames())
@@ -200,7 +159,7 @@ def test_a_quiet_hour_is_small(tmp_path: Path) -> None:
     assert write(tmp_path / "s.parquet", quiet).stat().st_size < 8 * rows
 
 
-def test_what_is_not_known_is_null_in_the_file_and_what_it_was_in_memory(tmp_path: Path) -> None:
+def test_unknown_values_are_null_in_the_file_only(tmp_path: Path) -> None:
     batch = replace(
         frames(4),
         pressure_raw=np.array([[300, NOT_READ]] * 4, dtype=np.uint16),
@@ -242,9 +201,7 @@ def test_what_is_always_known_cannot_be_null(tmp_path: Path) -> None:
     }
 
 
-def test_estimates_are_kept_in_single_truth_in_double_precision_and_notes_as_text(
-    tmp_path: Path,
-) -> None:
+def test_estimates_are_single_truth_is_double_precision(tmp_path: Path) -> None:
     third = np.full(3, 1 / 3)
     path = write(
         tmp_path / "s.parquet",
@@ -269,7 +226,7 @@ def test_estimates_are_kept_in_single_truth_in_double_precision_and_notes_as_tex
     assert extra["estimate_flags"].tolist() == [0, 511, 3]
 
 
-def test_notes_survive_and_may_be_added_before_the_first_group(tmp_path: Path) -> None:
+def test_notes_survive_and_may_be_added_late(tmp_path: Path) -> None:
     path = tmp_path / "s.parquet"
     with SealedFileWriter(path, make_array(), {"seed": 7, "scene": {"name": "mud"}}) as writer:
         writer.append_frames(frames(3), {})
@@ -285,9 +242,7 @@ def test_the_same_session_is_the_same_bytes(tmp_path: Path) -> None:
     assert one.read_bytes() == two.read_bytes()
 
 
-def test_an_integer_that_does_not_fit_its_column_is_an_error_and_not_another_integer(
-    tmp_path: Path,
-) -> None:
+def test_an_integer_too_large_for_its_column_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(pa.ArrowInvalid):
         write(tmp_path / "s.parquet", frames(2), estimate_flags=np.array([1, 65536 + 1]))
     assert list(tmp_path.iterdir()) == []
@@ -313,29 +268,18 @@ def group_seconds(path: Path) -> list[float]:
         ]
 
 
-def test_a_row_group_is_about_a_minute(tmp_path: Path) -> None:
-    # 150 s in pieces of a second
-    path, batch = tmp_path / "s.parquet", frames(3000, period_ns=50_000_000)
+@pytest.mark.parametrize(("period_ns", "rows"), [(50_000_000, 20), (200_000_000, 3000)])
+def test_a_row_group_is_about_a_minute(tmp_path: Path, period_ns: int, rows: int) -> None:
+    """Also of one long batch: who reads it a group at a time would hold all of it at once."""
+    path, batch = tmp_path / "s.parquet", frames(3000, period_ns=period_ns)
     with SealedFileWriter(path, make_array(), {}) as writer:
-        for begin in range(0, 3000, 20):
-            writer.append_frames(batch.slice_rows(begin, begin + 20), {})
-    seconds = group_seconds(path)
-    assert len(seconds) == 3
-    assert all(59.0 <= s <= 62.0 for s in seconds[:-1])
+        for begin in range(0, 3000, rows):
+            writer.append_frames(batch.slice_rows(begin, begin + rows), {})
+    assert all(59.0 <= s <= 62.0 for s in group_seconds(path)[:-1])
     assert_same_bits(read(path), batch)
 
 
-def test_one_long_batch_is_cut_into_row_groups_of_a_minute_too(tmp_path: Path) -> None:
-    # else whoever reads it one group at a time holds all of it at once
-    batch = frames(3000, period_ns=200_000_000)  # ten minutes
-    path = write(tmp_path / "s.parquet", batch)
-    assert all(s <= 62.0 for s in group_seconds(path))
-    assert_same_bits(read(path), batch)
-
-
-def test_row_groups_grow_with_the_session_to_five_minutes_and_no_frame_is_lost(
-    tmp_path: Path,
-) -> None:
+def test_row_groups_grow_to_five_minutes(tmp_path: Path) -> None:
     # a footer costs every reader time for each of them
     batch = frames(10 * 3600, period_ns=1_000_000_000)
     path = write(tmp_path / "s.parquet", batch)
@@ -347,7 +291,7 @@ def test_row_groups_grow_with_the_session_to_five_minutes_and_no_frame_is_lost(
     assert_same_bits(read(path), batch)
 
 
-def test_a_long_row_group_is_read_in_pieces(
+def test_long_row_groups_are_read_in_pieces(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     batch = frames(5000)
@@ -359,9 +303,7 @@ def test_a_long_row_group_is_read_in_pieces(
     assert_same_bits(FrameBatch.concatenate(pieces), batch)
 
 
-def test_a_gap_of_an_hour_is_no_reason_for_a_group_of_its_own_for_every_frame(
-    tmp_path: Path,
-) -> None:
+def test_a_gap_of_an_hour_makes_no_group_of_each_frame(tmp_path: Path) -> None:
     batch = frames(300)
     t_mono_ns = batch.t_mono_ns + np.where(np.arange(300) >= 150, 3_600_000_000_000, 0)
     path = tmp_path / "s.parquet"
@@ -371,3 +313,94 @@ def test_a_gap_of_an_hour_is_no_reason_for_a_group_of_its_own_for_every_frame(
                 replace(batch, t_mono_ns=t_mono_ns).slice_rows(begin, begin + 10), {}
             )
     assert pq.ParquetFile(path).num_row_groups <= 3
+
+
+# --- when it appears ------------------------------------------------------------------------------
+
+
+def names_in(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("is_replaced", [False, True])
+def test_the_file_appears_when_it_is_sealed(tmp_path: Path, is_replaced: bool) -> None:
+    path, batch = tmp_path / "s.parquet", frames(3000, period_ns=50_000_000)
+    old = write(path, frames(5)).read_bytes() if is_replaced else b""
+    with SealedFileWriter(path, make_array(), {}) as writer:
+        for begin in range(0, 3000, 300):
+            writer.append_frames(batch.slice_rows(begin, begin + 300), {})
+            assert (path.read_bytes() if path.exists() else b"") == old
+        (name,) = set(names_in(tmp_path)) - {"s.parquet"}  # the first minute is on the disk
+        assert name.startswith(f".s.parquet.{os.getpid()}.")
+        assert remove_dead_process_temporaries(tmp_path) == []
+    assert names_in(tmp_path) == ["s.parquet"]
+    assert len(read(path)) == 3000
+
+
+def fail(path: Path, batch: FrameBatch | None, error: type[BaseException]) -> None:
+    """Write the batch, if there is one, and then fail within the block."""
+    with SealedFileWriter(path, make_array(), {}) as writer:
+        if batch is not None:
+            writer.append_frames(batch, {})
+        raise error
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+@pytest.mark.parametrize("rows", [0, 3000])
+def test_an_exception_in_the_block_leaves_nothing_behind(
+    tmp_path: Path, error: type[BaseException], rows: int
+) -> None:
+    batch = frames(rows, period_ns=50_000_000) if rows else None
+    with pytest.raises(error):
+        fail(tmp_path / "s.parquet", batch, error)
+    assert names_in(tmp_path) == []
+
+
+def test_a_file_that_is_there_survives_a_failure(tmp_path: Path) -> None:
+    path = write(tmp_path / "s.parquet", frames(5))
+    old = path.read_bytes()
+    with pytest.raises(RuntimeError):
+        fail(path, frames(1300, period_ns=50_000_000), RuntimeError)
+    assert path.read_bytes() == old
+    assert names_in(tmp_path) == ["s.parquet"]
+
+
+def test_a_session_without_frames_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "s.parquet"
+    with (
+        pytest.raises(FileFormatError, match="no frames"),
+        SealedFileWriter(path, make_array(), {}),
+    ):
+        pass
+    assert names_in(tmp_path) == []
+
+
+def test_a_file_is_synced_before_its_name_and_the_folder_after(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, events = tmp_path / "s.parquet", []
+    fsync = os.fsync
+
+    def watched(descriptor: int) -> None:
+        target = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
+        events.append(("folder" if target == tmp_path else "file", path.exists()))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", watched)
+    write(path, frames(5))
+    assert events == [("file", False), ("folder", True)]
+
+
+@pytest.mark.parametrize("room", [0, 100, 9000])
+def test_a_full_disk_is_an_os_error_and_leaves_nothing_behind(tmp_path: Path, room: int) -> None:
+    path, batch = tmp_path / "s.parquet", frames(2000)
+    assert write(tmp_path / "whole.parquet", batch).stat().st_size > 10_000
+    (tmp_path / "whole.parquet").unlink()
+    with pytest.raises(OSError, match=r"[Ff]ile too large|EFBIG"), disk_with_room_for(room):
+        write(path, batch)
+    assert names_in(tmp_path) == []
+
+
+def test_a_folder_that_is_not_there_is_an_os_error(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="missing"):
+        write(tmp_path / "missing" / "s.parquet", frames(5))

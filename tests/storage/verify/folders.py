@@ -24,12 +24,12 @@ from tests.builders.frames import make_frames
 
 ID = "20200101T000000Z-00000a"
 OTHER_ID = "20200101T000000Z-00000b"
-BOOTS = ("a" * 32, "b" * 32)
+STREAM_IDS = ("a" * 32, "b" * 32)
 EVENTS = (Marker(id="e1", label="slip", t_ns=UTC_NS + 5),)
 
 
 def array(boot: int = 0) -> ArrayInfo:
-    return make_array(1, stream_id=BOOTS[boot], utc_offset_ns=UTC_NS + boot)
+    return make_array(1, stream_id=STREAM_IDS[boot], utc_offset_ns=UTC_NS + boot)
 
 
 def frames(first: int, last: int, boot: int = 0) -> FrameBatch:
@@ -37,7 +37,7 @@ def frames(first: int, last: int, boot: int = 0) -> FrameBatch:
 
 
 def journal(data: Path, boot: int, *runs: tuple[int, int], **notes: Any) -> Journal:
-    folder = data / "journal" / "bench" / BOOTS[boot]
+    folder = data / "journal" / "bench" / STREAM_IDS[boot]
     held = Journal(folder, array(boot))
     for first, last in runs:
         for begin in range(first, last + 1, 5):
@@ -56,14 +56,16 @@ def session(session_id: str = ID, **changes: Any) -> Session:
         "started_t_ns": UTC_NS,
         "stopped_t_ns": UTC_NS + 10**9,
         "parts": (
-            Part(stream_id=BOOTS[0], seq_first=10, seq_last=49),
-            Part(stream_id=BOOTS[1], seq_first=0, seq_last=19),
+            Part(stream_id=STREAM_IDS[0], seq_first=10, seq_last=49),
+            Part(stream_id=STREAM_IDS[1], seq_first=0, seq_last=19),
         ),
         "scene": "test",
         "notes": "first try",
         "markers": EVENTS,
         "clock": (
-            ClockOffset(stream_id=BOOTS[0], t_mono_ns=1, server_minus_node_ns=2, uncertainty_ns=3),
+            ClockOffset(
+                stream_id=STREAM_IDS[0], t_mono_ns=1, server_minus_node_ns=2, uncertainty_ns=3
+            ),
         ),
     }
     return Session(**content | changes)
@@ -79,10 +81,10 @@ def sealed(data: Path, session_id: str = ID, **changes: Any) -> Path:
     """A sealed session of two parts, of which frames 20 to 24 of the first are lost."""
     begun = session(session_id, **changes)
     journals = {
-        BOOTS[0]: journal(data, 0, (0, 19), (25, 60)),
-        BOOTS[1]: journal(data, 1, (0, 19)),
+        STREAM_IDS[0]: journal(data, 0, (0, 19), (25, 60)),
+        STREAM_IDS[1]: journal(data, 1, (0, 19)),
     }
-    lost = {BOOTS[0]: Losses({"disk_full": [(20, 24)]})}
+    lost = {STREAM_IDS[0]: Losses({"disk_full": [(20, 24)]})}
     states = {
         stream_id: StreamState(stored=held.stored, lost=lost.get(stream_id, Losses()))
         for stream_id, held in journals.items()

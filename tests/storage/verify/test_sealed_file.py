@@ -25,7 +25,7 @@ from storage.verify.sealed_file import find_ledger_contradictions, verify_sealed
 from tests.builders.arrays import UTC_NS, make_array
 from tests.builders.frames import make_frames
 
-BOOTS = ("a" * 32, "b" * 32)
+STREAM_IDS = ("a" * 32, "b" * 32)
 
 
 def frames(*numbers: int, offset_ns: int = UTC_NS) -> FrameBatch:
@@ -46,7 +46,7 @@ def frames(*numbers: int, offset_ns: int = UTC_NS) -> FrameBatch:
 def counted(first: int, last: int, boot: int = 0, **lost: int) -> PartLedger:
     length = last - first + 1
     return PartLedger(
-        stream_id=BOOTS[boot],
+        stream_id=STREAM_IDS[boot],
         seq_first=first,
         seq_last=last,
         recorded=length - sum(lost.values()),
@@ -58,18 +58,14 @@ def counted(first: int, last: int, boot: int = 0, **lost: int) -> PartLedger:
 def notes_of(*parts: PartLedger) -> dict[str, Any]:
     lossy = any(part.lost for part in parts)
     ledger = Ledger(complete=not lossy, lossy=lossy, parts=parts, missed_slots=0)
-    session_parts = [
-        Part(
-            stream_id=part.stream_id, seq_first=part.seq_first, seq_last=part.seq_last
-        ).model_dump()
-        for part in parts
-    ]
+    facts = {"stream_id", "seq_first", "seq_last"}
+    session_parts = [Part(**part.model_dump(include=facts)).model_dump() for part in parts]
     session = {"id": "20200101T000000Z-000000", "node": "bench", "parts": session_parts}
     return {"ledger": ledger.model_dump(mode="json"), "session": session, "lost": {}}
 
 
 def write(path: Path, notes: dict[str, Any], *parts: FrameBatch) -> Path:
-    with SealedFileWriter(path, make_array(1, stream_id=BOOTS[0]), notes) as writer:
+    with SealedFileWriter(path, make_array(1, stream_id=STREAM_IDS[0]), notes) as writer:
         for number, batch in enumerate(parts):
             if len(batch):
                 writer.append_frames(batch, {"part": np.full(len(batch), number, np.uint16)})
@@ -80,7 +76,7 @@ def walk(path: Path) -> Path:
     """Two parts, 60 frames of 100 and three frames lost."""
     present = [n for n in range(10, 70) if n not in (20, 21, 40)]
     parts = (counted(10, 69, disk_full=3), counted(0, 39, boot=1))
-    lost = {"lost": {BOOTS[0]: {"disk_full": [[20, 21], [40, 40]]}}}
+    lost = {"lost": {STREAM_IDS[0]: {"disk_full": [[20, 21], [40, 40]]}}}
     batches = (frames(*present), frames(*range(40), offset_ns=5))
     return write(path, notes_of(*parts) | lost, *batches)
 
@@ -126,7 +122,7 @@ def test_a_file_of_no_session_is_proven_as_far_as_it_goes(tmp_path: Path) -> Non
     assert "frames 2 to 4 are missing, and nothing says why" in "; ".join(gap.problems)
 
 
-def test_what_is_no_sealed_file_is_refused_and_not_called_damaged(tmp_path: Path) -> None:
+def test_what_is_no_sealed_file_is_refused(tmp_path: Path) -> None:
     foreign = tmp_path / "foreign.parquet"
     pq.write_table(pa.table({"a": [1]}), foreign)
     text = tmp_path / "notes.txt"
@@ -139,7 +135,7 @@ def test_what_is_no_sealed_file_is_refused_and_not_called_damaged(tmp_path: Path
 # --- damage ---------------------------------------------------------------------------------------
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_one_flipped_bit_anywhere_is_found(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
@@ -160,20 +156,14 @@ def test_one_flipped_bit_anywhere_is_found(
 def test_a_file_that_was_cut_anywhere_is_damaged(tmp_path: Path) -> None:
     content = walk(tmp_path / "s.parquet").read_bytes()
     path = tmp_path / "frames.parquet"
-    for size in (*range(0, len(content), 101), len(content) - 1):
+    for size in (*range(0, len(content), 211), len(content) - 1):
         path.write_bytes(content[:size])
         assert verify_sealed_file(path).problems != [], size
-
-
-def test_bytes_behind_its_end_are_damage(tmp_path: Path) -> None:
-    path = walk(tmp_path / "frames.parquet")
-    path.write_bytes(path.read_bytes() + b"\0")
+    path.write_bytes(content + b"\0")
     assert problems(path)
 
 
-def test_a_footer_hash_of_another_footer_is_found_though_the_file_hash_agrees(
-    tmp_path: Path,
-) -> None:
+def test_a_footer_hash_of_another_footer_is_found(tmp_path: Path) -> None:
     # slices of such a file would be refused
     path = walk(tmp_path / "s.parquet")
     before = FOOTER_HASH_KEY + b"\x18\x40"
@@ -192,39 +182,31 @@ def test_a_file_that_another_program_wrote_anew_says_so(tmp_path: Path) -> None:
     assert problems(path) == "it has no hashes: another program has rewritten it"
 
 
-def test_a_row_group_that_is_gone_is_missed(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("slices", "said"),
+    [
+        (
+            [(0, 57)],
+            [
+                "part 1: 0 frames, and the ledger has 40",
+                "part 1: 40 frames are missing (0 to 39), and the ledger accounts for 0",
+            ],
+        ),
+        ([(0, 30), (31, 97)], ["part 0: 56 frames, and the ledger has 57", "and not named lost"]),
+        ([(0, 5), (4, 97)], ["part 0: frame 14 follows frame 14", "58 frames, and the ledger has"]),
+        ([(3, 7), (0, 3), (7, 97)], ["frame 10 follows frame 16"]),
+    ],
+    ids=["a part is gone", "a row is gone", "a row stands twice", "rows are out of order"],
+)
+def test_rows_are_held_against_the_ledger(
+    tmp_path: Path, slices: list[tuple[int, int]], said: list[str]
+) -> None:
     path = walk(tmp_path / "s.parquet")
-    table = pq.read_table(path)
     assert pq.ParquetFile(path).num_row_groups == 2
-    rewritten(path, table.slice(0, 57))
-    found = problems(path)
-    assert "part 1: 0 frames, and the ledger has 40" in found
-    assert "part 1: 40 frames are missing (0 to 39), and the ledger accounts for 0" in found
-
-
-def test_rows_that_were_taken_out_are_missed_and_named(tmp_path: Path) -> None:
-    path = walk(tmp_path / "s.parquet")
     table = pq.read_table(path)
-    rewritten(path, pa.concat_tables([table.slice(0, 30), table.slice(31)]))
+    rewritten(path, pa.concat_tables([table.slice(a, b - a) for a, b in slices]))
     found = problems(path)
-    assert "part 0: 56 frames, and the ledger has 57" in found
-    assert "missing and not named lost" in found
-
-
-def test_a_row_that_stands_twice_is_seen(tmp_path: Path) -> None:
-    path = walk(tmp_path / "s.parquet")
-    table = pq.read_table(path)
-    rewritten(path, pa.concat_tables([table.slice(0, 5), table.slice(4)]))
-    found = problems(path)
-    assert "part 0: frame 14 follows frame 14" in found
-    assert "58 frames, and the ledger has 57" in found
-
-
-def test_frames_in_another_order_are_seen(tmp_path: Path) -> None:
-    path = walk(tmp_path / "s.parquet")
-    table = pq.read_table(path)
-    rewritten(path, pa.concat_tables([table.slice(3, 4), table.slice(0, 3), table.slice(7)]))
-    assert "frame 10 follows frame 16" in problems(path)
+    assert [text for text in said if text not in found] == []
 
 
 def test_a_shifted_time_is_seen(tmp_path: Path) -> None:
@@ -246,9 +228,7 @@ def test_a_shifted_time_is_seen(tmp_path: Path) -> None:
         ({"seq_first": 9, "recorded": 58}, "4 frames are missing"),
     ],
 )
-def test_an_edited_ledger_is_held_against_the_frames(
-    tmp_path: Path, change: dict[str, Any], said: str
-) -> None:
+def test_an_edited_ledger_is_found(tmp_path: Path, change: dict[str, Any], said: str) -> None:
     path = walk(tmp_path / "s.parquet")
     with SealedFileReader(path) as reader:
         notes = json.loads(json.dumps(reader.notes))
@@ -258,19 +238,17 @@ def test_an_edited_ledger_is_held_against_the_frames(
     assert "of other parts than its session" in problems(path) or "seq" not in str(change)
 
 
-def test_numbers_that_are_named_lost_have_to_be_those_that_are_missing(tmp_path: Path) -> None:
+def test_numbers_named_lost_are_those_that_are_missing(tmp_path: Path) -> None:
     path = walk(tmp_path / "s.parquet")
     with SealedFileReader(path) as reader:
         notes = json.loads(json.dumps(reader.notes))
-    notes["lost"] = {BOOTS[0]: {"disk_full": [[20, 20], [40, 41]]}}
+    notes["lost"] = {STREAM_IDS[0]: {"disk_full": [[20, 20], [40, 41]]}}
     rewritten(path, pq.read_table(path), notes)
     assert "frames 21 are missing and not named lost" in problems(path)
 
 
 @pytest.mark.parametrize("notes", [{"ledger": 7}, {"ledger": {}}, {"lost": 3}, {"session": 4}])
-def test_notes_that_are_not_readable_are_a_problem_and_no_crash(
-    tmp_path: Path, notes: dict[str, Any]
-) -> None:
+def test_unreadable_notes_are_a_problem(tmp_path: Path, notes: dict[str, Any]) -> None:
     path = write(tmp_path / "s.parquet", notes_of(counted(0, 2)) | notes, frames(0, 1, 2))
     report = verify_sealed_file(path)
     assert report.problems != []

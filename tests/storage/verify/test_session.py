@@ -1,4 +1,4 @@
-"""A session's folder proves itself: every file of it against every other."""
+"""A session's folder proves itself: every file of it against every other, and damage is named."""
 
 from __future__ import annotations
 
@@ -7,23 +7,26 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
 import pytest
 
 from devices.errors import FileFormatError
 from service.sessions.inputs import SessionInputs
 from service.sessions.sealing import seal_session
-from storage.checksummed_json import write_checksummed_json
-from storage.sessions.folder import Part, Session
+from storage.checksummed_json import verify_and_strip_json_checksum, write_checksummed_json
+from storage.sessions.folder import Part, SessionsFolder
 from storage.sessions.ledger import compute_ledger
 from storage.verify.data_folder import find_verdict, verify_path
 from storage.verify.sealed_file import verify_sealed_file
 from storage.verify.session import SessionReport, verify_session
 from tests.storage.verify.folders import (
-    BOOTS,
+    EVENTS,
     ID,
     OTHER_ID,
+    STREAM_IDS,
     array,
     edited,
+    in_ledger,
     journal,
     keep,
     problems,
@@ -48,7 +51,7 @@ def test_a_whole_session_is_proven_and_nothing_is_touched(tmp_path: Path) -> Non
     }
     assert (content["complete"], content["lossy"], content["id"]) == (False, True, ID)
     assert content["parts"][0] == {
-        "stream_id": BOOTS[0],
+        "stream_id": STREAM_IDS[0],
         "seq_first": 10,
         "seq_last": 49,
         "recorded": 35,
@@ -60,13 +63,11 @@ def test_a_whole_session_is_proven_and_nothing_is_touched(tmp_path: Path) -> Non
 
 
 def test_a_session_without_a_frame_is_whole(tmp_path: Path) -> None:
-    begun = session(parts=(Part(stream_id=BOOTS[0], seq_first=0, seq_last=-1),))
+    begun = session(parts=(Part(stream_id=STREAM_IDS[0], seq_first=0, seq_last=-1),))
     ledger = compute_ledger(begun.parts, {}, is_finished=True)
     folder = keep(tmp_path, begun)
-    keep(
-        tmp_path,
-        seal_session(SessionInputs(begun, array(), {}, None, "none", (), {}), folder, ledger),
-    )
+    inputs = SessionInputs(begun, array(), {}, None, "none", (), {})
+    keep(tmp_path, seal_session(inputs, folder, ledger))
     assert problems(folder) == ""
     (folder / "frames.parquet").write_bytes(b"")
     assert "no frame recorded" in problems(folder)
@@ -74,13 +75,7 @@ def test_a_session_without_a_frame_is_whole(tmp_path: Path) -> None:
 
 def test_a_session_that_was_pulled_is_proven_too(tmp_path: Path) -> None:
     folder = sealed(tmp_path)
-    kept = Session.model_validate(
-        {
-            k: v
-            for k, v in json.loads((folder / "session.json").read_bytes()).items()
-            if k != "check"
-        }
-    )
+    kept = SessionsFolder(folder.parent).load(ID)
     view = kept.model_dump(
         mode="json",
         exclude={"ledger", "markers", "clock", "scene_content", "calibration"},
@@ -135,7 +130,7 @@ def test_a_session_that_waits_is_counted_from_the_journals(tmp_path: Path) -> No
 
 def test_a_session_that_is_recorded_reaches_to_the_newest_frame(tmp_path: Path) -> None:
     journal(tmp_path, 0, (0, 29))
-    parts = (Part(stream_id=BOOTS[0], seq_first=5),)
+    parts = (Part(stream_id=STREAM_IDS[0], seq_first=5),)
     folder = keep(tmp_path, session(state="recording", parts=parts, stopped_t_ns=None))
     report = verify_session(folder)
     assert report.ledger is not None
@@ -150,11 +145,11 @@ def test_a_session_that_is_recorded_reaches_to_the_newest_frame(tmp_path: Path) 
 
 def test_damage_in_a_journal_that_it_needs_is_its_own(tmp_path: Path) -> None:
     journal(tmp_path, 0, (0, 60))
-    (path,) = (tmp_path / "journal" / "bench" / BOOTS[0]).glob("*.arrows")
+    (path,) = (tmp_path / "journal" / "bench" / STREAM_IDS[0]).glob("*.arrows")
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
-    parts = (Part(stream_id=BOOTS[0], seq_first=0, seq_last=60),)
+    parts = (Part(stream_id=STREAM_IDS[0], seq_first=0, seq_last=60),)
     report = verify_session(keep(tmp_path, session(state="pending", parts=parts)))
     assert "do not agree with their checksum" in "; ".join(report.problems)
     assert report.ledger is not None
@@ -201,7 +196,7 @@ def test_a_data_folder_is_all_of_its_sessions_and_journals(tmp_path: Path) -> No
 
 def test_whatever_is_named_is_found(tmp_path: Path) -> None:
     folder = sealed(tmp_path)
-    stream = tmp_path / "journal" / "bench" / BOOTS[0]
+    stream = tmp_path / "journal" / "bench" / STREAM_IDS[0]
     for path in (folder, folder / "session.json", stream, stream / "stream.json", tmp_path):
         assert verify_path(path).to_json_dict()["problems"] == []
     for path in stream.glob("0*"):
@@ -210,3 +205,96 @@ def test_whatever_is_named_is_found(tmp_path: Path) -> None:
     for path in (tmp_path / "none", tmp_path / "empty"):
         with pytest.raises(FileFormatError):
             verify_path(path)
+
+
+# --- damage ---------------------------------------------------------------------------------------
+
+
+FILES = ("session.json", "frames.parquet", "markers.parquet", "clock.parquet")
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_that_is_missing_is_damage(tmp_path: Path, name: str) -> None:
+    folder = sealed(tmp_path)
+    (folder / name).unlink()
+    assert f"{name} is missing" in problems(folder)
+    report = verify_session(folder)
+    assert report.to_json_dict()["id"] == ID
+    assert find_verdict(report) == "damaged"
+
+
+@pytest.mark.parametrize("name", FILES[:3])
+def test_a_file_of_another_session_in_its_place_is_seen(tmp_path: Path, name: str) -> None:
+    one = sealed(tmp_path / "one")
+    two = sealed(tmp_path / "two", OTHER_ID, markers=(EVENTS[0].model_copy(update={"id": "e2"}),))
+    shutil.copy(two / name, one / name)
+    assert problems(one)
+    assert problems(two) == ""
+
+
+def test_a_session_in_another_one_s_folder_is_seen(tmp_path: Path) -> None:
+    folder = sealed(tmp_path)
+    folder.rename(folder.with_name(OTHER_ID))
+    report = verify_path(tmp_path)
+    assert any("lies in the folder of" in said for said in report.to_json_dict()["problems"])
+
+
+def test_a_damaged_or_exchanged_file_is_one_finding(tmp_path: Path) -> None:
+    path = sealed(tmp_path) / "frames.parquet"
+    whole = path.read_bytes()
+    other = (sealed(tmp_path, OTHER_ID) / "frames.parquet").read_bytes()
+    for content in (whole + b"x", whole[:300] + b"x" + whole[301:], other, b"x"):
+        path.write_bytes(content)
+        (problem,) = verify_session(path.parent).problems
+        assert problem.startswith("frames.parquet")
+        assert (f"it is of session {OTHER_ID}" in problem) == (content == other)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (raised("id", OTHER_ID), "says id"),
+        (raised("node", "other"), "says node"),
+        (raised("frames", 54), "says frames 54"),
+        (raised("bytes", 54), "says bytes 54"),
+        (raised("sha256", "0" * 64), "not the file that session.json names"),
+        (raised("sha256", None), "not the file that session.json names"),
+        (raised("duration_s", 3.0), "lasted 3.0 s"),
+        (raised("stopped_t_ns", 5), "says stopped_t_ns"),
+        (raised("calibration_id", "x"), "says calibration_id"),
+        (raised("absolute_scale", "measured"), "says absolute_scale"),
+        (raised("ledger", None), "its ledger is missing"),
+        (raised("markers", []), "other events"),
+        (lambda c: c["clock"][0].update(uncertainty_ns=4), "clock.parquet has other rows"),
+        (in_ledger("recorded", 40), "ledgers of session.json and frames.parquet"),
+        (in_ledger("lost", {}), "ledgers of session.json and frames.parquet"),
+        (in_ledger("pending", 5), "still to come"),
+        (lambda c: c["parts"].pop(), "not of the same parts"),
+        (lambda c: c["parts"][0].update(seq_last=50), "not of the same parts"),
+    ],
+)
+def test_an_edit_with_a_right_checksum_is_found(tmp_path: Path, change: Any, said: str) -> None:
+    folder = sealed(tmp_path)
+    edited(folder, change)
+    assert said in problems(folder)
+
+
+def test_an_edited_note_is_seen_by_the_check_alone(tmp_path: Path) -> None:
+    folder = sealed(tmp_path)
+    path = folder / "session.json"
+    text = path.read_bytes()
+    path.write_bytes(text.replace(b"first try", b"third try"))
+    assert "was changed" in problems(folder)
+    path.write_bytes(verify_and_strip_json_checksum(text, where=""))
+    assert "no hash" in problems(folder)
+
+
+def test_a_damaged_table_beside_it_is_seen(tmp_path: Path) -> None:
+    folder = sealed(tmp_path)
+    for name in ("markers.parquet", "clock.parquet"):
+        whole = (folder / name).read_bytes()
+        (folder / name).write_bytes(whole[:-9])
+        assert name in problems(folder)
+        pq.write_table(pq.read_table(folder / "frames.parquet").select(["seq"]), folder / name)
+        assert name in problems(folder)
+        (folder / name).write_bytes(whole)

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from devices.errors import FileFormatError, UsageError
-from storage.formats.load_trace import read_load_trace
-from storage.formats.reference import ReferenceData, ReferenceOptions, read_reference
-from tests.storage.formats.readers.damaged import count_refused
+from storage.formats.reference import ReferenceOptions
+from tests.storage.formats.readers.reading import count_refused, read
 
 ONE = """BioWare Version 5.2.1.3 Export
 Device:\tPlate A 9287\tPlate A 9287\tPlate A 9287\tPlate A 9287
@@ -57,14 +56,6 @@ FORMS: dict[str, Callable[[str], str | bytes]] = {
 }
 
 
-def read(
-    folder: Path, content: str | bytes, stated: ReferenceOptions | None = None
-) -> ReferenceData:
-    path = folder / "export.txt"
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return read_reference(path, stated or ReferenceOptions())
-
-
 @pytest.mark.parametrize("form", FORMS)
 def test_one_plate_needs_no_option_whatever_the_form(tmp_path: Path, form: str) -> None:
     found = read(tmp_path, FORMS[form](ONE))
@@ -89,7 +80,7 @@ def test_two_plates_are_told_by_their_devices_and_added_up(tmp_path: Path) -> No
     )
 
 
-def test_plates_of_one_name_follow_one_another_or_are_refused(tmp_path: Path) -> None:
+def test_plates_of_one_name_follow_one_another(tmp_path: Path) -> None:
     same = TWO.replace("\tFz\tFz\t|Ft|\tAx\tAy", "\tFz\tFx\tFz\tAx\tAy")
     with pytest.raises(FileFormatError, match="cannot be assigned to devices"):
         read(tmp_path, same.replace("left", "right"), ReferenceOptions({"grf_n": "plate2_fz"}))
@@ -132,9 +123,7 @@ def test_units_are_those_of_the_file(tmp_path: Path) -> None:
         (ONE.replace("(s)\tFx", "(min)\tFx"), "its time is in min"),
     ],
 )
-def test_what_is_no_measurement_is_refused_in_a_sentence(
-    tmp_path: Path, text: str, says: str
-) -> None:
+def test_what_is_no_measurement_is_refused(tmp_path: Path, text: str, says: str) -> None:
     with pytest.raises(FileFormatError, match=says):
         read(tmp_path, text)
 
@@ -145,16 +134,6 @@ def test_a_part_of_a_recording_is_read_and_said(tmp_path: Path) -> None:
     assert found.notes[0] == "it holds 3 of the 4 samples that its head states"
 
 
-def test_a_load_is_pressed_from_it(tmp_path: Path) -> None:
-    path = tmp_path / "export.txt"
-    path.write_text(ONE)
-    found = read_load_trace(path)
-    assert found.fz_n is not None
-    assert found.fz_n.tolist() == [0.0, 90.25, 100.5, 80.0]
-
-
 def test_damaged_texts_are_refused_by_our_own_errors(tmp_path: Path) -> None:
-    assert count_refused(tmp_path / "export.txt", ONE, ReferenceOptions()) > 50
-    assert (
-        count_refused(tmp_path / "export.txt", TWO, ReferenceOptions({"grf_n": "plate2_fz"})) > 50
-    )
+    assert count_refused(tmp_path, ONE) > 50
+    assert count_refused(tmp_path, TWO, ReferenceOptions({"grf_n": "plate2_fz"})) > 50

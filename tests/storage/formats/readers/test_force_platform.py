@@ -9,22 +9,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
+from devices.arrays import Floats
 from devices.errors import FileFormatError, UsageError
 from storage.formats.readers.c3d import C3dFile
 from storage.formats.reference import ReferenceData, ReferenceOptions, read_reference
 from tests.builders.c3d import c3d_bytes, force_plate
+from tests.storage.formats.readers.reading import read_c3d
 
 LOAD_N = np.linspace(0.0, 98.0, 50)
 X_MM, Y_MM = 10.0, 20.0
 """Of the load, in the plate's own axes, of which y and z are turned in the laboratory's."""
 
 
-def channels(kind: int) -> npt.NDArray[np.float64]:
+def channels(kind: int) -> Floats:
     """What a plate of this type measures of `LOAD_N` at (`X_MM`, `Y_MM`) on its surface."""
     nothing = np.zeros(50)
     if kind == 1:  # forces, the centre of pressure itself, free moment
@@ -44,6 +46,11 @@ MORE: dict[int, dict[str, Any]] = {
 }
 
 
+COLUMNS = {"grf_n": "plate1_fz", "cop_x_m": "plate1_cop_x", "cop_y_m": "plate1_cop_y"}
+LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+CORNERS_MM = np.array(
+    [(250.0, 150.0, 0), (-250.0, 150.0, 0), (-250.0, -150.0, 0), (250.0, -150.0, 0)]
+)
 UNITS = {
     1: ["N", "N", "N", "mm", "mm", "Nmm"],
     2: ["N"] * 3 + ["Nmm"] * 3,
@@ -64,17 +71,6 @@ def read(path: Path, stated: ReferenceOptions | None = None) -> ReferenceData:
     return read_reference(path, stated or ReferenceOptions())
 
 
-@pytest.mark.parametrize("kind", MORE)
-def test_plates_of_four_types_say_what_bears_on_them(tmp_path: Path, kind: int) -> None:
-    columns = {"grf_n": "plate1_fz", "cop_x_m": "plate1_cop_x", "cop_y_m": "plate1_cop_y"}
-    volts = ReferenceOptions(columns, {"grf": "N", "cop": "mm"}, "+")
-    found = read(written(tmp_path / "gait.c3d", kind), volts if kind == 4 else ReferenceOptions())
-    np.testing.assert_allclose(found.time_s, np.arange(50) / 1000.0)
-    np.testing.assert_allclose(found.grf_n, LOAD_N, atol=1e-4)
-    assert found.cop_m is not None
-    np.testing.assert_allclose(found.cop_m[1:], [[0.01, -0.02]] * 49, atol=1e-6)
-
-
 def test_a_plate_is_chosen_and_its_axes_turned_by_the_mapping(tmp_path: Path) -> None:
     stated = ReferenceOptions(
         {"grf_n": "plate1_fz", "cop_x_m": "-plate1_cop_y", "cop_y_m": "plate1_cop_x"}
@@ -84,21 +80,17 @@ def test_a_plate_is_chosen_and_its_axes_turned_by_the_mapping(tmp_path: Path) ->
     np.testing.assert_allclose(found.cop_m[1:], [[0.02, 0.01]] * 49, atol=1e-6)
 
 
-def test_a_plate_that_was_not_zeroed_is_said_and_nothing_taken_off(tmp_path: Path) -> None:
-    path = tmp_path / "gait.c3d"
+def test_a_plate_that_was_not_zeroed_is_noted(tmp_path: Path) -> None:
     analog = channels(2)
     analog[:, 2] += 5.0
-    path.write_bytes(c3d_bytes(force_plate(2, 6, ZERO=[1, 2]), analog))
-    found = read(path)
+    found = read_c3d(tmp_path, force_plate(2, 6, ZERO=[1, 2]), analog)
     np.testing.assert_allclose(found.grf_n, LOAD_N + 5.0, atol=1e-4)
     assert "ZERO states frames 1 to 2, in which plates read 24.000" in found.notes[0]
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("kind", [1, 2, 3])
-def test_load_and_reaction_read_alike_and_the_file_is_said_to_hold_which(
-    tmp_path: Path, kind: int, sign: float
-) -> None:
+def test_load_and_reaction_are_read_alike_and_noted(tmp_path: Path, kind: int, sign: float) -> None:
     path, analog = tmp_path / "gait.c3d", channels(kind)
     forces = slice(0, 8) if kind == 3 else [0, 1, 2] if kind == 1 else slice(0, 6)
     analog[:, forces] *= sign
@@ -123,9 +115,7 @@ def test_load_and_reaction_read_alike_and_the_file_is_said_to_hold_which(
         np.concatenate([np.zeros(1000), np.full(500, 300.0), np.full(500, -120.0)]),
     ],
 )
-def test_a_sign_that_the_load_does_not_tell_has_to_be_stated(
-    tmp_path: Path, force_n: npt.NDArray[np.float64]
-) -> None:
+def test_a_sign_that_no_load_tells_has_to_be_stated(tmp_path: Path, force_n: Floats) -> None:
     noise_n = 0.01 * np.random.default_rng(2).normal(size=len(force_n))
     analog = np.zeros((len(force_n), 6))
     analog[:, 2] = force_n + noise_n
@@ -142,9 +132,7 @@ def test_a_spike_of_the_other_sign_is_no_load(tmp_path: Path) -> None:
     analog = np.zeros((5000, 6))
     analog[1000:1600, 2] = -700.0
     analog[3000:3003, 2] = 5000.0
-    path = tmp_path / "gait.c3d"
-    path.write_bytes(c3d_bytes(force_plate(2, 6), analog))
-    assert read(path).grf_n[1200] == 700.0
+    assert read_c3d(tmp_path, force_plate(2, 6), analog).grf_n[1200] == 700.0
 
 
 @pytest.mark.parametrize(
@@ -155,9 +143,7 @@ def test_a_spike_of_the_other_sign_is_no_load(tmp_path: Path) -> None:
         ({"CHANNEL": np.array([[1, 2, 3, 4, 5, 60]])}, "expected 6 of the 6 channels"),
     ],
 )
-def test_what_is_no_plate_is_refused_in_a_sentence(
-    tmp_path: Path, more: dict[str, Any], said: str
-) -> None:
+def test_what_is_no_plate_is_refused(tmp_path: Path, more: dict[str, Any], said: str) -> None:
     with pytest.raises(FileFormatError, match=said):
         read(written(tmp_path / "gait.c3d", **more))
 
@@ -170,29 +156,23 @@ def test_what_is_no_plate_is_refused_in_a_sentence(
         (["N"] * 3 + ["lbin"] * 3, "unit of column 'plate1_cop_x'"),
     ],
 )
-def test_a_unit_that_the_file_does_not_say_has_to_be_stated(
-    tmp_path: Path, units: list[str], said: str
-) -> None:
+def test_a_missing_unit_has_to_be_stated(tmp_path: Path, units: list[str], said: str) -> None:
     content = force_plate(2, 6)
     content["ANALOG"]["UNITS"] = [unit or " " for unit in units]
     path = tmp_path / "gait.c3d"
     path.write_bytes(c3d_bytes(content, channels(2)))
-    columns = {"grf_n": "plate1_fz", "cop_x_m": "plate1_cop_x", "cop_y_m": "plate1_cop_y"}
     with pytest.raises(UsageError, match=said):
-        read(path, ReferenceOptions(columns))
+        read(path, ReferenceOptions(COLUMNS))
     factor, unit = (1.0, "N") if units[0] == "N" else (1e3, "kN")
-    found = read(path, ReferenceOptions(columns, {"grf": unit, "cop": "mm"}, "+"))
+    found = read(path, ReferenceOptions(COLUMNS, {"grf": unit, "cop": "mm"}, "+"))
     np.testing.assert_allclose(found.grf_n, factor * LOAD_N, atol=0.1)
     assert found.cop_m is not None
     np.testing.assert_allclose(found.cop_m[1:], [[0.01, -0.02]] * 49, atol=1e-6)
 
 
 def test_forces_that_a_matrix_makes_of_volts_have_no_unit_of_their_own(tmp_path: Path) -> None:
-    content = force_plate(4, 6, **MORE[4])
-    path = tmp_path / "gait.c3d"
-    path.write_bytes(c3d_bytes(content, channels(4)))
     with pytest.raises(FileFormatError, match="no column 'grf_n'"):
-        read(path)
+        read_c3d(tmp_path, force_plate(4, 6, **MORE[4]), channels(4))
 
 
 def test_of_two_plates_none_is_chosen_for_the_user(tmp_path: Path) -> None:
@@ -224,7 +204,7 @@ def test_what_is_no_c3d_is_refused(tmp_path: Path, content: bytes) -> None:
 
 @settings(max_examples=300, deadline=None)
 @given(at=st.integers(0, 4095), byte=st.integers(0, 255), cut=st.integers(0, 3))
-def test_a_damaged_file_is_read_or_refused_in_a_sentence(
+def test_a_damaged_file_is_read_or_refused_by_our_own_errors(
     tmp_path_factory: pytest.TempPathFactory, at: int, byte: int, cut: int
 ) -> None:
     path = tmp_path_factory.mktemp("damaged") / "gait.c3d"
@@ -246,89 +226,95 @@ def test_a_file_that_was_cut_is_refused(tmp_path: Path) -> None:
 # --- Independent readings -------------------------------------------------------------------------
 
 
-def corners_of(rng: np.random.Generator, *, up: int) -> npt.NDArray[np.float64]:
-    """Return corners (4, 3) in mm of a plate that lies anywhere, this axis of the laboratory up."""
+def axes_of(rng: np.random.Generator, up: int, facing: float, tilt: float) -> Floats:
+    """Return axes of a tilted plate, in rows, with this axis of the laboratory up."""
     angle = rng.uniform(0.0, 2.0 * np.pi)
     across = np.roll(np.eye(3), up - 2, axis=1)  # rows: two level axes, then up
-    x = np.cos(angle) * across[0] + np.sin(angle) * across[1]
-    z = -across[2]
+    x, z = np.cos(angle) * across[0] + np.sin(angle) * across[1], -facing * across[2]
     y = np.cross(z, x)
-    signs = [(1, 1), (-1, 1), (-1, -1), (1, -1)]
-    place = rng.uniform(-500.0, 500.0, 3)
-    return np.array([place + 250.0 * a * x + 150.0 * b * y for a, b in signs])
+    return np.stack([x, np.cos(tilt) * y + np.sin(tilt) * z, np.cos(tilt) * z - np.sin(tilt) * y])
 
 
-@settings(max_examples=60, deadline=None)
+def turn(begin: Floats, end: Floats) -> Floats:
+    """Return the rotation by the smallest angle."""
+    cross = np.cross(begin, end)
+    size = float(np.linalg.norm(cross))
+    vector = cross * np.arctan2(size, begin @ end) / size if size > 0.0 else cross
+    return np.asarray(Rotation.from_rotvec(vector).as_matrix())
+
+
+def in_plane(place: Floats, up: Floats) -> Floats:
+    """Return x and y of a place, the laboratory turned until the plate's normal is its z."""
+    axis = np.where(np.arange(3) == np.argmax(np.abs(up)), np.sign(up), 0.0)
+    return np.asarray(turn(axis, np.array([0.0, 0.0, 1.0])) @ turn(up, axis) @ place)[:2]
+
+
+@settings(max_examples=100, deadline=None)
 @given(
     kind=st.sampled_from([1, 2, 3, 4]),
-    sign=st.sampled_from([1.0, -1.0]),
-    up=st.sampled_from([0, 1, 2]),
-    raised=st.sampled_from([1.0, -1.0]),
+    signs=st.tuples(st.sampled_from([1.0, -1.0]), st.sampled_from([1.0, -1.0])),
+    up=st.sampled_from([(0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0), (2, 1.0)]),
+    tilt=st.sampled_from([0.0, 0.1, 0.6]),
+    units=st.sampled_from([("mm", "Nmm"), ("m", "Nm"), ("mm", "Nm"), ("cm", "Ncm")]),
     seed=st.integers(0, 1000),
 )
 def test_any_plate_gives_the_force_and_the_place_that_were_laid_on_it(
     tmp_path_factory: pytest.TempPathFactory,
     kind: int,
-    sign: float,
-    up: int,
-    raised: float,
+    signs: tuple[float, float],
+    up: tuple[int, float],
+    tilt: float,
+    units: tuple[str, str],
     seed: int,
 ) -> None:
-    rng = np.random.default_rng(seed)
-    corners = corners_of(rng, up=up).astype(np.float32).astype(np.float64)
-    x, y = corners[0] - corners[1], corners[0] - corners[3]
-    x, y = x / np.linalg.norm(x), y / np.linalg.norm(y)
+    """Load or reaction, the origin below or above, anywhere, in any units."""
+    (sign, raised), (unit, moments), rng = signs, units, np.random.default_rng(seed)
+    of_mm = 1e-3 / LENGTHS[unit]
+    lever = of_mm if kind == 4 else 1e-3 / LENGTHS[moments.removeprefix("N")]
+    axes = axes_of(rng, *up, tilt)
+    corners_mm = rng.uniform(-500.0, 500.0, 3) + CORNERS_MM @ axes
     origin = np.array([3.0, -5.0, -40.0]) if kind != 3 else np.array([120.0, 80.0, -40.0])
     force = np.stack([5.0 * rng.normal(size=50), 5.0 * rng.normal(size=50), LOAD_N + 10.0])
     local = np.stack([rng.uniform(-90, 90, 50), rng.uniform(-60, 60, 50), np.zeros(50)])
     # Moments about the origin of the plate, from which the middle of its surface is at `origin`.
     middle = origin if kind in (2, 4) else np.array([0.0, 0.0, origin[2]])
-    at = local + middle[:, None]
-    moment = np.cross(at, force, axis=0)
+    moment = np.cross(local + middle[:, None], force, axis=0)
     nothing = np.zeros(50)
+    matrix = np.eye(6) + 0.05 * rng.normal(size=(6, 6)).round(3)
     if kind == 1:
-        rows = [*(sign * force), *local[:2], nothing]
+        rows = [*(sign * force), *(of_mm * local[:2]), nothing]
     elif kind == 3:
         a, b = origin[:2]
         # Vertical forces of the sensors that have this sum and these moments.
         sums = np.array([[1, 1, 1, 1], [b, b, -b, -b], [-a, a, a, -a], [1, -1, 1, -1]])
-        wanted = np.stack([force[2], moment[0], moment[1], nothing])
-        z = np.linalg.solve(sums, wanted)
+        z = np.linalg.solve(sums, np.stack([force[2], moment[0], moment[1], nothing]))
         rows = [*(sign * np.stack([0.5 * force[0]] * 2 + [0.5 * force[1]] * 2)), *(sign * z)]
     else:
-        rows = [*(sign * force), *(sign * moment)]
-    matrix = np.eye(6) + 0.05 * rng.normal(size=(6, 6)).round(3)
+        rows = [*(sign * force), *(sign * lever * moment)]
     if kind == 4:
         rows = list(np.linalg.solve(matrix, np.stack(rows)))
-    stored = np.stack(rows, axis=1)
-    more = {"CORNERS": corners.reshape(1, 4, 3), "ORIGIN": raised * origin[None]}
-    if kind == 1:
-        more["ORIGIN"] = np.zeros((1, 3))
-    if kind == 3:
-        more["ORIGIN"] = np.array([[*origin[:2], raised * origin[2]]])
+    above = np.array([1.0, 1.0, raised]) if kind == 3 else np.full(3, raised * (kind != 1))
+    more = {"CORNERS": of_mm * corners_mm[None], "ORIGIN": (of_mm * above * origin)[None]}
     if kind == 4:
         more["CAL_MATRIX"] = matrix.T.reshape(1, 6, 6)
-    content = force_plate(kind, stored.shape[1], **more)
-    content["ANALOG"]["UNITS"] = UNITS[kind]
-    path = tmp_path_factory.mktemp("plates") / "gait.c3d"
-    path.write_bytes(c3d_bytes(content, stored))
-    columns = {"grf_n": "plate1_fz", "cop_x_m": "plate1_cop_x", "cop_y_m": "plate1_cop_y"}
-    found = read(path, ReferenceOptions(columns, {"grf": "N", "cop": "mm"} if kind == 4 else {}))
-    placed = corners.mean(axis=0)[:, None] + np.outer(x, local[0]) + np.outer(y, local[1])
-    level = {2: (0, 1, 1.0), 1: (0, 2, -1.0), 0: (2, 1, -1.0)}[up]
-    expected = np.stack([placed[level[0]], placed[level[1]]]) * 1e-3
-    expected[0 if up == 0 else 1] *= level[2]
+    content = force_plate(kind, len(rows), **more)
+    content["POINT"]["UNITS"] = [unit]
+    of = {"mm": unit, "Nmm": moments}
+    content["ANALOG"]["UNITS"] = [of.get(each, each) for each in UNITS[kind]]
+    stated = ReferenceOptions(COLUMNS, {"grf": "N", "cop": unit} if kind == 4 else {})
+    folder = tmp_path_factory.mktemp("plates")
+    found = read_c3d(folder, content, np.stack(rows, axis=1), stated)
+    placed_mm = corners_mm.mean(axis=0)[:, None] + axes[:2].T @ local[:2]
     np.testing.assert_allclose(found.grf_n, force[2], rtol=1e-5)
     assert found.cop_m is not None
-    np.testing.assert_allclose(found.cop_m, expected.T, atol=2e-5)
+    np.testing.assert_allclose(found.cop_m.T, 1e-3 * in_plane(placed_mm, -axes[2]), atol=2e-5)
 
 
 @pytest.mark.parametrize("kind", [1, 2, 4])
 def test_another_program_reads_the_same(tmp_path: Path, kind: int) -> None:
     ezc3d = pytest.importorskip("ezc3d")
     path = written(tmp_path / "gait.c3d", kind)
-    columns = {"grf_n": "plate1_fz", "cop_x_m": "plate1_cop_x", "cop_y_m": "plate1_cop_y"}
-    found = read(path, ReferenceOptions(columns, {"grf": "N", "cop": "mm"} if kind == 4 else {}))
+    found = read(path, ReferenceOptions(COLUMNS, {"grf": "N", "cop": "mm"} if kind == 4 else {}))
     plate = ezc3d.c3d(str(path), extract_forceplat_data=True)["data"]["platform"][0]
     np.testing.assert_allclose(found.grf_n, -plate["force"][2], rtol=1e-12)
     assert found.cop_m is not None
@@ -340,7 +326,7 @@ def test_another_program_reads_the_same(tmp_path: Path, kind: int) -> None:
 # --- Forms of the file ----------------------------------------------------------------------------
 
 
-def test_more_than_32767_frames_and_integers_without_a_sign_are_read(tmp_path: Path) -> None:
+def test_over_32767_frames_of_unsigned_integers_are_read(tmp_path: Path) -> None:
     frames = 40_000
     counts = np.zeros((frames, 6))
     counts[:, 2] = 32_768 + np.where(np.arange(frames) % 1000 < 300, 20_000, 0)
@@ -352,9 +338,7 @@ def test_more_than_32767_frames_and_integers_without_a_sign_are_read(tmp_path: P
         "RATE": 100.0,
     }
     content["POINT"] |= {"FRAMES": frames, "SCALE": 1.0}
-    path = tmp_path / "gait.c3d"
-    path.write_bytes(c3d_bytes(content, counts, samples_a_frame=1, is_integer=True))
-    found = read(path)
+    found = read_c3d(tmp_path, content, counts, samples_a_frame=1, is_integer=True)
     assert len(found.grf_n) == frames
     assert (found.grf_n[0], found.grf_n[500]) == (pytest.approx(1000.0), 0.0)
 
@@ -378,17 +362,15 @@ def test_frames_beyond_65535_are_counted_as_the_file_states_them(
     content["ANALOG"]["RATE"] = 100.0
     for group, values in more.items():
         content[group] = {**content.get(group, {}), **values}
-    path = tmp_path / "gait.c3d"
-    path.write_bytes(c3d_bytes(content, analog, samples_a_frame=1, frames_in_header=65_535))
-    assert len(read(path).grf_n) == frames
+    more_frames: dict[str, Any] = {"samples_a_frame": 1, "frames_in_header": 65_535}
+    assert len(read_c3d(tmp_path, content, analog, **more_frames).grf_n) == frames
 
 
 def test_a_file_without_a_rate_of_points_is_read_by_its_analog_rate(tmp_path: Path) -> None:
     content = force_plate(2, 6)
     content["POINT"]["RATE"] = 0.0
-    path = tmp_path / "gait.c3d"
-    path.write_bytes(c3d_bytes(content, channels(2), point_hz=0.0))
-    np.testing.assert_allclose(read(path).time_s, np.arange(50) / 1000.0)
+    found = read_c3d(tmp_path, content, channels(2), point_hz=0.0)
+    np.testing.assert_allclose(found.time_s, np.arange(50) / 1000.0)
 
 
 def test_a_plate_without_channels_leaves_the_others_alone(tmp_path: Path) -> None:
@@ -399,26 +381,29 @@ def test_a_plate_without_channels_leaves_the_others_alone(tmp_path: Path) -> Non
         "ORIGIN": np.array([[0.0, 0.0, -40.0]] * 2),
         "CHANNEL": np.array([[1, 2, 3, 4, 5, 6], [0] * 6]),
     }
-    path = tmp_path / "gait.c3d"
-    path.write_bytes(c3d_bytes(force_plate(2, 6, **more), channels(2)))
-    found = read(path)
+    found = read_c3d(tmp_path, force_plate(2, 6, **more), channels(2))
     np.testing.assert_allclose(found.grf_n, LOAD_N, atol=1e-4)
     assert "plate 2 is not read" in found.notes[0]
 
 
-def test_a_plate_whose_sensors_are_nowhere_has_a_force_and_no_centre(tmp_path: Path) -> None:
+def test_a_single_plate_without_channels_is_refused(tmp_path: Path) -> None:
+    content = force_plate(2, 6)
+    del content["FORCE_PLATFORM"]["CHANNEL"]
+    with pytest.raises(FileFormatError, match="the channels of nothing"):
+        read_c3d(tmp_path, content, channels(2))
+
+
+def test_a_plate_without_places_of_sensors_has_no_cop(tmp_path: Path) -> None:
     found = read(written(tmp_path / "gait.c3d", 3, ORIGIN=np.zeros((1, 3))))
     np.testing.assert_allclose(found.grf_n, LOAD_N, atol=1e-4)
     assert found.cop_m is None
     assert "no centre of pressure" in found.notes[0]
 
 
-def test_one_sample_without_load_and_a_centre_nowhere_is_left_out(tmp_path: Path) -> None:
+def test_a_cop_off_the_plate_without_load_is_nan(tmp_path: Path) -> None:
     analog = channels(2)
     analog[0, 2:5] = (1e-13, 1.0, 1.0)
-    path = tmp_path / "gait.c3d"
-    path.write_bytes(c3d_bytes(force_plate(2, 6), analog))
-    found = read(path)
+    found = read_c3d(tmp_path, force_plate(2, 6), analog)
     assert found.cop_m is not None
     assert np.isnan(found.cop_m[0]).all()
     np.testing.assert_allclose(found.cop_m[1:], [[0.01, -0.02]] * 49, atol=1e-6)
@@ -436,9 +421,7 @@ def test_a_file_is_read_where_memory_is_limited(tmp_path: Path) -> None:
     assert done.stdout.strip() == "50"
 
 
-def test_memory_that_is_not_enough_is_named_as_the_cause(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_too_little_memory_is_the_cause(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = written(tmp_path / "gait.c3d")
 
     def refuse(*_: object) -> None:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from devices.errors import FileFormatError, FootTileError, UsageError
-from storage.formats.reference import ReferenceData, ReferenceOptions, read_reference
+from storage.formats.reference import ReferenceOptions
+from tests.storage.formats.readers.reading import read
 
 FACTS = (
     "# Start time: 01.01.2026 09:00:00.000\n# Duration: 00:00.200\n"
@@ -36,12 +37,6 @@ def line(i: int) -> str:
 
 def text(*lines: str, names: str = NAMES) -> str:
     return FACTS + "\n".join((names, *(lines or map(line, range(20))), ""))
-
-
-def read(folder: Path, content: str, stated: ReferenceOptions) -> ReferenceData:
-    path = folder / "walk.txt"
-    path.write_text(content, encoding="utf-8")
-    return read_reference(path, stated)
 
 
 def test_each_sole_has_its_force(tmp_path: Path) -> None:
@@ -112,12 +107,12 @@ def test_cop_in_another_unit_is_not_read(tmp_path: Path) -> None:
         (FACTS + NAMES + "\n", "0 samples"),
     ],
 )
-def test_what_is_damaged_is_refused_in_a_sentence(tmp_path: Path, content: str, said: str) -> None:
+def test_a_damaged_text_is_refused(tmp_path: Path, content: str, said: str) -> None:
     with pytest.raises(FileFormatError, match=said):
         read(tmp_path, content, LEFT)
 
 
-def test_a_text_that_is_cut_off_anywhere_never_breaks_the_reader(tmp_path: Path) -> None:
+def test_a_text_cut_off_anywhere_gives_no_other_force(tmp_path: Path) -> None:
     content = text()
     for end in range(0, len(content), 11):
         try:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from devices.errors import FileFormatError, UsageError
-from storage.formats.reference import ReferenceData, ReferenceOptions, read_reference
-from tests.storage.formats.readers.damaged import count_refused
+from storage.formats.reference import ReferenceOptions
+from tests.storage.formats.readers.reading import count_refused, read
 
 ROWS = np.array(
     [
@@ -38,16 +38,8 @@ FORMS: dict[str, Callable[[str], str]] = {
 }
 
 
-def read(folder: Path, text: str, stated: ReferenceOptions) -> ReferenceData:
-    path = folder / "trial.txt"
-    path.write_bytes(text.encode())
-    return read_reference(path, stated)
-
-
 @pytest.mark.parametrize("form", FORMS)
-def test_force_and_cop_are_read_where_rate_units_and_sign_are_stated(
-    tmp_path: Path, form: str
-) -> None:
+def test_force_and_cop_are_read_with_rate_units_and_sign_stated(tmp_path: Path, form: str) -> None:
     found = read(tmp_path, FORMS[form](ONE), ReferenceOptions(PLATE, UNITS, "+", rate_hz=50.0))
     np.testing.assert_allclose(found.time_s, [0.0, 0.02, 0.04, 0.06])
     np.testing.assert_array_equal(found.grf_n, ROWS[:, 2])
@@ -81,11 +73,8 @@ def test_the_load_tells_the_sign(tmp_path: Path) -> None:
     steps = np.arange(400)
     force = np.where((steps > 100) & (steps < 300), -700.0, 0.0)
     rows = np.stack([steps % 2, steps % 3, force, 0 * force, 0 * force, 0 * force], axis=1)
-    found = read(
-        tmp_path,
-        text_of(rows),
-        ReferenceOptions({"grf_n": "plate1_fz"}, {"grf": "N"}, rate_hz=1000.0),
-    )
+    stated = ReferenceOptions({"grf_n": "plate1_fz"}, {"grf": "N"}, rate_hz=1000.0)
+    found = read(tmp_path, text_of(rows), stated)
     np.testing.assert_array_equal(found.grf_n, -force)
 
 
@@ -93,14 +82,11 @@ def test_six_columns_of_which_the_first_is_a_time_are_not_a_plate(tmp_path: Path
     rows = np.column_stack([np.arange(4) * 0.01, ROWS[:, 1:]])
     with pytest.raises(FileFormatError, match=r"it has column1, .*column6\)"):
         read(tmp_path, text_of(rows), ReferenceOptions())
-    found = read(
-        tmp_path,
-        text_of(rows),
-        ReferenceOptions({"time_s": "column1", "grf_n": "column3"}, {"grf": "N"}, "+"),
-    )
+    stated = ReferenceOptions({"time_s": "column1", "grf_n": "column3"}, {"grf": "N"}, "+")
+    found = read(tmp_path, text_of(rows), stated)
     np.testing.assert_array_equal(found.grf_n, ROWS[:, 2])
 
 
 def test_damaged_texts_are_refused_by_our_own_errors(tmp_path: Path) -> None:
     stated = ReferenceOptions(PLATE, UNITS, "+", rate_hz=50.0)
-    assert count_refused(tmp_path / "trial.txt", ONE, stated) > 20
+    assert count_refused(tmp_path, ONE, stated) > 20

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from devices.errors import FileFormatError, UsageError
-from storage.formats.reference import ReferenceData, ReferenceOptions, read_reference
-from tests.storage.formats.readers.damaged import count_refused
+from storage.formats.reference import ReferenceOptions
+from tests.storage.formats.readers.reading import count_refused, read
 
 FRAMES = 8
 PARTS = 5
@@ -68,14 +68,6 @@ FORMS: dict[str, Callable[[str], str | bytes]] = {
 }
 
 
-def read(
-    folder: Path, content: str | bytes, stated: ReferenceOptions | None = None
-) -> ReferenceData:
-    path = folder / "trial.csv"
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return read_reference(path, stated or ReferenceOptions())
-
-
 @pytest.mark.parametrize("form", FORMS)
 def test_a_plate_is_read_at_the_rate_of_the_devices(tmp_path: Path, form: str) -> None:
     found = read(tmp_path, FORMS[form](TWO), ReferenceOptions(SECOND))
@@ -127,12 +119,10 @@ def test_a_gap_of_frames_stays_a_gap(tmp_path: Path) -> None:
         (TWO.replace("-610.0", "much"), "is not numeric: 'much'"),
     ],
 )
-def test_what_is_no_measurement_is_refused_in_a_sentence(
-    tmp_path: Path, text: str, says: str
-) -> None:
+def test_what_is_no_measurement_is_refused(tmp_path: Path, text: str, says: str) -> None:
     with pytest.raises(FileFormatError, match=says):
         read(tmp_path, text, ReferenceOptions(SECOND))
 
 
 def test_damaged_texts_are_refused_by_our_own_errors(tmp_path: Path) -> None:
-    assert count_refused(tmp_path / "trial.csv", without_first(TWO), ReferenceOptions()) > 100
+    assert count_refused(tmp_path, without_first(TWO)) > 50

@@ -10,8 +10,9 @@ import pytest
 
 from devices.arrays import Floats
 from devices.errors import FileFormatError
-from storage.formats.reference import ReferenceData, ReferenceOptions, read_reference
-from tests.builders.c3d import c3d_bytes, force_plate
+from storage.formats.reference import ReferenceData, ReferenceOptions
+from tests.builders.c3d import force_plate
+from tests.storage.formats.readers.reading import read_c3d
 
 SAMPLES = 200
 LOAD_N = 100.0 + 400.0 * np.sin(np.linspace(0.0, np.pi, SAMPLES))
@@ -25,34 +26,22 @@ def wrench() -> Floats:
     return np.stack([nothing, nothing, LOAD_N, Y_MM * LOAD_N, -X_MM * LOAD_N, nothing], axis=1)
 
 
-def read(
-    tmp_path: Path,
-    content: dict[str, dict[str, Any]],
-    analog: Floats,
-    stated: ReferenceOptions | None = None,
-    **more: Any,
-) -> ReferenceData:
-    path = tmp_path / "gait.c3d"
-    path.write_bytes(c3d_bytes(content, analog, **more))
-    return read_reference(path, stated or ReferenceOptions())
-
-
 def is_right(found: ReferenceData, *, y: float = -1.0) -> None:
     np.testing.assert_allclose(found.grf_n, LOAD_N, rtol=1e-5)
     assert found.cop_m is not None
     np.testing.assert_allclose(found.cop_m, 1e-3 * np.stack([X_MM, y * Y_MM], axis=1), atol=2e-6)
 
 
-def test_channels_in_the_place_of_samples_of_a_frame_are_told_by_the_rates(tmp_path: Path) -> None:
-    found = read(tmp_path, force_plate(2, 6), wrench(), measures_in_header=6)
+def test_channels_in_place_of_samples_are_told_by_the_rates(tmp_path: Path) -> None:
+    found = read_c3d(tmp_path, force_plate(2, 6), wrench(), measures_in_header=6)
     is_right(found)
     assert found.time_s[1] == pytest.approx(0.001)
 
 
-def test_of_two_analog_rates_that_of_the_frames_is_taken_and_it_is_said(tmp_path: Path) -> None:
+def test_of_two_analog_rates_that_of_the_frames_is_used(tmp_path: Path) -> None:
     content = force_plate(2, 6)
     content["ANALOG"]["RATE"] = 980.0
-    found = read(tmp_path, content, wrench())
+    found = read_c3d(tmp_path, content, wrench())
     assert found.time_s[1] == pytest.approx(0.001)
     assert "ANALOG:RATE states 980 Hz, and 10 samples in each frame at 100 Hz are" in found.notes[0]
 
@@ -64,7 +53,7 @@ def test_zeros_behind_the_last_sample_of_unsigned_channels_are_no_load(tmp_path:
     content = force_plate(2, 6)
     content["ANALOG"] |= {"OFFSET": np.full(6, 2048), "SCALE": np.full(6, -1.0)}
     content["POINT"]["SCALE"] = 1.0
-    found = read(tmp_path, content, counts, is_integer=True)
+    found = read_c3d(tmp_path, content, counts, is_integer=True)
     assert len(found.grf_n) == 2000
     assert (found.grf_n.max(), found.grf_n.min()) == (800.0, 0.0)
     assert "plate1: 3000 of its samples are stored as zeros and were not recorded" in found.notes
@@ -73,7 +62,7 @@ def test_zeros_behind_the_last_sample_of_unsigned_channels_are_no_load(tmp_path:
 @pytest.mark.parametrize(
     ("position", "stated", "held"), [("mm", "Nm", "Nmm"), ("m", "Nmm", "Nm"), ("mm", "Nm", "Nm")]
 )
-def test_moments_in_another_unit_than_stated_are_told_by_the_size_of_the_plate(
+def test_moments_in_another_unit_are_told_by_the_size_of_the_plate(
     tmp_path: Path, position: str, stated: str, held: str
 ) -> None:
     analog, content = wrench(), force_plate(2, 6)
@@ -84,7 +73,7 @@ def test_moments_in_another_unit_than_stated_are_told_by_the_size_of_the_plate(
             content["FORCE_PLATFORM"][name] = 1e-3 * content["FORCE_PLATFORM"][name]
     content["POINT"]["UNITS"] = [position]
     content["ANALOG"]["UNITS"] = ["N"] * 3 + [stated] * 3
-    found = read(tmp_path, content, analog)
+    found = read_c3d(tmp_path, content, analog)
     is_right(found)
     is_said = any("are not in" in note for note in found.notes)
     assert is_said == (stated != held)
@@ -93,20 +82,18 @@ def test_moments_in_another_unit_than_stated_are_told_by_the_size_of_the_plate(
 def test_a_plate_whose_corners_run_the_other_way_round_faces_up(tmp_path: Path) -> None:
     content = force_plate(2, 6)
     content["FORCE_PLATFORM"]["CORNERS"] = content["FORCE_PLATFORM"]["CORNERS"][:, [3, 2, 1, 0]]
-    found = read(tmp_path, content, wrench())
+    found = read_c3d(tmp_path, content, wrench())
     is_right(found, y=1.0)  # each corner is in the quadrant that its number says
     assert any("CORNERS run counterclockwise" in note for note in found.notes)
 
 
 @pytest.mark.parametrize(("factor", "said"), [(3.0, "off the plate in"), (1e-3, "the middle")])
-def test_a_centre_of_pressure_that_no_foot_has_is_said(
-    tmp_path: Path, factor: float, said: str
-) -> None:
+def test_a_cop_that_no_foot_has_is_noted(tmp_path: Path, factor: float, said: str) -> None:
     analog = wrench()
     analog[:, 3:5] *= factor
-    notes = read(tmp_path, force_plate(2, 6), analog).notes
+    notes = read_c3d(tmp_path, force_plate(2, 6), analog).notes
     assert any(said in note for note in notes)
-    assert not any(said in note for note in read(tmp_path, force_plate(2, 6), wrench()).notes)
+    assert not any(said in note for note in read_c3d(tmp_path, force_plate(2, 6), wrench()).notes)
 
 
 # --- Matrices -------------------------------------------------------------------------------------
@@ -127,13 +114,15 @@ def test_a_matrix_is_read_by_row_where_the_file_says_so(tmp_path: Path, is_by_ro
     volts = np.asarray(np.linalg.solve(MIXED, wrench().T).T, dtype=np.float64)
     content = with_matrix(MIXED.T if is_by_row else MIXED)
     content["FORCE_PLATFORM"]["MATRIX_STORE"] = ["BYROW" if is_by_row else "BYCOLUMN"]
-    is_right(read(tmp_path, content, volts, ReferenceOptions(COLUMNS, {"grf": "N", "cop": "mm"})))
+    is_right(
+        read_c3d(tmp_path, content, volts, ReferenceOptions(COLUMNS, {"grf": "N", "cop": "mm"}))
+    )
 
 
 def test_a_matrix_of_another_size_is_refused(tmp_path: Path) -> None:
     content = force_plate(4, 6, CAL_MATRIX=np.ones((1, 8, 8)))
     with pytest.raises(FileFormatError, match="type 4, with a CAL_MATRIX of 8 by"):
-        read(tmp_path, content, np.ones((SAMPLES, 6)))
+        read_c3d(tmp_path, content, np.ones((SAMPLES, 6)))
 
 
 def channels_of_four_sensors(x_mm: float, y_mm: float) -> Floats:
@@ -157,7 +146,7 @@ def test_bending_of_a_plate_is_corrected_as_ezc3d_does(tmp_path: Path) -> None:
         FPCOPPOLY=polynomial.reshape(1, 2, 6),
     )
     content["ANALOG"]["UNITS"] = ["N"] * 8
-    found = read(tmp_path, content, channels_of_four_sensors(150.0, 80.0))
+    found = read_c3d(tmp_path, content, channels_of_four_sensors(150.0, 80.0))
     path = str(tmp_path / "gait.c3d")
     plate = ezc3d.c3d(path, extract_forceplat_data=True)["data"]["platform"][0]
     assert found.cop_m is not None

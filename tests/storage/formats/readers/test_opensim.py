@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from devices.errors import FileFormatError, UsageError
-from storage.formats.load_trace import read_load_trace
-from storage.formats.reference import ReferenceData, ReferenceOptions, read_reference
+from storage.formats.reference import ReferenceData, ReferenceOptions
+from tests.storage.formats.readers.reading import read
 
 PLAIN = """grf.mot
 version=1
@@ -46,34 +46,23 @@ FORMS: dict[str, Callable[[str], str | bytes]] = {
 }
 
 
-def read(
+def read_mot(
     folder: Path, content: str | bytes, stated: ReferenceOptions | None = None
 ) -> ReferenceData:
-    path = folder / "grf.mot"
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return read_reference(path, stated or ReferenceOptions())
+    return read(folder, content, stated, "grf.mot")
 
 
 @pytest.mark.parametrize("form", FORMS)
 def test_the_same_force_is_read_whatever_the_form(tmp_path: Path, form: str) -> None:
-    found = read(tmp_path, FORMS[form](PLAIN))
+    found = read_mot(tmp_path, FORMS[form](PLAIN))
     np.testing.assert_array_equal(found.time_s, [0.0, 0.001, 0.002])
     np.testing.assert_array_equal(found.grf_n, [0.0, 20.0, 10.0])
     np.testing.assert_array_equal(found.cop_m, [[0.0, 0.0], [0.1, -0.03], [0.2, -0.02]])
 
 
-def test_a_load_is_pressed_from_it(tmp_path: Path) -> None:
-    path = tmp_path / "grf.sto"
-    path.write_text(PLAIN)
-    found = read_load_trace(path)
-    assert found.fz_n is not None
-    assert found.fz_n.tolist() == [0.0, 20.0, 10.0]
-    np.testing.assert_array_equal(found.cop_m, [[0.0, 0.0], [0.1, -0.03], [0.2, -0.02]])
-
-
 @pytest.mark.parametrize("cell", ["-nan(ind)", "nan", "NaN", "1.#QNAN"])
 def test_no_number_is_none_in_the_words_of_any_program(tmp_path: Path, cell: str) -> None:
-    found = read(tmp_path, PLAIN.replace("0.1\t0.03", f"{cell}\t{cell}"))
+    found = read_mot(tmp_path, PLAIN.replace("0.1\t0.03", f"{cell}\t{cell}"))
     np.testing.assert_array_equal(found.cop_m, [[0.0, 0.0], [np.nan, np.nan], [0.2, -0.02]])
 
 
@@ -83,14 +72,16 @@ def test_its_units_are_its_own(tmp_path: Path) -> None:
         "cop_x_m": "ground_force_px",
         "cop_y_m": "ground_force_pz",
     }
-    found = read(tmp_path, PLAIN, ReferenceOptions(columns, {"grf": "N", "cop": "m", "time": "s"}))
+    found = read_mot(
+        tmp_path, PLAIN, ReferenceOptions(columns, {"grf": "N", "cop": "m", "time": "s"})
+    )
     assert found.cop_m is not None
     assert found.cop_m[1].tolist() == [0.1, 0.03]
     with pytest.raises(UsageError, match="is in m, not in mm"):
-        read(tmp_path, PLAIN, ReferenceOptions(columns, {"cop": "mm"}))
+        read_mot(tmp_path, PLAIN, ReferenceOptions(columns, {"cop": "mm"}))
 
 
 def test_of_several_forces_none_is_chosen_for_the_user(tmp_path: Path) -> None:
     text = PLAIN.replace("ground_force_px", "1_ground_force_vy")
     with pytest.raises(FileFormatError, match="no column 'grf_n'"):
-        read(tmp_path, text)
+        read_mot(tmp_path, text)

@@ -157,9 +157,7 @@ def test_the_sign_follows_from_the_load(tmp_path: Path, write: Write) -> None:
 
 
 @every_format
-def test_the_only_topic_needs_no_mapping_and_gives_no_centre_of_pressure(
-    tmp_path: Path, write: Write
-) -> None:
+def test_the_only_topic_needs_no_mapping_and_gives_no_cop(tmp_path: Path, write: Write) -> None:
     found = read_reference(write(tmp_path, walk()), ReferenceOptions())
     assert found.grf_n.max() == 19.0
     assert found.cop_m is None
@@ -178,9 +176,7 @@ def test_bags_without_wrenches_are_refused(tmp_path: Path, write: Write) -> None
 
 
 @every_format
-def test_a_bag_that_is_cut_off_or_damaged_is_refused_in_a_sentence(
-    tmp_path: Path, write: Write
-) -> None:
+def test_a_cut_or_damaged_bag_is_refused_by_our_own_errors(tmp_path: Path, write: Write) -> None:
     path = write(tmp_path, walk())
     if path.is_dir():
         path = next(one for one in path.iterdir() if one.suffix in (".db3", ".mcap"))
@@ -275,7 +271,7 @@ def test_a_unit_that_is_not_ros_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.timeout(60)
 @pytest.mark.parametrize("ending", [".bag", ".mcap", ".db3"])
-def test_a_pipe_or_a_device_is_refused_and_not_waited_for(tmp_path: Path, ending: str) -> None:
+def test_a_pipe_or_a_device_is_refused_at_once(tmp_path: Path, ending: str) -> None:
     pipe, device = tmp_path / f"pipe{ending}", tmp_path / f"device{ending}"
     os.mkfifo(pipe)
     device.symlink_to("/dev/zero")
@@ -286,9 +282,7 @@ def test_a_pipe_or_a_device_is_refused_and_not_waited_for(tmp_path: Path, ending
 
 @pytest.mark.timeout(60)
 @pytest.mark.parametrize("name", ["metadata.yaml", "frames.db3"])
-def test_a_pipe_in_the_folder_of_a_bag_is_refused_and_not_waited_for(
-    tmp_path: Path, name: str
-) -> None:
+def test_a_pipe_in_the_folder_of_a_bag_is_refused_at_once(tmp_path: Path, name: str) -> None:
     folder = tmp_path / "bag.db3"
     folder.mkdir()
     os.mkfifo(folder / name)

@@ -18,7 +18,7 @@ from storage.clock.log import ClockOffset
 from storage.clock.table import CLOCK_NAME, StreamClockFacts, write_clock_file
 from storage.formats.export import Export, FlatColumns
 from storage.formats.markers import PlacedMarker, PlacedMarkers
-from storage.formats.slice import FormatOptions
+from storage.formats.slice import FormatOptions, Slice
 from storage.formats.writers.registry import FORMATS
 from storage.schema import Array
 from storage.sessions.folder import FRAMES_NAME, Marker
@@ -26,7 +26,7 @@ from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import UTC_NS
 from tests.builders.frames import make_frames
 from tests.storage.faulty_disk import disk_with_room_for
-from tests.storage.formats.walks import ARRAY, ROWS, export_of_walk, walk
+from tests.storage.formats.walks import ARRAY, ROWS, export_of_walk, lines_of_documents, walk
 from tests.storage.formats.writers.readers import said_in
 
 EACH = pytest.mark.parametrize("to", FORMATS)
@@ -56,7 +56,7 @@ def said(to: str, export: Export) -> Mapping[str, str]:
     ],
     ids=["complete", "lossy", "recording", "simulated"],
 )
-def test_a_file_says_whether_it_is_complete_and_what_was_done_to_its_numbers(
+def test_a_file_states_its_completeness_and_how_it_was_made(
     to: str, notes: dict[str, object], source: dict[str, object], complete: Sequence[str]
 ) -> None:
     facts = said(to, export_of_walk(notes=notes, provenance={"session": "s1", **source}))
@@ -89,11 +89,46 @@ def test_names_of_any_letters_break_nothing(to: str) -> None:
     assert facts["complete"]
 
 
+@pytest.mark.parametrize("to", [to for to in FORMATS if to != "parquet"])
+def test_the_same_session_is_the_same_bytes(to: str) -> None:
+    assert written(to, export_of_walk()) == written(to, export_of_walk())
+
+
+@pytest.mark.parametrize("to", ["c3d", "opensim", "mat"])
+def test_more_frames_than_fit_are_refused_with_the_slice_that_does(
+    to: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = "matlab" if to == "mat" else to
+    monkeypatch.setattr(f"storage.formats.writers.{module}.FRAMES_MAX", 700)
+    with pytest.raises(UsageError, match=r"more than 700 frames.* 0 s to 1\.400 s fits"):
+        written(to, export_of_walk())
+    assert written(to, export_of_walk(part=Slice(0.0, 1.4)))
+
+
+@pytest.mark.parametrize(("to", "section"), [("c3d", "C3D"), ("mcap", "MCAP"), ("xdf", "XDF")])
+def test_the_lines_of_the_documents_read_it(
+    to: str, section: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    info = ARRAY.model_copy(update={"node": "left"})
+    (tmp_path / f"session.{to}").write_bytes(written(to, export_of_walk(info=info)))
+    monkeypatch.chdir(tmp_path)
+    found: dict[str, Any] = {}
+    exec(lines_of_documents(section), found)  # noqa: S102  # our own
+    grf_n, on = walk()["grf_n"], walk()["contact"] == 1
+    expected = {"c3d": on * grf_n, "mcap": grf_n[-1], "xdf": grf_n}[to]
+    np.testing.assert_allclose(found["grf_n"], expected, atol=1e-5)
+    if to == "c3d":
+        np.testing.assert_allclose(found["cop_m"][0], walk()["cop_x_m"], atol=1e-6)
+        assert found["events"][0] == (pytest.approx(0.2), "Foot Strike")
+        assert found["complete"] == ["not known: there is no ledger"]
+
+
 @EACH
 def test_a_session_without_estimates_is_its_counts_or_refused(to: str) -> None:
     raw = export_of_walk({"part": np.zeros(ROWS, dtype=np.uint16)}, notes={"estimates": "no curve"})
     if FORMATS[to].needs_forces:
-        with pytest.raises(UsageError, match=r"holds forces.* none: no curve.*foottile estimate"):
+        match = r"holds forces.* none: no curve.*foottile estimate.*Parquet, Arrow or CSV"
+        with pytest.raises(UsageError, match=match):
             written(to, raw)
     else:
         assert said(to, raw)["complete"]
@@ -104,14 +139,17 @@ def untared() -> dict[str, Array]:
     columns = {name: values.copy() for name, values in walk().items()}
     for name in ("grf_n", "force_n", "cop_x_m", "cop_y_m"):
         columns[name][:] = np.nan
+    columns["estimate_flags"][:] = 512
     return columns
 
 
 @EACH
-def test_a_session_without_a_tare_has_no_number_of_newtons_or_is_refused(to: str) -> None:
+def test_a_session_without_a_tare_has_no_forces_or_is_refused(to: str) -> None:
     export = export_of_walk(untared())
     if FORMATS[to].needs_forces:
-        with pytest.raises(UsageError, match="none of its 1000 frames has a force"):
+        with pytest.raises(
+            UsageError, match=r"none of its 1000 frames has a force \(estimate_flags 512\)"
+        ):
             written(to, export)
     else:
         assert "They are not replaced" in said(to, export)["masked"]
@@ -139,7 +177,7 @@ class Watched:
 
 
 @EACH
-def test_who_goes_away_in_between_leaves_nothing_open_and_nothing_behind(
+def test_an_aborted_download_leaves_nothing_open_or_behind(
     to: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))

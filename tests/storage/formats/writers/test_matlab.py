@@ -13,11 +13,9 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from devices.errors import UsageError
 from devices.frames import NO_SERVO_COUNTS, NOT_READ
 from storage.formats.sealed_export import make_sealed_export
 from storage.formats.slice import NO_OPTIONS, Slice
-from storage.formats.writers import matlab
 from storage.formats.writers.matlab import MATLAB
 from storage.schema import CONTACT_UNKNOWN
 from storage.sessions import reader as reader_module
@@ -105,10 +103,6 @@ def test_a_slice_has_its_frames_and_columns_and_seconds_of_the_session(sealed: P
     assert loaded(written(sealed, Slice(0.051, 0.0515)))["t_ns"].size == 0
 
 
-def test_the_same_session_gives_the_same_bytes_at_any_time_of_day(sealed: Path) -> None:
-    assert written(sealed) == written(sealed)
-
-
 def test_a_matrix_is_given_away_piece_by_piece_and_is_the_same(
     sealed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -119,17 +113,6 @@ def test_a_matrix_is_given_away_piece_by_piece_and_is_the_same(
         export = make_sealed_export(reader, Slice(None, None, ("force_n",)), options=NO_OPTIONS)
         assert 7 * 4 in {len(chunk) for chunk in MATLAB.encode(export)}
     assert written(sealed) == whole
-
-
-def test_more_frames_than_its_limit_are_refused_with_the_slice_that_fits(
-    sealed: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(matlab, "FRAMES_MAX", 30)
-    with SealedFileReader(sealed) as reader:
-        chunks = MATLAB.encode(make_sealed_export(reader, Slice()))
-        with pytest.raises(UsageError, match=r"more than 30 frames.*0 s to 0\.060 s fits"):
-            next(chunks)
-    assert loaded(written(sealed, Slice(0.0, 0.06)))["t_ns"].size == 30
 
 
 @pytest.mark.in_turn

@@ -42,9 +42,7 @@ from tests.storage.formats.walks import (
     walk,
 )
 from tests.storage.formats.writers.readers import C3dFile, said_in
-
-WHOLE = {"complete": True, "lossy": False, "parts": [{"lost": {}}]}
-LOSSY = {"complete": False, "lossy": True, "parts": [{"lost": {"disk_full": 3}}]}
+from tests.storage.formats.writers.test_every_format import LOSSY, WHOLE
 
 
 @dataclass
@@ -160,7 +158,7 @@ def written(to: str, exports: Sequence[Export], options: FormatOptions = NO_OPTI
     return b"".join(get_multi_session_format(to).encode_together(given))
 
 
-def test_each_format_that_holds_several_is_read_here_and_the_others_name_them() -> None:
+def test_formats_of_one_session_name_those_of_several() -> None:
     several = {name for name, known in FORMATS.items() if known.holds_several}
     assert {to for to, _ in READERS} == several
     for name in set(FORMATS) - several:
@@ -169,9 +167,7 @@ def test_each_format_that_holds_several_is_read_here_and_the_others_name_them() 
 
 
 @EACH
-def test_two_feet_are_on_one_axis_and_each_says_how_far_it_may_be_off(
-    to: str, options: FormatOptions
-) -> None:
+def test_two_feet_are_on_one_axis_with_their_bounds(to: str, options: FormatOptions) -> None:
     left, right = two_feet()
     both = [replace(left, notes={"ledger": WHOLE}), replace(right, notes={"ledger": LOSSY})]
     content = written(to, both, options)
@@ -194,7 +190,7 @@ def test_two_feet_are_on_one_axis_and_each_says_how_far_it_may_be_off(
 
 @EACH
 @pytest.mark.parametrize("nodes", [("left", "left"), ("a/é 🦶", "a/é_🦶"), ("", "'")])
-def test_sessions_whose_nodes_have_one_name_are_told_apart(
+def test_nodes_of_one_name_are_told_apart(
     to: str, options: FormatOptions, nodes: tuple[str, str]
 ) -> None:
     content = written(to, two_feet(*nodes), options)
@@ -215,14 +211,12 @@ def test_sessions_whose_nodes_have_one_name_are_told_apart(
     assert len(set(names)) == len(names)
 
 
-def test_a_name_that_is_taken_has_a_number_and_so_has_one_that_looks_like_it() -> None:
+def test_a_name_that_is_taken_has_a_number() -> None:
     assert make_names_unique(["a", "b", "a", "a_2", "a"]) == ["a", "b", "a_2", "a_2_2", "a_3"]
 
 
 @EACH
-def test_sessions_without_a_common_axis_are_not_put_together(
-    to: str, options: FormatOptions
-) -> None:
+def test_sessions_without_a_common_axis_are_refused(to: str, options: FormatOptions) -> None:
     with pytest.raises(UsageError, match="the nodes' own clocks are no common axis"):
         written(to, [export_of_walk(), export_of_walk()], options)
     left, right = two_feet()
@@ -240,7 +234,7 @@ def test_chosen_columns_still_have_their_time(to: str) -> None:
     assert found["right-2"].time_s[0] - found["left"].time_s[0] == pytest.approx(0.3, abs=1e-5)
 
 
-def test_messages_of_both_are_in_the_order_of_their_instants_in_bounded_memory() -> None:
+def test_messages_of_both_are_in_order_of_time() -> None:
     content = written("mcap", two_feet())
     times = [message.log_time for *_, message in make_reader(io.BytesIO(content)).iter_messages()]
     reader = make_reader(io.BytesIO(content))
@@ -297,7 +291,7 @@ def feet_of_which_one_has_a_servo() -> list[Export]:
     return [left, replace(right, notes={"ledger": WHOLE})]
 
 
-def test_sessions_are_structs_with_the_same_fields_and_empty_ones_for_what_one_lacks() -> None:
+def test_sessions_are_structs_with_the_same_fields() -> None:
     file: Any = io.BytesIO(written("mat", feet_of_which_one_has_a_servo()))
     left, right = loadmat(file, simplify_cells=True)["sessions"]
     assert set(left) == set(right)
@@ -323,9 +317,7 @@ def test_octave_reads_an_array_of_structs(tmp_path: Path) -> None:
     assert done.stdout.split() == ["left", "true", f"{LATE_NS * 1e-9:.1f}"], done.stderr
 
 
-def test_more_bytes_than_a_variable_holds_are_refused_before_anything_is_written(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_too_many_bytes_for_a_variable_are_refused_first(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(matlab, "BYTES_MAX", 100_000)
     with pytest.raises(UsageError, match="bytes in these sessions, and 100000 in a variable"):
         next(get_multi_session_format("mat").encode_together(two_feet()))

@@ -90,7 +90,7 @@ def test_a_number_that_is_not_known_makes_no_sample_beside_it() -> None:
     assert np.isnan(at(t_ns).interpolate(values)).sum() == 2
 
 
-def test_frames_that_come_at_another_rate_than_the_nominal_have_theirs() -> None:
+def test_frames_at_another_rate_than_the_nominal_keep_theirs() -> None:
     found = at(BEGIN_NS + 3_000_000 * np.arange(100))
     assert found.rate_hz == pytest.approx(1000 / 3)
     assert found.empty_count == 0
@@ -115,7 +115,7 @@ def test_years_between_two_parts_are_refused_and_not_filled() -> None:
         at(t_ns, part=np.repeat([0, 1], 10))
 
 
-def test_of_two_streams_on_one_axis_each_is_empty_where_it_is_not() -> None:
+def test_two_streams_on_one_axis_are_empty_where_they_have_no_frames() -> None:
     early, late = times(20), times(20) + 10 * PERIOD_NS + 400_000
     axis = make_sample_axis([(early, NOMINAL_HZ), (late, NOMINAL_HZ)], 100)
     assert (axis.begin_ns, axis.count) == (BEGIN_NS, 30)

@@ -43,9 +43,7 @@ def test_an_option_of_another_format_is_refused_before_the_first_chunk(to: str) 
 
 @pytest.mark.parametrize("to", TABLES)
 @pytest.mark.parametrize("start", [0, 20])
-def test_seconds_and_timestamps_come_first_and_count_from_the_sessions_start(
-    to: str, start: int
-) -> None:
+def test_seconds_and_timestamps_come_first(to: str, start: int) -> None:
     part = Slice(start * PERIOD_NS * 1e-9)
     table = read(exported(to, part, options=NO_OPTIONS), to)
     assert table.column_names[:3] == ["time_s", "time_utc", "seq"]

@@ -36,7 +36,7 @@ from tests.waiting import until
         (errno.EIO, "read_only", "Input/output error"),
     ],
 )
-def test_a_disk_that_takes_nothing_costs_what_memory_cannot_hold_and_goes_on_when_it_does(
+def test_a_failing_disk_costs_what_memory_cannot_store(
     journal: NodeJournal,
     stream: NodeStream,
     monkeypatch: pytest.MonkeyPatch,
@@ -65,7 +65,7 @@ def test_a_disk_that_takes_nothing_costs_what_memory_cannot_hold_and_goes_on_whe
     assert stream.stored.number_count + stream.lost.by_reason[reason].number_count == 1000
 
 
-def test_a_slow_disk_holds_up_nobody_and_what_does_not_fit_is_named(
+def test_a_slow_disk_blocks_nobody_and_losses_are_named(
     journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(node_journal, "MAX_WAITING_BYTES", 20_000)
@@ -87,7 +87,7 @@ def test_a_slow_disk_holds_up_nobody_and_what_does_not_fit_is_named(
     assert stream.stored.number_count + stream.lost.numbers.number_count == 1000
 
 
-def test_what_the_disk_could_not_sync_is_written_once_more(
+def test_batches_of_a_failed_sync_are_written_again(
     journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """After a failed fsync the kernel may have forgotten the pages, and says so only once."""
@@ -102,7 +102,7 @@ def test_what_the_disk_could_not_sync_is_written_once_more(
     assert len(names) >= 2
 
 
-def test_frames_that_the_disk_could_not_sync_are_given_all_the_while(
+def test_frames_of_a_failed_sync_can_be_read_all_the_while(
     journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     disown = Journal.invalidate_whole_batches
@@ -122,16 +122,14 @@ def test_frames_that_the_disk_could_not_sync_are_given_all_the_while(
     assert batches
 
 
-def test_frames_that_turn_out_damaged_are_named_and_given_no_more(
-    journal: NodeJournal, stream: NodeStream
-) -> None:
+def test_damaged_frames_are_named_and_not_given(journal: NodeJournal, stream: NodeStream) -> None:
     store(journal, stream, 0, 49)
     journal.queue_invalidation(stream, Intervals([(20, 29)]))
     until(lambda: stream.lost.by_reason.get("corrupt") == Intervals([(20, 29)]))
     assert given(stream, 0, 49) == [0, 10, 30, 40]
 
 
-def test_the_bound_is_the_age_of_the_oldest_frame_when_it_is_on_the_disk(
+def test_the_bound_is_the_age_of_the_oldest_frame_at_its_sync(
     journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A frame that comes during one sync waits for that one and for the next."""
@@ -149,7 +147,7 @@ def test_the_bound_is_the_age_of_the_oldest_frame_when_it_is_on_the_disk(
     assert stream.notes.sync_max_s > 0.6
 
 
-def test_over_the_bound_of_memory_the_oldest_goes_first_of_whichever_stream(
+def test_over_the_bound_of_memory_the_oldest_frames_of_all_go(
     start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A stream that ended while the disk took nothing does not leave the next one without room."""

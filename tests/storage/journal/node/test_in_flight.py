@@ -47,9 +47,7 @@ def test_the_array_is_known_before_the_first_frame(tmp_path: Path) -> None:
     assert read_in_flight_of_this_boot(tmp_path) == (make_array(3), None)
 
 
-def test_after_another_start_of_the_machine_nothing_is_trusted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_after_a_reboot_nothing_is_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     take_in_flight(tmp_path, frames(0, 99))
     monkeypatch.setattr(in_flight, "read_kernel_boot_id", lambda: "another start")
     assert read_in_flight_of_this_boot(tmp_path) is None
@@ -57,9 +55,8 @@ def test_after_another_start_of_the_machine_nothing_is_trusted(
 
 @settings(max_examples=60)
 @given(data=st.data())
-def test_a_damaged_row_ends_what_is_trusted_and_never_gives_another_frame(
-    tmp_path_factory: pytest.TempPathFactory,
-    data: st.DataObject,
+def test_a_damaged_row_never_gives_another_frame(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
     folder = tmp_path_factory.mktemp("damaged")
     take_in_flight(folder, frames(0, 199))
@@ -81,9 +78,7 @@ def test_a_damaged_row_ends_what_is_trusted_and_never_gives_another_frame(
     assert_same_bits(left[1], frames(first, last))
 
 
-def test_a_full_disk_is_known_at_once_and_leaves_nothing_behind(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without room that is reserved, the first write to a mapped page would end the process."""
 
     monkeypatch.setattr(os, "posix_fallocate", refusing(*NO_SPACE))

@@ -26,7 +26,7 @@ from tests.storage.stream import frames, take_in_flight
 from tests.waiting import until
 
 
-def test_a_stream_that_ended_in_order_is_known_to_its_end_after_a_restart(
+def test_a_stream_that_ended_is_complete_after_a_restart(
     journal: NodeJournal, stream: NodeStream, start: Start
 ) -> None:
     fill(journal, stream, 0, 99)
@@ -66,7 +66,7 @@ def test_a_killed_node_has_lost_nothing(
     again.end_streams_and_close()
 
 
-def test_a_power_cut_costs_what_was_not_synced_and_says_how_much_that_may_be(
+def test_a_power_cut_costs_at_most_the_stated_tail(
     journal: NodeJournal, stream: NodeStream, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store(journal, stream, 0, 99)
@@ -93,7 +93,7 @@ def test_a_disk_that_was_slower_than_the_promise_widens_the_bound(
     again.end_streams_and_close()
 
 
-def test_killed_before_its_notes_were_written_a_stream_is_found_by_what_was_in_flight(
+def test_a_stream_without_notes_is_found_by_its_frames_in_flight(
     start: Start, tmp_path: Path
 ) -> None:
     folder = tmp_path / "journal" / "leg" / ("2" * 32)
@@ -105,7 +105,7 @@ def test_killed_before_its_notes_were_written_a_stream_is_found_by_what_was_in_f
     assert found.stored == Intervals([(0, 5)])
 
 
-def test_recovery_writes_what_was_in_flight_and_drops_nothing(
+def test_recovery_stores_frames_in_flight_and_drops_nothing(
     journal: NodeJournal, stream: NodeStream, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store(journal, stream, 0, 99)
@@ -122,7 +122,7 @@ def test_recovery_writes_what_was_in_flight_and_drops_nothing(
     assert not list(folder.rglob("in_flight"))
 
 
-def test_what_acquisition_had_taken_when_it_was_killed_is_taken_over(
+def test_frames_in_flight_of_a_killed_acquisition_are_stored(
     journal: NodeJournal, stream: NodeStream
 ) -> None:
     """Its last batches never came through the pipe; the node itself lives on."""
@@ -134,7 +134,7 @@ def test_what_acquisition_had_taken_when_it_was_killed_is_taken_over(
     assert (stream.next_seq, stream.lost.to_pairs()) == (100, {})
 
 
-def test_frames_in_flight_that_cannot_be_read_are_set_aside_and_bounded_while_the_node_lives_on(
+def test_damaged_frames_in_flight_are_set_aside_and_bounded(
     journal: NodeJournal, stream: NodeStream
 ) -> None:
     fill(journal, stream, 0, 89)
@@ -165,9 +165,7 @@ def test_frames_in_flight_that_cannot_be_read_now_are_waited_for(
     assert stream.stored == Intervals([(0, 99)])
 
 
-def test_notes_of_a_later_version_stay_and_their_stream_is_left_out(
-    start: Start, tmp_path: Path
-) -> None:
+def test_a_stream_with_notes_of_a_later_version_is_left_out(start: Start, tmp_path: Path) -> None:
     journal = start()
     fill(journal, journal.switch_to_new_stream(make_array()), 0, 99)
     journal.end_streams_and_close()
@@ -185,7 +183,7 @@ def test_notes_of_a_later_version_stay_and_their_stream_is_left_out(
 
 
 @pytest.mark.parametrize("damaged", [0, 1, 2])
-def test_streams_are_in_order_even_if_the_notes_of_one_are_damaged(
+def test_streams_are_in_order_also_with_damaged_notes(
     start: Start, tmp_path: Path, damaged: int
 ) -> None:
     journal = start()

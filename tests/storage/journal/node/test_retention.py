@@ -19,7 +19,7 @@ from tests.storage.journal.node.leg import Start, fill, given, store
 from tests.waiting import until
 
 
-def test_every_frame_is_on_disk_within_the_promise_and_can_be_given_at_any_time(
+def test_every_frame_is_stored_soon_and_can_be_read_at_any_time(
     journal: NodeJournal, stream: NodeStream
 ) -> None:
     fill(journal, stream, 0, 99)
@@ -47,7 +47,7 @@ def wants(*numbers: tuple[int, int | None]) -> RetentionRequest:
     return RetentionRequest(streams={"0" * 32: numbers}, known=("0" * 32,))
 
 
-def test_the_ring_drops_what_no_session_needs_and_counts_what_no_server_has(
+def test_the_ring_drops_what_no_session_needs(
     journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(retention, "RING_DURATION_NS", 200_000_000)
@@ -63,7 +63,7 @@ def test_the_ring_drops_what_no_session_needs_and_counts_what_no_server_has(
     until(lambda: "evicted" in stream.notes.lost)
 
 
-def test_if_it_is_not_known_what_servers_need_nothing_is_dropped_but_for_want_of_room(
+def test_with_damaged_requests_only_the_budget_drops_frames(
     start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(retention, "RING_DURATION_NS", 200_000_000)
@@ -85,7 +85,7 @@ def test_if_it_is_not_known_what_servers_need_nothing_is_dropped_but_for_want_of
     assert journal.disk_warnings == ()
 
 
-def test_over_its_budget_it_drops_the_ring_first_and_then_stops_and_counts(
+def test_over_the_budget_the_ring_goes_first_then_frames_are_lost(
     start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("storage.journal.segment_writer.SEGMENT_DURATION_NS", 20_000_000)
@@ -113,7 +113,7 @@ def test_over_its_budget_it_drops_the_ring_first_and_then_stops_and_counts(
     assert "disk_full" not in stream.lost.to_pairs()
 
 
-def test_what_sessions_need_and_no_server_has_is_undelivered(
+def test_required_frames_of_no_server_are_undelivered(
     journal: NodeJournal, stream: NodeStream
 ) -> None:
     journal.update_retention_request("laptop", wants((50, None)))
@@ -124,7 +124,7 @@ def test_what_sessions_need_and_no_server_has_is_undelivered(
     assert journal.retention_requests.required_numbers_of("0" * 32) == Intervals([(50, NO_END)])
 
 
-def test_what_the_nodes_own_session_needs_stays_whoever_has_it_besides(
+def test_frames_of_the_nodes_own_session_stay(
     journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(retention, "RING_DURATION_NS", 100_000_000)
@@ -152,9 +152,7 @@ def test_what_one_server_has_another_still_gets(
     assert journal.available_undelivered_numbers(stream) == Intervals([(0, 199)])
 
 
-def test_frames_that_were_not_handed_over_are_named(
-    journal: NodeJournal, stream: NodeStream
-) -> None:
+def test_frames_not_handed_over_are_named(journal: NodeJournal, stream: NodeStream) -> None:
     fill(journal, stream, 0, 9)
     fill(journal, stream, 30, 39)
     assert stream.lost.to_pairs() == {"node_busy": ((10, 29),)}

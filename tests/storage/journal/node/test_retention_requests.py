@@ -10,7 +10,7 @@ from storage.intervals import NO_END, Intervals
 from storage.journal.node.retention_requests import RetentionRequest, RetentionRequests
 
 
-def test_a_servers_word_outlives_the_process(tmp_path: Path) -> None:
+def test_a_request_outlives_the_process(tmp_path: Path) -> None:
     wanted = RetentionRequests(tmp_path / "retention.json")
     assert wanted.update_request_in_memory(
         "laptop", RetentionRequest(streams={"a": ((5, 9), (20, None))})
@@ -24,9 +24,7 @@ def test_a_servers_word_outlives_the_process(tmp_path: Path) -> None:
     assert again.required_numbers_of("b") == Intervals()
 
 
-def test_while_a_session_is_recorded_a_stream_nobody_has_heard_of_belongs_to_it(
-    tmp_path: Path,
-) -> None:
+def test_an_unknown_stream_is_required_while_a_session_is_recorded(tmp_path: Path) -> None:
     wanted = RetentionRequests(tmp_path / "retention.json")
     wanted.update_request_in_memory(
         "laptop", RetentionRequest(streams={"b": ((7, None),)}, recording=True, known=("a", "b"))
@@ -50,7 +48,7 @@ DAMAGES = (b"", b"{", b"[]", b"null", b'{"servers": 7}', b"\xff", b"[" * 100_000
 
 
 @pytest.mark.parametrize("content", DAMAGES, ids=lambda c: repr(c[:12]))
-def test_a_damaged_file_is_set_aside_and_as_long_as_it_is_there_all_may_be_wanted(
+def test_while_a_damaged_file_is_there_all_frames_may_be_required(
     tmp_path: Path, content: bytes
 ) -> None:
     path = tmp_path / "retention.json"

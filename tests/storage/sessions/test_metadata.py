@@ -33,11 +33,11 @@ def chosen(choice: SessionFilter, one: Session, complete: Completeness = True) -
     return choice.accepts(one, lambda _: complete)
 
 
-def test_without_a_wish_every_session_is_meant() -> None:
+def test_no_filter_accepts_every_session() -> None:
     assert chosen(SessionFilter(), session())
 
 
-def test_of_nodes_one_is_enough_and_of_tags_all_are_needed() -> None:
+def test_one_of_the_nodes_and_all_tags_are_needed() -> None:
     one = session(tags=("Mud", "third"))
     assert chosen(SessionFilter(nodes=("right", "left")), one)
     assert not chosen(SessionFilter(nodes=("lef",)), one)
@@ -46,7 +46,7 @@ def test_of_nodes_one_is_enough_and_of_tags_all_are_needed() -> None:
     assert not chosen(SessionFilter(tags=("mu",)), one)
 
 
-def test_a_beginning_counts_and_an_end_does_not() -> None:
+def test_a_time_range_has_its_begin_and_not_its_end() -> None:
     assert chosen(SessionFilter(from_t_ns=T_NS, to_t_ns=T_NS + 1), session())
     assert not chosen(SessionFilter(from_t_ns=T_NS + 1), session())
     assert not chosen(SessionFilter(to_t_ns=T_NS), session())
@@ -54,13 +54,11 @@ def test_a_beginning_counts_and_an_end_does_not() -> None:
 
 @pytest.mark.parametrize("wanted", [True, False, "lossy"])
 @pytest.mark.parametrize("found", [True, False, "lossy"])
-def test_what_is_complete_lossy_or_may_still_become_whole_is_told_apart(
-    wanted: Completeness, found: Completeness
-) -> None:
+def test_sessions_are_filtered_by_completeness(wanted: Completeness, found: Completeness) -> None:
     assert chosen(SessionFilter(complete=wanted), session(), found) == (wanted == found)
 
 
-def test_frames_are_not_counted_of_what_is_not_meant_anyway() -> None:
+def test_frames_of_excluded_sessions_are_not_counted() -> None:
     def counting(_: Session) -> Completeness:
         pytest.fail("it is of another node")
 
@@ -71,9 +69,7 @@ def test_frames_are_not_counted_of_what_is_not_meant_anyway() -> None:
     st.datetimes(datetime(1970, 1, 2), datetime(2261, 1, 1)),  # as it is written
     st.integers(-23 * 60, 23 * 60),
 )
-def test_an_instant_is_the_same_in_every_way_of_writing_it(
-    at: datetime, offset_minutes: int
-) -> None:
+def test_a_time_is_the_same_in_each_notation(at: datetime, offset_minutes: int) -> None:
     utc = at.replace(tzinfo=UTC)
     t_ns = parse_iso_or_t_ns(utc.isoformat(), where="from")
     assert datetime.fromtimestamp(t_ns // 10**9, UTC) == utc.replace(microsecond=0)
@@ -96,7 +92,7 @@ def test_a_date_is_its_midnight() -> None:
         *("NaN", "1e18", "2026-01-01T00:00:00 01:00", "\N{FULLWIDTH DIGIT ONE}" * 10),
     ],
 )
-def test_what_is_no_instant_is_refused_with_what_would_be_one(said: str) -> None:
+def test_what_is_no_time_is_refused_with_an_example(said: str) -> None:
     with pytest.raises(UsageError, match="is no instant") as refused:
         parse_iso_or_t_ns(said, where="--from")
     assert "--from" in str(refused.value)

@@ -1,4 +1,4 @@
-"""Texts of Novel's Loadsol app: soles, their regions, times of their own, lost packets."""
+"""Texts of Novel's Loadsol app: soles, regions, times of their own, lost packets; and of Pedar."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from devices.errors import FileFormatError, UsageError
-from storage.formats.reference import ReferenceData, ReferenceOptions, read_reference
+from storage.formats.reference import ReferenceOptions
+from tests.storage.formats.readers.reading import read
 
 LEFT, RIGHT = ReferenceOptions({"grf_n": "left_fz"}), ReferenceOptions({"grf_n": "right_fz"})
 SOLES = (
@@ -29,14 +30,6 @@ def line(i: int, left: str = "", right: str = "") -> str:
 def text(*lines: str) -> str:
     head = ("loadapp_2026_01_01_09_00_00_000.loadflux", "comment a, b and c", SOLES, QUANTITIES)
     return "\n".join((*head, *(lines or map(line, range(20))), ""))
-
-
-def read(
-    folder: Path, content: str, stated: ReferenceOptions, name: str = "walk.txt"
-) -> ReferenceData:
-    path = folder / name
-    path.write_text(content, encoding="utf-8")
-    return read_reference(path, stated)
 
 
 def test_each_sole_has_its_force_and_its_times(tmp_path: Path) -> None:
@@ -70,26 +63,15 @@ def test_a_packet_that_did_not_arrive_is_no_force_of_zero(tmp_path: Path) -> Non
 def test_a_single_sole_needs_no_mapping(tmp_path: Path) -> None:
     head = "run.loadflux\ncomment \n\tP1-R\t\t\nTime[secs]\tForce[N]\t\n"
     content = head + "".join(f"{i / 100:.3f}\t{i}.5\t\t\n" for i in range(20))
-    np.testing.assert_allclose(
-        read(tmp_path, content, ReferenceOptions()).grf_n, np.arange(20) + 0.5
-    )
+    np.testing.assert_allclose(read(tmp_path, content).grf_n, np.arange(20) + 0.5)
     milliseconds = content.replace("Time[secs]", "Time[ms]")
-    assert read(tmp_path, milliseconds, ReferenceOptions()).time_s[-1] == pytest.approx(19e-5)
+    assert read(tmp_path, milliseconds).time_s[-1] == pytest.approx(19e-5)
 
 
 def test_regions_without_a_sum_are_added_up(tmp_path: Path) -> None:
-    content = "\n".join(
-        [
-            "run.loadflux",
-            "comment",
-            "\tP1-L::heel\tP1-L::toe",
-            "Time[secs]\tForce[N]\tForce[N]",
-            *(f"{i / 100}\t{i}\t1" for i in range(20)),
-        ]
-    )
-    np.testing.assert_allclose(
-        read(tmp_path, content, ReferenceOptions()).grf_n, np.arange(20) + 1.0
-    )
+    head = "run.loadflux\ncomment\n\tP1-L::heel\tP1-L::toe\nTime[secs]\tForce[N]\tForce[N]\n"
+    content = head + "".join(f"{i / 100}\t{i}\t1\n" for i in range(20))
+    np.testing.assert_allclose(read(tmp_path, content).grf_n, np.arange(20) + 1.0)
 
 
 def test_commas_for_tabs_are_read(tmp_path: Path) -> None:
@@ -115,12 +97,12 @@ def test_stamps_that_the_app_rounds_are_spread(tmp_path: Path) -> None:
         (text().replace("AB1-L::medial", "AB1-L"), "sole AB1-L is there twice"),
     ],
 )
-def test_what_is_damaged_is_refused_in_a_sentence(tmp_path: Path, content: str, said: str) -> None:
+def test_a_damaged_text_is_refused(tmp_path: Path, content: str, said: str) -> None:
     with pytest.raises(FileFormatError, match=said):
         read(tmp_path, content, LEFT)
 
 
-def test_a_text_that_is_cut_off_anywhere_never_breaks_the_reader(tmp_path: Path) -> None:
+def test_a_text_cut_off_anywhere_gives_no_other_force(tmp_path: Path) -> None:
     content = text()
     for end in range(0, len(content), 7):
         try:
@@ -128,3 +110,19 @@ def test_a_text_that_is_cut_off_anywhere_never_breaks_the_reader(tmp_path: Path)
         except (FileFormatError, UsageError):
             continue
         assert set(found.grf_n[:-1]) <= {11 * i + 0.75 for i in range(20)}
+
+
+# --- Pedar ----------------------------------------------------------------------------------------
+
+
+def test_pressures_of_a_pedar_insole_are_refused_without_their_areas(tmp_path: Path) -> None:
+    content = (
+        "file name:  A.sol\tdate/time  01.01.26 09.00\nsensor type:  v_1 \n"
+        "total time [secs]:  0.020\ttime per frame [secs]:  0.02000\tscanning rate [Hz]:   50\n"
+        "pressure values in  kPa\n\nmask definition: \nleft insole: 1,2,\nright insole: 1,2,\n\n"
+        "time[secs]    \t      1\t      2\t      1\t      2\n"
+        "    0.02000\t  0.000\t 15.000\t  2.500\t  0.000\n"
+    )
+    with pytest.raises(FileFormatError, match="pressures of 4 sensors in kPa") as caught:
+        read(tmp_path, content, name="walk.asc")
+    assert "areas" in caught.value.what
