@@ -265,8 +265,10 @@ def test_of_a_stance_that_was_not_seen_whole_the_line_says_so(
 
 def test_of_a_cut_stance_a_bound_of_zero_is_left_out(server: Running, open_page: OpenPage) -> None:
     asked = """import("/static/session/stances.js").then(({ FIGURES, figureOf }) =>
-      [0, 0.012].map((s) => figureOf({ begun: false, duration_s: s }, FIGURES[1])[0]))"""
-    assert open_page(f"{server.url}/nodes").evaluate(asked) == ["\u2013", "≥\u00a012"]
+      [0, 0.012].map((s) => ({ begun: false, duration_s: s, duration_sigma_s: 0.01 }))
+        .map((stance) => figureOf(stance, FIGURES[1])))"""
+    found = open_page(f"{server.url}/nodes").evaluate(asked)
+    assert found == [["\u2013", ""], ["≥\u00a012", "±\u00a020"]]
 
 
 def test_a_laptop_shows_four_rows_of_stances_and_the_foot(

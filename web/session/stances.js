@@ -75,9 +75,10 @@ export function figureOf(stance, figure) {
   const { value, sigma, factor, decimals } = figure;
   const [of, sigmaOf] = [stance[value] ?? null, stance[sigma] ?? null];
   const isBound = isLowerBound(stance, figure);
+  if (of === null || (isBound && Number((of * factor).toFixed(decimals)) <= 0)) return ["–", ""];
   return [
-    of === null || (isBound && Number((of * factor).toFixed(decimals)) <= 0) ? "–" : `${isBound ? "≥\u00a0" : ""}${number(of * factor, decimals)}`,
-    of === null || sigmaOf === null ? "" : `±\u00a0${number(Z95 * sigmaOf * factor, decimals)}`,
+    `${isBound ? "≥\u00a0" : ""}${number(of * factor, decimals)}`,
+    sigmaOf === null ? "" : `±\u00a0${number(Z95 * sigmaOf * factor, decimals)}`,
   ];
 }
 
