@@ -106,7 +106,7 @@ def test_a_viewer_is_offered_nothing_and_the_server_refuses_it(
         assert recorded(server) == ["by another one"]
         with page.expect_navigation():
             page.evaluate("(url) => { location.href = url; }", address(server))  # in the same tab
-        expect(page.locator("#record")).to_be_visible()
+        expect(page.locator("#stop")).to_be_visible()
         expect(page.locator("#login")).to_be_hidden()
 
 
