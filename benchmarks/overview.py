@@ -75,7 +75,7 @@ def gathered(path: Path) -> float:
         names = ("grf_n", "grf_sigma_n", "grf_lower_bound_n", "cop_x_m", "cop_y_m", "angle_rad")
         for frames, columns in reader.read_batches(*names, "contact", "estimate_flags", "force_n"):
             began_s = time.process_time()
-            beside.add_frames(frames, columns)
+            beside.try_add_frames(frames, columns)
             spent_s += time.process_time() - began_s
         began_s = time.process_time()
         with tempfile.TemporaryDirectory() as folder:

@@ -210,7 +210,7 @@ NODE_BUSY = "node_busy"
 EVICTED = "evicted"
 CORRUPT = "corrupt"
 NODE_RESTARTED = "node_restarted"
-GIVEN_UP = "given_up"
+ABANDONED = "abandoned"
 REFUSED = "refused"
 
 LossPairs = dict[str, tuple[tuple[int, int], ...]]

@@ -41,7 +41,7 @@ class MountCalibration(CalibrationPart):
     on each tile by its rig calibration, and `a` the angle between its axis and the vertical.
     """
 
-    against: Text
+    reference: Text
     """Session and reference."""
     gains: Annotated[dict[Identifier, Parameter], Field(min_length=1, max_length=_TILES_MAX)]
     """Gains by serial: newtons of the ground on the tile's part of the foot for one of the dome."""
@@ -220,6 +220,19 @@ class Calibration(CalibrationPart):
     def find_mount_gain(self, serial: str) -> Parameter | None:
         """Return a tile's gain as mounted, over that in the rig; None: not measured."""
         return None if self.mounted is None else self.mounted.gains.get(serial)
+
+    def has_assumed_scale(self, serials: Sequence[str]) -> bool:
+        """Return True if the newtons of any of these tiles rest on an assumption.
+
+        A mount gain is measured with a force plate: it makes the scale of its tile a measured one.
+
+        Raises:
+            CalibrationError: a tile is not in it.
+        """
+        return any(
+            tile.absolute_scale == "assumed" and self.find_mount_gain(serial) is None
+            for serial, tile in zip(serials, self.get_tiles(serials), strict=True)
+        )
 
     def to_json(self) -> str:
         """Serialize to the text of a calibration file; its id is checked when read."""

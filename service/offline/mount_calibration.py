@@ -364,7 +364,7 @@ def calibrate_mount(
     }
     which = comparison.session.get("id") or path.name
     mounted = MountCalibration(
-        against=f"session {which} on {options.reference}, {reference_path.name}",
+        reference=f"session {which} on {options.reference}, {reference_path.name}",
         gains=gains,
         shear=mount.shear,
     )

@@ -69,14 +69,15 @@ class CalibrationSummary:
     @classmethod
     def from_calibration(cls, calibration: Calibration) -> CalibrationSummary:
         """Return the summary of a calibration."""
+        serials = tuple(tile.serial for tile in calibration.tiles)
         return cls(
             id=calibration.id,
             name=calibration.name,
             reference=calibration.reference,
             date=calibration.date,
-            serials=tuple(tile.serial for tile in calibration.tiles),
+            serials=serials,
             refused=tuple(calibration.refused),
-            has_assumed_scale=any(tile.absolute_scale == "assumed" for tile in calibration.tiles),
+            has_assumed_scale=calibration.has_assumed_scale(serials),
             has_mount_gains=calibration.mounted is not None,
         )
 

@@ -111,7 +111,7 @@ class DataFolder:
         # The size of some seconds of frames: a full disk still accepts an empty file.
         write_atomically(self.path / _PROBE_NAME, bytes(_PROBE_BYTES))
 
-    def close(self) -> None:
+    def release_lock(self) -> None:
         """Release the lock."""
         self._lock.close()
 

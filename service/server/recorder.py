@@ -146,7 +146,7 @@ class Recorder:
         node = self._nodes.find(session.node)
         if node is not None and session_parts.has_unreadable_journal(session, node):
             # Frames in an unreadable journal are abandoned; later streams have their own journals.
-            self._store.save(session.model_copy(update={"given_up": True}))
+            self._store.save(session.model_copy(update={"is_abandoned": True}))
             self._sealer.extend_node_sessions(node)
             session = self._store.get_session(session_id)
         self._store.save(session_parts.abandon_missing(session, node))

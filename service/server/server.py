@@ -125,7 +125,7 @@ class Server:
                 self.sessions, self.recorder, self.sealer, self.calibration_jobs, self.calibrations
             )
         except FootTileError:
-            self.data_folder.close()
+            self.data_folder.release_lock()
             raise
         self.previews = SessionPreviews(data)
         """Previews of unsealed sessions."""
@@ -215,7 +215,7 @@ class Server:
                     write()
                 except StorageError as error:
                     log.warning("%s", error)
-        self.data_folder.close()
+        self.data_folder.release_lock()
 
     def check_writable(self) -> None:
         """Check that the data folder is writable.

@@ -37,7 +37,7 @@ _UNSENT_NS = 1_000_000_000
 """Time after a hello within which frames may come that the hello did not count."""
 
 
-def make_session_streams(session: Session, node: ServerNode | None) -> dict[str, SessionStream]:
+def collect_stream_facts(session: Session, node: ServerNode | None) -> dict[str, SessionStream]:
     """Return the facts of a session's streams, by stream id."""
     found = {}
     for stream_id in dict.fromkeys(part.stream_id for part in session.parts):
@@ -139,7 +139,7 @@ def reopen_earlier_part(session: Session, node: ServerNode) -> Session:
 def _switch_stream(session: Session, node: ServerNode, part: Part) -> Session:
     """Return the session with its open part closed and another one open."""
     *before, last_part = close_at_stream_end(
-        session, make_session_streams(session, node), server_utc_ns()
+        session, collect_stream_facts(session, node), server_utc_ns()
     ).parts
     tails = {name: n for name, n in session.max_lost_tail_frames.items() if name != part.stream_id}
     parts = (
@@ -156,8 +156,8 @@ def abandon_missing(session: Session, node: ServerNode | None) -> Session:
     """Return the session without its missing frames: its open end is closed."""
     if node is not None:
         session = reopen_earlier_part(session, node)
-    closed = close_unfinished(session, make_session_streams(session, node), server_utc_ns())
-    return closed.model_copy(update={"given_up": True})
+    closed = close_unfinished(session, collect_stream_facts(session, node), server_utc_ns())
+    return closed.model_copy(update={"is_abandoned": True})
 
 
 def iterate_needed_parts(session: Session, node: ServerNode | None) -> Iterator[Part]:
@@ -187,9 +187,9 @@ def list_clock_offsets_since(node: ServerNode, part: Part) -> tuple[ClockOffset,
 def _extend_once(session: Session, node: ServerNode) -> list[Session]:
     """Close the open part and return the session with the next one; empty if undecided."""
     stream_id = session.parts[-1].stream_id
-    if stream_id in node.unreadable_streams and not session.given_up:
+    if stream_id in node.unreadable_streams and not session.is_abandoned:
         return []
-    streams = make_session_streams(session, node)
+    streams = collect_stream_facts(session, node)
     closed = close_at_stop(session, streams, leave_open_while_missing=True)
     if closed.parts[-1].seq_last is not None:
         return [closed]
@@ -229,7 +229,7 @@ def _later_streams(session: Session, node: ServerNode) -> Iterable[str]:
     if stream_id in order:
         return order[order.index(stream_id) + 1 :]
     # Hello no longer lists it: streams that began after its last frame are later.
-    newest = make_session_streams(session, node)[stream_id].find_batch_t_ns_near(
+    newest = collect_stream_facts(session, node)[stream_id].find_batch_t_ns_near(
         NO_END, at_or_before=True
     )
 
@@ -326,7 +326,7 @@ def current_inputs(session: Session, node: ServerNode, *, exact: bool = False) -
 
 def has_unreadable_journal(session: Session, node: ServerNode | None) -> bool:
     """Return whether a journal of the session cannot be read now: its losses are then unknown."""
-    if node is None or session.given_up:
+    if node is None or session.is_abandoned:
         return False
     return any(part.stream_id in node.unreadable_streams for part in session.parts)
 
@@ -346,7 +346,7 @@ def _with_likely_end(
     session: Session, node: ServerNode | None
 ) -> tuple[Session, dict[str, SessionStream]]:
     """Return a session with its likely end, and its streams."""
-    streams = make_session_streams(session, node)
+    streams = collect_stream_facts(session, node)
     with suppress(FootTileError):  # the frames at the stop are damaged
         session = close_at_stop(session, streams)
     return session, streams

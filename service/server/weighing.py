@@ -139,15 +139,17 @@ class Weighing:
             case _:
                 return f"All weights are done: unload {tile}"
 
-    def feed_pressures(self, t_ns: npt.NDArray[np.int64], absolute_kpa: Floats) -> list[Action]:
+    def feed_tile_pressures(
+        self, t_ns: npt.NDArray[np.int64], tile_absolute_kpa: Floats
+    ) -> list[Action]:
         """Feed readings of the tile; return the changes of markers, in order.
 
         Args:
             t_ns: (n,), instants, rising from call to call.
-            absolute_kpa: (n,), absolute pressures; NaN without a reading.
+            tile_absolute_kpa: (n,), of this tile; NaN without a reading.
         """
         actions: list[Action] = []
-        for at_ns, reading_kpa in zip(t_ns.tolist(), absolute_kpa.tolist(), strict=True):
+        for at_ns, reading_kpa in zip(t_ns.tolist(), tile_absolute_kpa.tolist(), strict=True):
             if not np.isfinite(reading_kpa):
                 continue
             at_s = 1e-9 * at_ns

@@ -272,7 +272,7 @@ class Weighings:
         weighing.seen_s = time.monotonic()
         i = node.last_info.serials.index(weighing.present_pass.serial)
         kpa = Compensation(node.last_info.tiles).compute_usable_kpa(frames)[:, i]
-        self._mark(weighing, node, weighing.present_pass.feed_pressures(frames.t_ns, kpa))
+        self._mark(weighing, node, weighing.present_pass.feed_tile_pressures(frames.t_ns, kpa))
         if weighing.present_pass.step != "done":
             return
         if weighing.at + 1 < len(weighing.passes):

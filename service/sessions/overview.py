@@ -62,7 +62,7 @@ class OverviewWriter:
         self._tiles = tiles
         self._pyramid = PyramidBuilder()
 
-    def add_frames(self, frames: FrameBatch, columns: Mapping[str, Array]) -> None:
+    def try_add_frames(self, frames: FrameBatch, columns: Mapping[str, Array]) -> None:
         """Add the next frames with their columns."""
         if self.problem is not None:
             return

@@ -189,7 +189,7 @@ def find_seqs_around(journal: Journal, t_ns: int, *, min_seq: int) -> SeqsAround
     Raises:
         DamagedFramesError: the frames at that time are damaged.
     """
-    last = journal.find_last_seq_once_passed(t_ns, min_seq=min_seq)
+    last = journal.find_part_last_seq_once_passed(t_ns, part_seq_first=min_seq)
     if last is None:
         return None
     # If the clock steps back, frames after that time may have lower numbers than earlier ones.

@@ -338,7 +338,7 @@ def _seal_if_possible(
                 session = session.with_newer_clock_rows(
                     ClockLog(stream.journal.folder).read_undamaged_rows()
                 )
-    is_local, abandon_missing = _is_node_folder(data), abandon_missing or session.given_up
+    is_local, abandon_missing = _is_node_folder(data), abandon_missing or session.is_abandoned
     session = _close_parts(session, own_streams, is_local=is_local, abandon_missing=abandon_missing)
     if any(part.seq_last is None for part in session.parts):
         return RecoveredSession(session, "waiting", "its node may still be recording it")
@@ -385,7 +385,7 @@ def _close_parts(
         try:
             if is_local or abandon_missing:
                 closed = close_unfinished(session, streams)
-                return closed.model_copy(update={"given_up": not is_local})
+                return closed.model_copy(update={"is_abandoned": not is_local})
             return close_at_stop(session, streams, leave_open_while_missing=True)
         except DamagedFramesError as error:  # at the stop: retry without these frames
             _invalidate(own.values(), error)

@@ -61,7 +61,7 @@ def seal_session(inputs: SessionInputs, folder: Path, ledger: Ledger) -> Session
                 writer.add_notes(frames.notes)
             writer.append_frames(batch, columns)
             stances.add_frames(batch.seq, batch.t_ns, columns)
-            overview.add_frames(batch, columns)
+            overview.try_add_frames(batch, columns)
             count += len(batch)
             part = int(columns["part"][0])
             if part != last_part:

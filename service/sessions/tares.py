@@ -361,7 +361,7 @@ class TareHistory:
         entry = self._entries[at] if 0 <= at < len(self._entries) else None
         return entry.tare.t_ns if isinstance(entry, RecordedTare) else otherwise
 
-    def store_tare(self, tare: Tare, info: ArrayInfo, reason: str = "") -> RecordedTare:
+    def store_and_apply_tare(self, tare: Tare, info: ArrayInfo, reason: str = "") -> RecordedTare:
         """Store a tare, which puts it in force.
 
         Args:

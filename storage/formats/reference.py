@@ -22,7 +22,7 @@ from storage.formats.readers.table import (
     SOLE_UNITS,
     STANDARD_UNITS,
     ForceTable,
-    respace_rounded_times_evenly,
+    spread_repeated_times_evenly,
 )
 from storage.formats.readers.text_options import TextOptions
 
@@ -162,7 +162,7 @@ def table_to_reference(table: ForceTable, options: ReferenceOptions) -> Referenc
         time_s, grf_n, cop = time_s[timed], grf_n[timed], [column[timed] for column in cop]
     if len(time_s) < 2:
         raise FileFormatError(f"{len(time_s)} samples", where=where, expected="at least two")
-    time_s, spread_note = respace_rounded_times_evenly(time_s)
+    time_s, spread_note = spread_repeated_times_evenly(time_s)
     notes += filter(None, [spread_note])
     _check_time(time_s, where)
     if abs(time_s[0]) >= PLAUSIBLE_MAX:

@@ -251,15 +251,15 @@ class Journal:
         self._open.write_waiting()
         return time_index.find_batch_t_ns_near(self._segments, near, at_or_before=at_or_before)
 
-    def find_last_seq_once_passed(self, t_ns: int, *, min_seq: int) -> int | None:
+    def find_part_last_seq_once_passed(self, t_ns: int, *, part_seq_first: int) -> int | None:
         """Return the last number at `t_ns` or before, if later frames are stored too.
 
-        None while the stream has not passed `t_ns`. Batches before `min_seq` are skipped;
-        `min_seq` - 1 if all others are later.
+        None while the stream has not passed `t_ns`. Batches before `part_seq_first` are skipped;
+        `part_seq_first` - 1 if all others are later.
         """
         self._open.write_waiting()
-        return time_index.find_last_seq_once_passed(
-            self._segments, t_ns, min_seq=min_seq, read_frames=self.read_frames
+        return time_index.find_part_last_seq_once_passed(
+            self._segments, t_ns, part_seq_first=part_seq_first, read_frames=self.read_frames
         )
 
     def delete_old_segments(self, before_t_ns: int, keep_numbers: Intervals) -> Intervals:

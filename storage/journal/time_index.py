@@ -142,22 +142,22 @@ def _find_nearest_batches(
     return found
 
 
-def find_last_seq_once_passed(
+def find_part_last_seq_once_passed(
     segments: Iterable[Segment],
     t_ns: int,
     *,
-    min_seq: int,
+    part_seq_first: int,
     read_frames: Callable[[int, int], Iterable[FrameBatch]],
 ) -> int | None:
-    """Return the last number at `t_ns` or before, as `Journal.find_last_seq_once_passed`.
+    """Return the last number at `t_ns` or before, as `Journal.find_part_last_seq_once_passed`.
 
     Args:
         segments: segments of the journal.
         t_ns: node's UTC.
-        min_seq: batches before this number are skipped.
+        part_seq_first: batches before this number are skipped.
         read_frames: returns the frames of a batch by its first and last number.
     """
-    segments = [segment for segment in segments if segment.seq_range[1] >= min_seq]
+    segments = [segment for segment in segments if segment.seq_range[1] >= part_seq_first]
     if all(segment.t_ns_last <= t_ns for segment in segments):
         return None
     # Among segments that end before `t_ns` only the last one counts.
@@ -170,18 +170,18 @@ def find_last_seq_once_passed(
             if segment.seq_range[1] == before or segment.t_ns_first <= t_ns < segment.t_ns_last
         ]
     )
-    records = records[records["seq_first"] + records["count"] > min_seq]
+    records = records[records["seq_first"] + records["count"] > part_seq_first]
     is_later_known = any(segment.t_ns_first > t_ns for segment in segments)
     if not is_later_known and not (records["t_ns_last"] > t_ns).any():
         return None
     early = records[records["t_ns_first"] <= t_ns]
     if not len(early):
-        return min_seq - 1
+        return part_seq_first - 1
     newest = seq_range_of(early[early["seq_first"].argmax()])
     rows = sum(
         int(np.searchsorted(batch.t_ns, t_ns, side="right")) for batch in read_frames(*newest)
     )
-    return max(min_seq - 1, newest[0] + rows - 1)
+    return max(part_seq_first - 1, newest[0] + rows - 1)
 
 
 PIECE_FRAMES = 4096

@@ -150,7 +150,7 @@ class Session(_Record):
     """Count by stream_id, of the stream at the stop, if the node was connected."""
     max_lost_tail_frames: dict[str, int] = Field(default_factory=dict)
     """Count by stream_id, of parts that ended because the node went away."""
-    given_up: bool = False
+    is_abandoned: bool = False
     """True: a person has given up the pending frames."""
     take: str | None = None
     """Id of the take that it was recorded in together with other nodes."""

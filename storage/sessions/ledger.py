@@ -19,7 +19,7 @@ import numpy as np
 from devices.errors import FileFormatError
 from devices.frames import FrameBatch
 from storage.frame_rules import mask_impossible_times
-from storage.intervals import CORRUPT, GIVEN_UP, NO_END, NODE_RESTARTED, Intervals, Losses
+from storage.intervals import ABANDONED, CORRUPT, NO_END, NODE_RESTARTED, Intervals, Losses
 from storage.schema import Array
 from storage.sessions.folder import Ledger, Part, PartLedger, Session
 
@@ -143,9 +143,9 @@ def settle_losses(session: Session, streams: Mapping[str, StreamStateT]) -> dict
     for part in session.parts:
         stream = streams[part.stream_id]
         lost, may_come = Losses(stream.lost.to_pairs()), stream.obtainable
-        if session.given_up:
+        if session.is_abandoned:
             lost.add_if_new(stream.damaged, CORRUPT)
-            lost.add_if_new(may_come, GIVEN_UP)
+            lost.add_if_new(may_come, ABANDONED)
             may_come = Intervals()
         lost.add_if_new(stream.damaged - may_come, CORRUPT)
         reaches_end = (

@@ -22,7 +22,6 @@ from service.version import SOFTWARE_VERSION
 from studies.benchmark.draws import (
     BATCH_FRAMES,
     ComparedModelSet,
-    DrawRecording,
     DrawResult,
     DrawTask,
     MeasurementFailure,
@@ -169,19 +168,14 @@ def _measure_scene(
         tile_count=len(scene.tile),
         rate_hz=recording.info.nominal_rate_hz,
         absent_models=list_missing_models(scene.models),
-        assumed_scale=_is_scale_assumed(recording),
+        assumed_scale=recording.calibration.has_assumed_scale(
+            [tile.serial for tile in recording.info.tiles if not tile.reference]
+        ),
         draw_count=len(good),
         frames=Quantiles.from_values([float(draw.frames) for draw in good]),
         model_sets=model_set,
         figures_by_mode_and_label=summarize_model_sets(model_set, good, times_ns),
         failures=(*failures, *not_timed),
-    )
-
-
-def _is_scale_assumed(recording: DrawRecording) -> bool:
-    bearing = [tile.serial for tile in recording.info.tiles if not tile.reference]
-    return any(
-        recording.calibration.get_tile(serial).absolute_scale == "assumed" for serial in bearing
     )
 
 

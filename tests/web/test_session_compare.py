@@ -93,7 +93,7 @@ def test_a_plate_lies_over_our_force_and_no_peak_of_it_hides(
     begin_ns = int(compared.column("t_ns")[0])
     since_s = (kept["t_ns"].to_numpy() - begin_ns) * 1e-9
     theirs_n = kept["reference_grf_n"].to_numpy()
-    page = open_page(url_of(compared, against=folder.name, **view))
+    page = open_page(url_of(compared, reference=folder.name, **view))
     least_n, most_n, first_s, last_s = beside(page)
     if view:
         assert first_s <= view["from"] + 0.01
@@ -111,7 +111,7 @@ def test_figures_of_a_comparison_are_said_in_words_with_limits_met_or_missed(
 ) -> None:
     page = open_page(url_of(compared))
     name = compared.running.http.get(f"{compared.url}/comparisons").json()["items"][0]["name"]
-    page.select_option("#beside", f"against:{name}")
+    page.select_option("#beside", f"reference:{name}")
     says = page.locator("#report-summary")
     expect(says).to_contain_text("1 of 2 limits missed")
     expect(says).to_contain_text(f"Reference clock: {1e3 * LAG_S:.0f}.")
@@ -124,12 +124,12 @@ def test_figures_of_a_comparison_are_said_in_words_with_limits_met_or_missed(
     mean_n = report["figures"]["grf_mae_n"]["mean"]
     assert float(shown.split()[0]) == pytest.approx(mean_n, abs=6e-4)
     expect(page.locator("#report-notes li")).to_have_count(len(report["notes"]))
-    expect(page).to_have_url(re.compile("against="))
+    expect(page).to_have_url(re.compile("reference="))
     beside(page)
     page.select_option("#beside", "")
     expect(page.locator("#report-card")).to_be_hidden()
     expect(page.locator("#legend [data-kind=beside]")).to_have_count(0)
-    expect(page).not_to_have_url(re.compile("against="))
+    expect(page).not_to_have_url(re.compile("reference="))
 
 
 def test_another_session_is_laid_over_by_start_contact_or_marker_and_says_how_far_it_moved(
@@ -300,7 +300,7 @@ def test_a_damaged_comparison_is_said_to_be_and_the_page_stays(
     (folder / "compare.json").write_text('{"reference": "x"}')
     with browser.new_context() as context:  # its console says 422, and is right
         page = context.new_page()
-        page.goto(url_of(compared, against="damaged"))
+        page.goto(url_of(compared, reference="damaged"))
         expect(page.locator("#beside-summary")).to_contain_text(
             "it has no hash: it was cut off or edited"
         )
@@ -314,7 +314,7 @@ def test_axe_has_nothing_to_complain_of_with_something_beside(
     compared: Recording, open_page: OpenPage, size: tuple[int, int]
 ) -> None:
     name = compared.running.http.get(f"{compared.url}/comparisons").json()["items"][0]["name"]
-    page = open_page(url_of(compared, against=name, **{"from": 2, "to": 3}), *size)
+    page = open_page(url_of(compared, reference=name, **{"from": 2, "to": 3}), *size)
     beside(page)
     expect(page.locator("#report-rows tr").nth(5)).to_be_attached()
     page.keyboard.press("ArrowRight")

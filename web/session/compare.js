@@ -54,9 +54,9 @@ export class Compare {
     const sessions = await unlessRefused(api.newestSessions(SESSIONS_MAX), { items: [] });
     const others = sessions.items.filter((one) => one.id !== this.session.id && one.state === "sealed" && one.sha256);
     const query = new URLSearchParams(location.search);
-    const wanted = query.has("against") ? `against:${query.get("against")}` : query.has("with") ? `with:${query.get("with")}` : "";
+    const wanted = ["reference", "with"].filter((key) => query.has(key)).map((key) => `${key}:${query.get(key)}`)[0] ?? "";
     const group = (label, options) => (options.length ? [el("optgroup", { label }, ...options)] : []);
-    const references = this.references.map((one) => el("option", { value: `against:${one.name}`, text: one.name }));
+    const references = this.references.map((one) => el("option", { value: `reference:${one.name}`, text: one.name }));
     const known = others.map((one) => el("option", { value: `with:${one.id}`, text: `${one.name || one.id}, ${one.node}, ${localTime(new Date(one.started_t_ns / 1e6))}` }));
     if (wanted.startsWith("with:") && !others.some((one) => `with:${one.id}` === wanted)) { // an older one, by URL
       known.push(el("option", { value: wanted, text: wanted.slice(5) }));
@@ -79,8 +79,8 @@ export class Compare {
     this.showText("");
     this.updateUrl();
     try {
-      if (wanted.startsWith("against:")) await this.against(wanted.slice(8));
-      else if (wanted.startsWith("with:")) await this.with(wanted.slice(5), align);
+      if (wanted.startsWith("reference:")) await this.showReference(wanted.slice(10));
+      else if (wanted.startsWith("with:")) await this.showSession(wanted.slice(5), align);
     } catch (error) {
       if (!(error instanceof api.Refusal)) throw error;
       this.showText(error.message);
@@ -88,7 +88,7 @@ export class Compare {
   }
 
   /** Show a reference; it has this session's time axis. */
-  async against(name) {
+  async showReference(name) {
     const wanted = this.wanted;
     const found = await api.getComparison(this.session.id, name);
     if (wanted !== this.wanted) return;
@@ -167,7 +167,7 @@ export class Compare {
   /** Write the selection to the URL. */
   updateUrl() {
     const fields = new URLSearchParams(location.search);
-    for (const name of ["with", "against", "align"]) fields.delete(name);
+    for (const name of ["with", "reference", "align"]) fields.delete(name);
     const [kind, ...rest] = (this.wanted ?? "").split(":");
     if (kind) fields.set(kind, rest.join(":"));
     if (kind === "with" && this.align.value && !byId("align-choice").hidden) fields.set("align", this.align.value);

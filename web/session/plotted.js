@@ -126,7 +126,7 @@ export class Plotted {
       await new Compare(this.session, this, offset, references).begin();
     };
     const asked = new URLSearchParams(location.search);
-    if (references.length || asked.has("with") || asked.has("against")) return open();
+    if (references.length || asked.has("with") || asked.has("reference")) return open();
     byId("compare").hidden = false;
     byId("compare").addEventListener("click", () => quietly(async () => {
       await open();

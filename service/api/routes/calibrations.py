@@ -25,7 +25,6 @@ from service.server.broadcast.views import (
     CalibrationView,
     Page,
     View,
-    absolute_scale,
 )
 from service.server.calibrations import JOB_SESSIONS_MAX, CalibrationJob, CalibrationSummary
 from service.server.node import ServerNode
@@ -156,10 +155,8 @@ class NodeCalibrationView(View):
         live, assigned = estimates.live, estimates.assignment.current
         used = None
         if live.calibration is not None and live.calibration_id and live.ranges is not None:
-            used = CalibrationView(
-                id=live.calibration_id,
-                name=live.calibration.name,
-                absolute_scale=absolute_scale(live.ranges),
+            used = CalibrationView.from_calibration(
+                live.calibration, live.calibration_id, live.ranges
             )
         return cls(
             node=node.name,

@@ -41,7 +41,7 @@ def _make_json(found: MountCalibrationResult) -> dict[str, object]:
     mounted, mount = found.calibration.mounted, found.mount_fit
     return {
         "id": found.calibration.id,
-        "against": None if mounted is None else mounted.against,
+        "reference": None if mounted is None else mounted.reference,
         "gains": {}
         if mounted is None
         else {serial: _make_parameter_json(gain) for serial, gain in mounted.gains.items()},

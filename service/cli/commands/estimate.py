@@ -148,7 +148,7 @@ def estimate_command(
                     "begin_s": result.tare_s[0],
                     "end_s": result.tare_s[1],
                 },
-                "asks_for": result.omitted_effects_n,
+                "omitted_effects_n": result.omitted_effects_n,
                 **make_findings_json(result.findings),
             }
         )

@@ -64,7 +64,7 @@ def fit_determined_effects(
         points,
         scale_kpa=tile.range_kpa[1],
         baseline_kpa=baseline_kpa,
-        initial_curve=convert_centred_cubic_to_unit(tile.coefficients),
+        initial_curve=convert_centred_cubic_to_c1_c2_c3(tile.coefficients),
         temperature_effect=soaked,
         reference_delay=reference_delay,
     )
@@ -134,7 +134,7 @@ def _make_dome_model(effects: Effects, tile: TileCalibration, baseline_kpa: floa
         baseline_kpa: absolute pressure unloaded.
     """
     gas, rubber, loop = effects.gas, effects.rubber, effects.hysteresis
-    curve = convert_centred_cubic_to_unit(
+    curve = convert_centred_cubic_to_c1_c2_c3(
         tile.coefficients if rubber is None else rubber.coefficients
     )
     model = DomeModel(curve, tile.range_kpa[1], baseline_kpa, effects.wall_compliance_per_kpa)
@@ -193,7 +193,7 @@ def collect_loadings(recordings: Sequence[Indentation]) -> TileLoadings:
     return TileLoadings(join_loading_points(parts), baseline_kpa)
 
 
-def convert_centred_cubic_to_unit(coefficients: Sequence[float]) -> Floats:
+def convert_centred_cubic_to_c1_c2_c3(coefficients: Sequence[float]) -> Floats:
     """Convert a cubic in u = 2 x - 1 to c1, c2, c3 in x = gauge / range."""
     return np.asarray(np.linalg.solve(_U_OF_X, np.array(coefficients[1:])))
 
@@ -238,7 +238,7 @@ def replay_release_and_tap(
     effects = tile.effects
     # The mean curve of slow strokes contains creep and loop.
     static = DomeModel(
-        convert_centred_cubic_to_unit(tile.coefficients),
+        convert_centred_cubic_to_c1_c2_c3(tile.coefficients),
         tile.range_kpa[1],
         baseline_kpa,
         effects.wall_compliance_per_kpa,

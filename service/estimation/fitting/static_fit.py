@@ -25,15 +25,15 @@ from service.estimation.calibration import (
 from service.estimation.fitting.least_squares import (
     compute_cubic_basis_through_zero,
     compute_curve_n,
-    compute_mean_half_width_95_n,
+    compute_curve_student_t_half_width_95_n,
     compute_new_loading_half_width_95_n,
 )
 from service.estimation.fitting.rig.checks import (
     check_baseline_drift_kpa,
     reject_contradictions,
+    reject_no_load_or_single_repeat,
     reject_poor_fit,
     reject_saturated_reference,
-    reject_unusable_strokes,
     select_before_saturation,
 )
 from service.estimation.fitting.rig.indentation import (
@@ -80,7 +80,7 @@ def fit_static_curve(*recordings: Indentation) -> TileCalibration:
     blocks = average_stroke_blocks(*recordings)
     reject_saturated_reference(recordings, blocks)
     blocks, by_chip = select_before_saturation(recordings, blocks, noise_kpa)
-    reject_unusable_strokes(blocks, where)
+    reject_no_load_or_single_repeat(blocks, where)
     drift_kpa = check_baseline_drift_kpa(recordings)
     # The mean end of the repeats: beyond it there is little data.
     high_kpa = float(np.mean(_repeat_maxima(blocks, blocks.gauge_kpa)))
@@ -194,7 +194,7 @@ def _make_band(tile: TileCalibration) -> tuple[BandPoint, ...]:
     columns = (
         gauge_kpa,
         compute_curve_n(tile, gauge_kpa),
-        compute_mean_half_width_95_n(tile, gauge_kpa),
+        compute_curve_student_t_half_width_95_n(tile, gauge_kpa),
         compute_new_loading_half_width_95_n(tile, gauge_kpa),
     )
     return tuple(

@@ -220,10 +220,7 @@ def make_plan(
             off_n=CONTACT_OFF_SIGMA * unloaded_n,
             min_ns=CONTACT_MIN_NS,
         ),
-        is_scale_assumed=any(
-            entry.absolute_scale == "assumed" and gain is None
-            for entry, gain in zip(entries, gains, strict=True)
-        ),
+        is_scale_assumed=calibration.has_assumed_scale([info.tiles[i].serial for i in bearing]),
         gap_ns=round(GAP_PERIODS * 1e9 / info.nominal_rate_hz),
     )
 

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from devices.frames import ArrayInfo, ServoInfo
+from service.estimation.calibration import Calibration
 from service.estimation.compilation import is_compiling
 from service.estimation.tare.tare import (
     IntervalSource,
@@ -68,6 +69,17 @@ class CalibrationView(View):
     id: str
     name: str
     absolute_scale: Literal["measured", "assumed"]
+
+    @classmethod
+    def from_calibration(
+        cls, calibration: Calibration, calibration_id: str, ranges: TileRanges
+    ) -> CalibrationView:
+        """Return the view of a calibration for an array's tiles."""
+        return cls(
+            id=calibration_id,
+            name=calibration.name,
+            absolute_scale="assumed" if ranges.is_scale_assumed else "measured",
+        )
 
 
 class TareView(View):
@@ -263,11 +275,7 @@ class NodeView(View):
             nominal_rate_hz=info.nominal_rate_hz,
             calibration=None
             if calibration is None or live.calibration_id is None or live.ranges is None
-            else CalibrationView(
-                id=live.calibration_id,
-                name=calibration.name,
-                absolute_scale=absolute_scale(live.ranges),
-            ),
+            else CalibrationView.from_calibration(calibration, live.calibration_id, live.ranges),
             calibration_source=estimates.calibration_source,
             calibration_problem=estimates.calibration_problem,
             tare=TareView.from_recorded(tare) if tare is not None else None,
@@ -430,9 +438,3 @@ def make_tile_views(info: ArrayInfo, ranges: TileRanges | None) -> list[TileView
 
 def _nan_to_none(values: npt.NDArray[np.float64]) -> list[float | None]:
     return [value if math.isfinite(value) else None for value in values.tolist()]
-
-
-def absolute_scale(ranges: TileRanges) -> Literal["measured", "assumed"]:
-    """Return `assumed` if the scale of any of these tiles is an assumption."""
-    assumed = any(e is not None and e.absolute_scale == "assumed" for e in ranges.entries)
-    return "assumed" if assumed else "measured"

@@ -45,12 +45,14 @@ class TileRanges:
         end_kpa: end of each tile's calibrated range.
         full_scale_n: force at that end.
         slope_n_per_kpa: slope near zero.
+        is_scale_assumed: True if the newtons of any of them rest on an assumption.
     """
 
     entries: tuple[TileCalibration | None, ...]
     end_kpa: Floats
     full_scale_n: Floats
     slope_n_per_kpa: Floats
+    is_scale_assumed: bool
 
     @classmethod
     def from_calibration(cls, info: ArrayInfo, calibration: Calibration) -> Self:
@@ -77,6 +79,7 @@ class TileRanges:
                 gain * curves.compute_forces(curves.range_high_kpa[None]).force_n[0]
             ),
             slope_n_per_kpa=by_tile(gain * curves.slope_at_zero_n_per_kpa),
+            is_scale_assumed=calibration.has_assumed_scale([serials[i] for i in bearing]),
         )
 
 

@@ -123,7 +123,9 @@ class TareController:
             TareError: the foot was loaded, or there is nothing to tare.
             StorageError: the tare cannot be stored.
         """
-        recorded = self._history.store_tare(self._live.compute_unloaded_tare(), self._info, reason)
+        recorded = self._history.store_and_apply_tare(
+            self._live.compute_unloaded_tare(), self._info, reason
+        )
         self._put_in_force(recorded)
         return recorded
 
@@ -187,7 +189,7 @@ class TareController:
         # In the history, or lost: the server was restarted, and another tare may have followed.
         is_older = not self._has_seen_lead and self._history.may_have_lost_tare(tare.t_ns)
         if ("lead", tare.t_ns) not in keys and not is_older:
-            self._live.set_tare(self._history.store_tare(tare, self._info).tare)
+            self._live.set_tare(self._history.store_and_apply_tare(tare, self._info).tare)
         self._is_lead_done = True
 
     def _is_flight_check_due(self) -> bool:
@@ -211,7 +213,9 @@ class TareController:
         )
         self._flight_warning = found.rejection
         if found.tare is not None:
-            self._put_in_force(self._history.store_tare(found.tare, self._info, found.reason))
+            self._put_in_force(
+                self._history.store_and_apply_tare(found.tare, self._info, found.reason)
+            )
 
     def _put_in_force(self, recorded: RecordedTare) -> None:
         self._lead_problem = self._flight_warning = None

@@ -304,7 +304,7 @@ class FeedReader:
         self._request_without_rows: Recompute | None = None
         """Last request for which no frame was due."""
 
-    async def events(self) -> AsyncGenerator[FeedEvent, None]:
+    async def iterate_events_forever(self) -> AsyncGenerator[FeedEvent, None]:
         """Yield events without end.
 
         Raises:

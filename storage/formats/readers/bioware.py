@@ -11,14 +11,14 @@ import re
 from devices.errors import FileFormatError
 from storage.formats.readers.device_columns import (
     DeviceColumn,
-    get_force_and_cop_columns,
+    get_vertical_force_and_cop_columns,
     group_columns_by_plate,
     make_plate_signals,
     parse_device_columns,
 )
 from storage.formats.readers.plate_signals import make_plate_table
 from storage.formats.readers.table import ForceTable
-from storage.formats.readers.text import is_number, split_cells_without_empty_end
+from storage.formats.readers.text import is_number, split_trimmed_cells_without_empty_end
 
 FORM = "lines of facts, a line of names that begins with a time, lines of numbers"
 _NAMES = re.compile(
@@ -45,13 +45,13 @@ def parse_bioware_force_and_cop(text: str, where: str, values_max: int) -> Force
     facts = {
         cells[0].strip(" :").lower(): cells[1:]
         for line in text[: found.start()].split("\n")
-        if (cells := split_cells_without_empty_end(line, delimiter))
+        if (cells := split_trimmed_cells_without_empty_end(line, delimiter))
     }
     line, _, rows = text[found.start() :].partition("\n")
-    names = split_cells_without_empty_end(line, delimiter)[1:]
+    names = split_trimmed_cells_without_empty_end(line, delimiter)[1:]
     devices = [*facts.get("device", []), *[""] * len(names)]
     units = [""] * (len(names) + 1)
-    below = split_cells_without_empty_end(rows.partition("\n")[0], delimiter)
+    below = split_trimmed_cells_without_empty_end(rows.partition("\n")[0], delimiter)
     if not any(map(is_number, below)):
         units = [*below, *units]
         rows = rows.partition("\n")[2]
@@ -68,7 +68,7 @@ def parse_bioware_force_and_cop(text: str, where: str, values_max: int) -> Force
         ),
     ]
     plates = group_columns_by_plate(columns, where)
-    indices = [0, *(i for plate in plates for i in get_force_and_cop_columns(plate))]
+    indices = [0, *(i for plate in plates for i in get_vertical_force_and_cop_columns(plate))]
     numbers = parse_device_columns(rows, delimiter, columns, indices, values_max, where)
     notes = []
     stated = next(iter(facts.get("samples (#)", [])), "")

@@ -14,8 +14,8 @@ from storage.formats.readers.plate_signals import PlateSignals
 from storage.formats.readers.text import (
     TextLayout,
     parse_columns,
-    split_cells_without_empty_end,
     split_csv_cells,
+    split_trimmed_cells_without_empty_end,
 )
 
 FORCE_UNITS = {"n": "N", "kn": "kN"}
@@ -97,7 +97,9 @@ def parse_device_columns(
             "there are no numbers below the names", where=where, expected="a whole file"
         )
     width = len(split_csv_cells(first, delimiter))
-    if len(split_cells_without_empty_end(first, delimiter)) > len(columns) or width <= max(indices):
+    if len(split_trimmed_cells_without_empty_end(first, delimiter)) > len(columns) or width <= max(
+        indices
+    ):
         raise FileFormatError(
             f"there are {len(columns)} names for {width} columns of numbers",
             where=where,
@@ -110,7 +112,7 @@ def parse_device_columns(
     return {i: np.asarray(found[names[i]], dtype=np.float64) for i in indices}
 
 
-def get_force_and_cop_columns(plate_columns: dict[str, int]) -> list[int]:
+def get_vertical_force_and_cop_columns(plate_columns: dict[str, int]) -> list[int]:
     """Return the indices of a plate's vertical force and centre of pressure."""
     return [plate_columns["fz"], *_get_cop_columns(plate_columns)]
 

@@ -19,7 +19,7 @@ from storage.formats.readers.text import (
     FORM,
     is_number,
     parse_text_table,
-    split_cells_without_empty_end,
+    split_trimmed_cells_without_empty_end,
 )
 
 _CHANNELS = 6
@@ -33,7 +33,7 @@ def is_netforce(head: str) -> bool:
     A first column that rises from line to line is a time, not a force.
     """
     lines = islice((line for line in head.split("\n") if line.strip()), _INSPECTED_LINES)
-    rows = [split_cells_without_empty_end(line, ",") for line in lines]
+    rows = [split_trimmed_cells_without_empty_end(line, ",") for line in lines]
     if len(rows) == _INSPECTED_LINES or not head.endswith("\n"):
         rows = rows[:-1]  # the last line may be truncated
     width = len(rows[0]) if rows else 0

@@ -17,14 +17,14 @@ from devices.errors import FileFormatError
 from storage.formats.readers.device_columns import (
     FORCE_UNITS,
     DeviceColumn,
-    get_force_and_cop_columns,
+    get_vertical_force_and_cop_columns,
     group_columns_by_plate,
     make_plate_signals,
     parse_device_columns,
 )
 from storage.formats.readers.plate_signals import PlateSignals, make_plate_table
 from storage.formats.readers.table import ForceTable
-from storage.formats.readers.text import split_cells_without_empty_end
+from storage.formats.readers.text import split_trimmed_cells_without_empty_end
 
 FORM = "a section Devices: its rate, lines of devices, names and units, lines of numbers"
 _NAMES = re.compile(r"^\"?Frame\"?(?P<delimiter>[,;\t])\"?Sub ?Frame\"?", re.I | re.M)
@@ -48,15 +48,18 @@ def parse_nexus_force_and_cop(text: str, where: str, values_max: int) -> ForceTa
     for found in _NAMES.finditer(text):
         delimiter = found["delimiter"]
         above = [
-            split_cells_without_empty_end(line, delimiter)
+            split_trimmed_cells_without_empty_end(line, delimiter)
             for line in text[: found.start()].split("\n")[-4:-1]
         ]
         line, _, below = text[found.start() :].partition("\n")
         units, _, rows = below.partition("\n")
         columns = _make_device_columns(
             above[-1] if above else [],
-            split_cells_without_empty_end(line, delimiter),
-            [cell.strip("[]() ") for cell in split_cells_without_empty_end(units, delimiter)],
+            split_trimmed_cells_without_empty_end(line, delimiter),
+            [
+                cell.strip("[]() ")
+                for cell in split_trimmed_cells_without_empty_end(units, delimiter)
+            ],
         )
         try:
             groups = group_columns_by_plate(columns, where)
@@ -77,7 +80,7 @@ def parse_nexus_force_and_cop(text: str, where: str, values_max: int) -> ForceTa
             *(
                 i
                 for group in groups
-                for i in {*get_force_and_cop_columns(group), *_shear_columns(group)}
+                for i in {*get_vertical_force_and_cop_columns(group), *_shear_columns(group)}
             ),
         ]
         numbers = parse_device_columns(rows, delimiter, columns, needed, values_max, where)

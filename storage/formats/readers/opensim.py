@@ -24,7 +24,7 @@ from storage.formats.readers.text import (
     TextLayout,
     parse_columns,
     read_decoded_text,
-    split_cells_without_empty_end,
+    split_trimmed_cells_without_empty_end,
 )
 
 FORM = "a header to the line endheader, a line of names, lines of numbers"
@@ -49,12 +49,12 @@ def read_opensim_table(path: Path, is_needed: ColumnFilter, values_max: int) -> 
     line = rows.partition("\n")[0]
     delimiter = "\t" if "\t" in head and "\t" in line else BLANKS
     names, first = (
-        split_cells_without_empty_end(head, delimiter),
-        split_cells_without_empty_end(line, delimiter),
+        split_trimmed_cells_without_empty_end(head, delimiter),
+        split_trimmed_cells_without_empty_end(line, delimiter),
     )
     if len(first) > 1 and all(map(_VECTOR.fullmatch, first[1:])):
         rows = rows.replace(",", delimiter)
-        first = split_cells_without_empty_end(rows.partition("\n")[0], delimiter)
+        first = split_trimmed_cells_without_empty_end(rows.partition("\n")[0], delimiter)
         vectors = (name if name.endswith(("_v", "_p", "_m")) else f"{name}_" for name in names[1:])
         names = [*names[:1], *(f"{name}{axis}" for name in vectors for axis in "xyz")]
     if len(names) < 2 or (first and len(first) != len(names)):

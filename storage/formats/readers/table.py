@@ -158,7 +158,7 @@ class SpacedTimes(NamedTuple):
     note: str
 
 
-def respace_rounded_times_evenly(time_s: Floats) -> SpacedTimes:
+def spread_repeated_times_evenly(time_s: Floats) -> SpacedTimes:
     """Replace all times by times at a constant rate if rounding made some of them equal.
 
     Times are returned unchanged unless the rate is clear: no time falls, and all deviate from a

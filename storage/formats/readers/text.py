@@ -114,7 +114,7 @@ def parse_text_table(
         raise FileFormatError(f"there is no text below {options.skip_rows} lines", where=where)
     layout = detect_layout(text, where, options)
     if units is not None:
-        cells = split_cells_without_empty_end(units, layout.delimiter)
+        cells = split_trimmed_cells_without_empty_end(units, layout.delimiter)
         layout = replace(layout, units={**layout.units, **_units_by_name(layout.names, cells)})
     needed = select_needed_names(layout.names, is_needed, where)
     columns = parse_columns(text, layout, needed, values_max, where, options.decimal)
@@ -291,7 +291,7 @@ def _detect_named_layout(
     state single values, such as a rate. With `is_first` the first line has the names.
     """
     rows = [
-        (number, split_cells_without_empty_end(line, delimiter))
+        (number, split_trimmed_cells_without_empty_end(line, delimiter))
         for number, line in enumerate(lines)
     ]
     rows = [(number, cells) for number, cells in rows if any(cells)]
@@ -300,7 +300,7 @@ def _detect_named_layout(
     for i, (number, cells) in enumerate(rows[:1] if is_first else rows):
         is_comment = number in comments
         names = (
-            split_cells_without_empty_end(COMMENT_START.sub("", lines[number]), delimiter)
+            split_trimmed_cells_without_empty_end(COMMENT_START.sub("", lines[number]), delimiter)
             if is_comment
             else cells
         )
@@ -324,7 +324,7 @@ def _detect_nameless_layout(
 ) -> TextLayout | None:
     """Return the layout of numbers without a line of names; None if the delimiter does not fit."""
     for number, line in enumerate(lines):
-        cells = split_cells_without_empty_end(line, delimiter)
+        cells = split_trimmed_cells_without_empty_end(line, delimiter)
         if not any(cells) or COMMENT_START.match(line):
             continue
         if all(map(is_number, cells)):
@@ -360,7 +360,7 @@ def split_csv_cells(line: str, delimiter: str) -> list[str]:
         return []
 
 
-def split_cells_without_empty_end(line: str, delimiter: str) -> list[str]:
+def split_trimmed_cells_without_empty_end(line: str, delimiter: str) -> list[str]:
     """Return the cells of a line with normalised blanks, without trailing empty cells."""
     cells = [" ".join(cell.split()) for cell in split_csv_cells(line, delimiter)]
     while cells and not cells[-1]:

@@ -156,8 +156,11 @@ def read_in_flight_of_this_boot(folder: Path) -> InFlightFrames | None:
     return InFlightFrames(info, frames)
 
 
-def read_in_flight_frames_from(folder: Path, seq_first: int) -> FrameBatch | None:
-    """Read the frames that a killed process left from `seq_first` on; None if there are none.
+def read_newest_in_flight_run(folder: Path, next_journal_seq: int) -> FrameBatch | None:
+    """Read the newest run without a gap that a killed process left, from a number on.
+
+    None if there is none, or after a restart of the machine. Frames that the journal has already
+    are left out only by `next_journal_seq`.
 
     Raises:
         DamagedFileError: its content has changed.
@@ -165,9 +168,9 @@ def read_in_flight_frames_from(folder: Path, seq_first: int) -> FrameBatch | Non
     """
     left = read_in_flight_of_this_boot(folder)
     frames = None if left is None else left.frames
-    if frames is None or int(frames.seq[-1]) < seq_first:
+    if frames is None or int(frames.seq[-1]) < next_journal_seq:
         return None
-    return frames.slice_rows(max(0, seq_first - int(frames.seq[0])), len(frames))
+    return frames.slice_rows(max(0, next_journal_seq - int(frames.seq[0])), len(frames))
 
 
 def try_delete_in_flight_file(folder: Path) -> None:

@@ -103,7 +103,9 @@ class RetentionRequests:
             server.required_numbers_of(stream_id) for server in servers
         )
 
-    def numbers_to_retain(self, stream_id: str, acked_by: Mapping[str, Intervals]) -> Intervals:
+    def node_session_or_undelivered_numbers(
+        self, stream_id: str, acked_by: Mapping[str, Intervals]
+    ) -> Intervals:
         """Return the needed numbers that their own server has not acknowledged.
 
         Numbers of the node's own session stay included even if a server has them as well.

@@ -22,7 +22,7 @@ from storage.intervals import CORRUPT, EVICTED, NODE_BUSY, Intervals, Losses, un
 from storage.journal.journal import Journal
 from storage.journal.node.in_flight import (
     IN_FLIGHT_FILE,
-    read_in_flight_frames_from,
+    read_newest_in_flight_run,
     try_delete_in_flight_file,
 )
 from storage.journal.node.retention_requests import RetentionRequests
@@ -163,7 +163,7 @@ class NodeStream:
     def numbers_to_retain(self, requests: RetentionRequests) -> Intervals:
         """Return the numbers that must not be deleted."""
         with self._lock:
-            return requests.numbers_to_retain(self.stream_id, self._acked_by)
+            return requests.node_session_or_undelivered_numbers(self.stream_id, self._acked_by)
 
     # --- frames in and out ------------------------------------------------------------------------
 
@@ -421,7 +421,7 @@ class NodeStream:
             StorageError: they cannot be read now.
         """
         try:
-            new = read_in_flight_frames_from(self.folder, self.next_seq)
+            new = read_newest_in_flight_run(self.folder, self.next_seq)
         except DamagedFileError as error:
             problems.append(set_aside_and_describe(self.folder / IN_FLIGHT_FILE, error))
             self.set_max_lost_tail_in_memory()

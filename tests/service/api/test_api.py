@@ -249,7 +249,7 @@ def test_every_operation_is_described(tmp_path: Path) -> None:
     try:
         schema = make_app(server, logins=Logins(SHARED_TOKEN)).openapi()
     finally:
-        server.data_folder.close()
+        server.data_folder.release_lock()
     ids = []
     for path, operations in schema["paths"].items():
         for method, operation in operations.items():

@@ -64,7 +64,7 @@ def a_foreign_folder(data: Path) -> None:
 
 def another_servers(data: Path) -> None:
     other = data.with_name("other")
-    DataFolder(other).close()
+    DataFolder(other).release_lock()
     other.rename(data)
 
 
@@ -231,7 +231,7 @@ def test_a_folder_is_not_used_before_what_is_open_in_the_one_before_is_closed(
             folder.check_still_in_place()
     folder.relock_same_folder()
     folder.check_still_in_place()
-    folder.close()
+    folder.release_lock()
 
 
 def test_a_copy_that_another_server_has_is_not_taken_from_it(tmp_path: Path) -> None:
@@ -245,7 +245,7 @@ def test_a_copy_that_another_server_has_is_not_taken_from_it(tmp_path: Path) -> 
         with pytest.raises(StorageError, match="another foottile server"):
             folder.relock_same_folder()
     folder.relock_same_folder()
-    folder.close()
+    folder.release_lock()
 
 
 def test_a_place_that_cannot_be_seen_is_a_folder_that_is_gone(
@@ -312,7 +312,7 @@ def test_a_disk_that_is_unmounted_takes_nothing_and_its_mount_point_neither(moun
     with pytest.raises(FolderGoneError, match="nothing in its place"):
         folder.check_writable()
     assert list(mounted.iterdir()) == []
-    folder.close()
+    folder.release_lock()
 
 
 def test_a_start_that_a_full_disk_refuses_leaves_nothing(

@@ -49,7 +49,10 @@ def test_what_is_pulled_proves_itself_file_by_file(sealed: Sealed, tmp_path: Pat
         pull_session(server, sealed.id, tmp_path)
         folder = tmp_path / sealed.id
         report = verify_path(folder)
-        assert (find_verdict(report), report.to_json_dict()["unproven"]) == ("complete", [])
+        assert (find_verdict(report), report.to_json_dict()["unproven"]) == (
+            "complete",
+            [],
+        )
         for path in sorted(folder.iterdir()):
             whole = path.read_bytes()
             path.write_bytes(whole[:40] + bytes([whole[40] ^ 1]) + whole[41:])

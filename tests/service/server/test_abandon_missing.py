@@ -40,7 +40,7 @@ def test_what_is_given_up_of_a_stream_whose_end_is_known_is_counted_frame_by_fra
     answer = session.running.http.post(f"{session.url}/abandon-missing")
     assert answer.status_code == 200, answer.text
     sealed = session.sealed()
-    assert sealed["lost"] == {"given_up": 30}
+    assert sealed["lost"] == {"abandoned": 30}
     assert (sealed["frames"], sealed["max_lost_tail_frames"], sealed["complete"]) == (
         50,
         0,

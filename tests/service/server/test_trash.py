@@ -240,7 +240,7 @@ def test_what_is_given_up_within_a_session_is_lost_for_that_reason(
     assert session.now()["pending_frames"] == 30
     running.http.post(f"{session.url}/abandon-missing")
     done = session.sealed()
-    assert (done["complete"], done["frames"], done["lost"]) == ("lossy", 70, {"given_up": 30})
+    assert (done["complete"], done["frames"], done["lost"]) == ("lossy", 70, {"abandoned": 30})
     ledger = session.ledger()
     assert ledger["parts"][0]["max_lost_tail_frames"] == 0
 

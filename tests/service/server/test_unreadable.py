@@ -60,7 +60,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def _tares(folder: Path) -> None:
-    TareHistory(folder / "tares.json").store_tare(make_tare(2), INFO)
+    TareHistory(folder / "tares.json").store_and_apply_tare(make_tare(2), INFO)
 
 
 def _wanted(folder: Path) -> None:
@@ -70,7 +70,7 @@ def _wanted(folder: Path) -> None:
 
 
 def _server_id(folder: Path) -> None:
-    DataFolder(folder).close()
+    DataFolder(folder).release_lock()
 
 
 def _token(folder: Path) -> None:
@@ -277,7 +277,7 @@ def test_a_session_that_cannot_be_read_stays_as_it_is_and_is_named(
         patched.setattr(durable_files, "_without_following", refuse)
         server = Server(running.data)
         said = " ".join(server.sessions.problems)
-        server.data_folder.close()
+        server.data_folder.release_lock()
     assert "Too many open files" in said
     assert contents(running.data / "sessions") == before
     running.start()

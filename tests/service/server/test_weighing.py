@@ -30,7 +30,9 @@ class Tile:
         t_ns = (self._readings + np.arange(n)) * (1_000_000_000 // RATE_HZ)
         self._readings += n
         noise_kpa = 0.15 * self._rng.standard_normal(n)
-        return self.weighing.feed_pressures(t_ns, EMPTY_KPA + kpa + per_s * since_s + noise_kpa)
+        return self.weighing.feed_tile_pressures(
+            t_ns, EMPTY_KPA + kpa + per_s * since_s + noise_kpa
+        )
 
 
 def labels(actions: list[Action]) -> list[str]:

@@ -204,7 +204,7 @@ def test_a_server_and_recovery_in_its_folder_come_to_the_same_session(
         stream.write(data)
         if tared is not None:
             history = TareHistory(data / "nodes" / "bench" / "tares.json")
-            history.store_tare(make_tare(t_ns=t_ns(tared)), INFO)
+            history.store_and_apply_tare(make_tare(t_ns=t_ns(tared)), INFO)
         recorder, node = server_on(data, begun)
         made = recorder.collect_inputs(ID)
         waiting = recorder.get_ledger(ID)
@@ -215,15 +215,15 @@ def test_a_server_and_recovery_in_its_folder_come_to_the_same_session(
             (one,) = recover_folder(data).sessions
             assert one.outcome == "sealed" or one.ledger == waiting
             keep(data, begun)
-        given_up = session_parts.abandon_missing(begun, node)
+        abandoned = session_parts.abandon_missing(begun, node)
         (one,) = recover_folder(data, abandon_missing=True).sessions
         done = one.session
         assert done.state == "sealed"
-        assert (done.parts, done.given_up) == (given_up.parts, True)
-        assert done.max_lost_tail_frames == given_up.max_lost_tail_frames
-        streams_then = session_parts.make_session_streams(given_up, node)
+        assert (done.parts, done.is_abandoned) == (abandoned.parts, True)
+        assert done.max_lost_tail_frames == abandoned.max_lost_tail_frames
+        streams_then = session_parts.collect_stream_facts(abandoned, node)
         ledger = compute_ledger(
-            given_up.parts, settle_losses(given_up, streams_then), is_finished=True
+            abandoned.parts, settle_losses(abandoned, streams_then), is_finished=True
         )
         assert done.ledger == ledger
         if done.frames and made.problem is not None:

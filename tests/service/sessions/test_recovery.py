@@ -175,7 +175,7 @@ def test_what_is_given_up_is_lost_and_says_so(tmp_path: Path) -> None:
     stream(servers(tmp_path), info_of(), (0, 99), (120, 199))
     session(tmp_path)
     _, ledger = recovered(tmp_path, abandon_missing=True)
-    assert ledger.parts[0].lost == {"given_up": 20}
+    assert ledger.parts[0].lost == {"abandoned": 20}
     assert ledger.parts[0].max_lost_tail_frames == TAIL
     assert loaded(tmp_path).frames == 180
 
@@ -201,9 +201,9 @@ def test_a_session_that_was_stopped_is_ended_by_its_clock(tmp_path: Path) -> Non
 def test_what_was_given_up_before_the_crash_is_not_waited_for(tmp_path: Path) -> None:
     stream(servers(tmp_path), info_of(), (0, 99), (120, 199))
     parts = (Part(stream_id=BOOT, seq_first=0, seq_last=150),)
-    session(tmp_path, state="pending", stopped_t_ns=t_ns(150), parts=parts, given_up=True)
+    session(tmp_path, state="pending", stopped_t_ns=t_ns(150), parts=parts, is_abandoned=True)
     one, ledger = recovered(tmp_path)
-    assert (one.outcome, ledger.parts[0].lost) == ("sealed", {"given_up": 20})
+    assert (one.outcome, ledger.parts[0].lost) == ("sealed", {"abandoned": 20})
 
 
 def test_a_stop_among_frames_that_are_lost_is_placed_by_the_rate(tmp_path: Path) -> None:

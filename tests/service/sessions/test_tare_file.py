@@ -45,7 +45,7 @@ def written(folder: Path, count: int = len(TAKEN)) -> Path:
     tares = TareHistory(path)
     for t_ns, info, source, undone in TAKEN[:count]:
         tare = make_tare(2, baseline_kpa=100.0 + t_ns / 7, t_ns=t_ns, source=source)
-        recorded = tares.store_tare(tare, info)
+        recorded = tares.store_and_apply_tare(tare, info)
         if undone:
             tares.undo_tare(recorded.id)
     return path
@@ -175,7 +175,7 @@ def test_a_tare_after_the_lost_one_puts_all_right_again_and_so_it_stays(tmp_path
     assert found.is_tare_lost(OTHER), "it is not known whose it was"
     assert found.last_non_automatic_or_oldest(INFO) is None
     assert not found.is_empty(INFO)
-    mine = found.store_tare(make_tare(2, t_ns=90, source="flight"), INFO)
+    mine = found.store_and_apply_tare(make_tare(2, t_ns=90, source="flight"), INFO)
     for tares in (found, TareHistory(path)):
         assert tares.problem is None or tares is found
         in_force = tares.tare_in_force(INFO)

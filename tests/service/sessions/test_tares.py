@@ -35,7 +35,7 @@ def test_a_node_that_was_never_tared_has_none(tmp_path: Path) -> None:
 
 def test_the_newest_is_in_force_and_undone_the_one_before(tmp_path: Path) -> None:
     tares = history(tmp_path)
-    one, two, three = (tares.store_tare(tare(t), INFO) for t in (1, 2, 3))
+    one, two, three = (tares.store_and_apply_tare(tare(t), INFO) for t in (1, 2, 3))
     assert tares.tare_in_force(INFO) is three
     tares.undo_tare(three.id)
     same_as_two = tares.tare_in_force(INFO)
@@ -45,7 +45,7 @@ def test_the_newest_is_in_force_and_undone_the_one_before(tmp_path: Path) -> Non
     assert [recorded.undone for recorded in tares.all_tares] == [True, False, True]
     tares.undo_tare(two.id)
     assert tares.tare_in_force(INFO) is None
-    again = tares.store_tare(tare(4), INFO)
+    again = tares.store_and_apply_tare(tare(4), INFO)
     assert tares.tare_in_force(INFO) is again
 
 
@@ -63,7 +63,7 @@ def test_tares_of_other_tiles_do_not_count(tmp_path: Path) -> None:
     tares = history(tmp_path, 1)
     mine = tares.all_tares[0]
     for number, info in enumerate(OTHERS):
-        tares.store_tare(tare(10 + number, tiles=len(info.tiles)), info)
+        tares.store_and_apply_tare(tare(10 + number, tiles=len(info.tiles)), info)
     assert tares.tare_in_force(INFO) is mine
     assert instants(tares.tares_in_force_between(INFO, 0, 100)) == [1]
     for number, info in enumerate(OTHERS):
@@ -76,7 +76,7 @@ def test_a_tare_does_not_count_for_a_part_that_was_swapped(tmp_path: Path) -> No
     swapped = INFO.model_copy(update={"tiles": (INFO.tiles[0], other)})
     assert tares.tare_in_force(swapped) is None
     assert tares.tares_in_force_between(swapped, 0, 100) == ()
-    tares.store_tare(tare(2), swapped)
+    tares.store_and_apply_tare(tare(2), swapped)
     assert instants(history(tmp_path).tares_in_force_between(INFO, 0, 100)) == [1]
 
 
@@ -125,10 +125,10 @@ def test_during_an_interval_are_those_that_were_in_force_at_some_time_of_it(
 
 def test_every_tare_has_a_reason_in_words(tmp_path: Path) -> None:
     tares = history(tmp_path)
-    tares.store_tare(tare(1, source="lead"), INFO)
-    tares.store_tare(tare(2), INFO)
-    tares.store_tare(tare(3), INFO, "new shoe")
-    tares.store_tare(tare(4), INFO, "x" * 500)
+    tares.store_and_apply_tare(tare(1, source="lead"), INFO)
+    tares.store_and_apply_tare(tare(2), INFO)
+    tares.store_and_apply_tare(tare(3), INFO, "new shoe")
+    tares.store_and_apply_tare(tare(4), INFO, "x" * 500)
     assert [recorded.reason for recorded in history(tmp_path).all_tares] == [
         "unloaded lead of the emulation",
         "by hand",
@@ -140,8 +140,8 @@ def test_every_tare_has_a_reason_in_words(tmp_path: Path) -> None:
 def test_an_undone_tare_pauses_automatic_ones_until_somebody_tares(tmp_path: Path) -> None:
     tares = history(tmp_path, 1)
     assert not tares.is_automatic_paused(INFO)
-    one = tares.store_tare(tare(2, source="flight"), INFO)
-    two = tares.store_tare(tare(3, source="flight"), INFO)
+    one = tares.store_and_apply_tare(tare(2, source="flight"), INFO)
+    two = tares.store_and_apply_tare(tare(3, source="flight"), INFO)
     assert not tares.is_automatic_paused(INFO)
     tares.undo_tare(two.id)
     in_force = tares.tare_in_force(INFO)
@@ -150,7 +150,7 @@ def test_an_undone_tare_pauses_automatic_ones_until_somebody_tares(tmp_path: Pat
     assert tares.is_automatic_paused(INFO)
     assert history(tmp_path).is_automatic_paused(INFO), "also after a restart"
     assert not tares.is_automatic_paused(OTHERS[0]), "not for other tiles"
-    by_hand = tares.store_tare(tare(4), INFO)
+    by_hand = tares.store_and_apply_tare(tare(4), INFO)
     assert not tares.is_automatic_paused(INFO)
     tares.undo_tare(by_hand.id)  # else the next automatic one would replace the one restored
     assert tares.is_automatic_paused(INFO)
@@ -161,11 +161,11 @@ def test_automatic_tares_are_held_against_the_last_one_by_hand_or_the_oldest(
 ) -> None:
     tares = history(tmp_path)
     assert tares.last_non_automatic_or_oldest(INFO) is None
-    first = tares.store_tare(tare(1, source="flight"), INFO)
-    tares.store_tare(tare(2, source="flight"), INFO)
+    first = tares.store_and_apply_tare(tare(1, source="flight"), INFO)
+    tares.store_and_apply_tare(tare(2, source="flight"), INFO)
     assert tares.last_non_automatic_or_oldest(INFO) is first
-    by_hand = tares.store_tare(tare(3), INFO)
-    tares.store_tare(tare(4, source="flight"), INFO)
+    by_hand = tares.store_and_apply_tare(tare(3), INFO)
+    tares.store_and_apply_tare(tare(4, source="flight"), INFO)
     assert tares.last_non_automatic_or_oldest(INFO) is by_hand
     tares.undo_tare(by_hand.id)
     anchor = tares.last_non_automatic_or_oldest(INFO)
@@ -179,7 +179,7 @@ def test_automatic_tares_never_push_out_one_that_was_taken_by_hand(
     monkeypatch.setattr("service.sessions.tares.AUTOMATIC_KEPT_MAX", 20)
     tares = history(tmp_path, 0)
     for t in range(1, 301):
-        tares.store_tare(tare(t, source="unloaded" if t % 100 == 0 else "flight"), INFO)
+        tares.store_and_apply_tare(tare(t, source="unloaded" if t % 100 == 0 else "flight"), INFO)
         assert sum(recorded.is_automatic for recorded in tares.all_tares) <= 20
     assert instants([t.tare for t in tares.all_tares if not t.is_automatic]) == [0, 100, 200, 300]
     kept = instants([t.tare for t in tares.all_tares if t.is_automatic])
@@ -194,7 +194,7 @@ def test_automatic_tares_never_push_out_one_that_was_taken_by_hand(
 
 def test_the_history_survives_a_restart_bit_by_bit(tmp_path: Path) -> None:
     tares = history(tmp_path, 1, 2**62)
-    tares.store_tare(tare(5, tiles=1), array("Ü"))
+    tares.store_and_apply_tare(tare(5, tiles=1), array("Ü"))
     tares.undo_tare(tares.all_tares[1].id)
     again = history(tmp_path)
     assert len(again.all_tares) == 3
@@ -223,18 +223,18 @@ def test_a_disk_that_cannot_be_written_leaves_the_history_as_it_was(
     with monkeypatch.context() as patch:
         patch.setattr("os.fsync", refusing(*NO_SPACE))
         with pytest.raises(StorageError, match="No space left"):
-            tares.store_tare(tare(3), INFO)
+            tares.store_and_apply_tare(tare(3), INFO)
         with pytest.raises(StorageError, match="No space left"):
             tares.undo_tare(before[0].id)
     assert tares.all_tares == before
     assert tares.tare_in_force(INFO) is before[1]
     assert instants([recorded.tare for recorded in history(tmp_path).all_tares]) == [1, 2]
     assert not any(recorded.undone for recorded in history(tmp_path).all_tares)
-    tares.store_tare(tare(4), INFO)
+    tares.store_and_apply_tare(tare(4), INFO)
     assert instants([recorded.tare for recorded in history(tmp_path).all_tares]) == [1, 2, 4]
 
 
 def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path: Path) -> None:
     (tmp_path / "node").write_bytes(b"")
     with pytest.raises(StorageError):
-        TareHistory(tmp_path / "node" / "more" / "tares.json").store_tare(tare(), INFO)
+        TareHistory(tmp_path / "node" / "more" / "tares.json").store_and_apply_tare(tare(), INFO)

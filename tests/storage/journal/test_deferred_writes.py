@@ -53,7 +53,7 @@ def test_what_waits_is_written_before_anything_is_read(tmp_path: Path) -> None:
     journal.append_new_frames(part(40, 49))
     assert journal.find_first_batch_seq_since(int(part(45, 45).t_ns[0])) == 40
     journal.append_new_frames(part(50, 59))
-    assert journal.find_last_seq_once_passed(int(part(54, 54).t_ns[0]), min_seq=0) == 54
+    assert journal.find_part_last_seq_once_passed(int(part(54, 54).t_ns[0]), part_seq_first=0) == 54
     assert [m.seq_first for m in journal.read_overlapping_messages(0, 59)] == [0, 30, 40, 50]
 
 

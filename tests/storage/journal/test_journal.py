@@ -265,7 +265,7 @@ def test_the_last_number_before_a_time_is_known_once_it_is_passed(
     for n in order:
         journal.append_new_frames(LONG.slice_rows(n * 5, n * 5 + 5))
     stored = {n for n in members(journal.stored) if n >= at_least}
-    found = journal.find_last_seq_once_passed(t_ns, min_seq=at_least)
+    found = journal.find_part_last_seq_once_passed(t_ns, part_seq_first=at_least)
     if not any(LONG.t_ns[n] > t_ns for n in stored):
         assert found is None
     else:

@@ -25,7 +25,6 @@ from service.server.broadcast.views import (
     CalibrationView,
     TileView,
     View,
-    absolute_scale,
     make_tile_views,
 )
 from service.server.estimates.live_estimator import TileRanges
@@ -132,10 +131,7 @@ def _make_view(
         ranges = None
     calibration_view = None
     if calibration is not None and ranges is not None:
-        scale = absolute_scale(ranges)
-        calibration_view = CalibrationView(
-            id=calibration.id, name=calibration.name, absolute_scale=scale
-        )
+        calibration_view = CalibrationView.from_calibration(calibration, calibration.id, ranges)
     return ArrayView(
         session_id=session_id,
         node=info.node,

@@ -191,7 +191,7 @@ async def stop_session(session_id: str, server: ServerState) -> SessionView:
 async def abandon_missing(session_id: str, server: ServerState) -> SessionView:
     """Seal a pending session without its missing frames, because its node never comes back.
 
-    It is sealed as lossy: the missing frames are lost, reason `given_up`.
+    It is sealed as lossy: the missing frames are lost, reason `abandoned`.
     """
     server.recorder.abandon_missing(session_id)
     session = await server.sealer.wait_until_sealed_or_timeout(session_id, SEAL_TIMEOUT_S)

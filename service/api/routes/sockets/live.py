@@ -97,7 +97,7 @@ class LiveFeedSession:
             "policy": self._policy,
         }
         await self._send_message(encode_json(hello))
-        async with aclosing(self._reader.events()) as items:
+        async with aclosing(self._reader.iterate_events_forever()) as items:
             async for item in items:
                 await self._send_event(item)
 

@@ -129,7 +129,7 @@ _FLAT_NOISE = 0.6  # of the noise of a reading: block means scatter by less
 _RAIL_READINGS = 5  # fewer may be missing by chance
 
 
-def reject_unusable_strokes(blocks: Strokes, where: str) -> None:
+def reject_no_load_or_single_repeat(blocks: Strokes, where: str) -> None:
     """Reject no load, a load of the wrong sign, too small a range, or a single repeat.
 
     Raises:

@@ -55,7 +55,7 @@ def follow(path: Path, weights: tuple[str, ...]) -> Indentation:
     begins: list[int] = []
     for begin in range(0, len(t_ns), 10):
         rows = slice(begin, begin + 10)
-        for action in guide.feed_pressures(t_ns[rows], kpa[rows]):
+        for action in guide.feed_tile_pressures(t_ns[rows], kpa[rows]):
             match action:
                 case Begin(label, _):
                     phase[begin:] = label.removeprefix("T01 ")
@@ -123,7 +123,7 @@ def test_the_command_guides_through_the_weights_and_writes_what_is_accepted(
                 play.force_n = known.force_n
             elif self.step == "empty":
                 play.force_n = 0.0
-            return super().feed_pressures(t_ns, absolute_kpa)
+            return super().feed_tile_pressures(t_ns, absolute_kpa)
 
     monkeypatch.setattr(weighings, "Weighing", Followed)
     monkeypatch.setenv("FOOTTILE_TOKEN", tared.running.shown["Authorization"].split()[-1])

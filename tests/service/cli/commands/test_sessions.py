@@ -142,16 +142,20 @@ def test_estimate_says_which_models_a_recording_asks_for_and_what_they_are_good_
     jumps = ("--load", recording("squat_jump_plate1.csv"), "--load-scale", 0.03, "--cop-scale", 0.2)
     run("simulate", "--scene", "standing", *jumps, "--truth", "--out", "s.parquet")
     whole = run("estimate", "s.parquet", "--out", "e.parquet", "--json").printed()
-    assert whole["asks_for"] == {}
+    assert whole["omitted_effects_n"] == {}
     few = ("estimate", "s.parquet", "--models", "unwrap,static,denoise", "--out", "e.parquet")
     bare = run(*few, "--json").printed()
-    assert {"rubber", "hysteresis"} <= set(bare["asks_for"]) <= {"gas", "rubber", "hysteresis"}
+    assert (
+        {"rubber", "hysteresis"}
+        <= set(bare["omitted_effects_n"])
+        <= {"gas", "rubber", "hysteresis"}
+    )
     said = run(*few).err
-    for name, newtons in bare["asks_for"].items():
+    for name, newtons in bare["omitted_effects_n"].items():
         assert f"model {name!r} is inactive; it would change the GRF by {newtons:.2f} N" in said
     # Each is expected beside all others, so together they are more than what is gained.
     gained_n = bare["accuracy"]["grf_mae_n"] - whole["accuracy"]["grf_mae_n"]
-    assert 0.5 * gained_n < sum(bare["asks_for"].values()) < 4.0 * gained_n
+    assert 0.5 * gained_n < sum(bare["omitted_effects_n"].values()) < 4.0 * gained_n
 
 
 def test_estimating_anew_gives_the_bits_of_the_simulation(run: Run, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from service.estimation.fitting.least_squares import (
     compute_curve_n,
-    compute_mean_half_width_95_n,
+    compute_curve_student_t_half_width_95_n,
     compute_new_loading_half_width_95_n,
     compute_student_t_95,
 )
@@ -39,7 +39,9 @@ def test_the_band_of_the_mean_is_t_times_the_standard_error() -> None:
     )
     gauge_kpa = np.linspace(0.0, tile.range_kpa[1], 7)
     expected_n = 3.182446 * 0.02 * compute_curve_n(tile, gauge_kpa)
-    np.testing.assert_allclose(compute_mean_half_width_95_n(tile, gauge_kpa), expected_n, rtol=1e-6)
+    np.testing.assert_allclose(
+        compute_curve_student_t_half_width_95_n(tile, gauge_kpa), expected_n, rtol=1e-6
+    )
 
 
 def test_the_band_of_a_new_loading_adds_its_own_gain_and_loop() -> None:
@@ -49,7 +51,7 @@ def test_the_band_of_a_new_loading_adds_its_own_gain_and_loop() -> None:
     assert half_n[0] == 0.0
     # 150 N: 4.5 N of gain and 0.5 N of a loop that is open to 150/151.
     assert half_n[1] == pytest.approx(3.182446 * np.hypot(4.5, 0.5 * 150 / 151), rel=1e-6)
-    assert (compute_mean_half_width_95_n(tile, gauge_kpa) == 0.0).all()
+    assert (compute_curve_student_t_half_width_95_n(tile, gauge_kpa) == 0.0).all()
 
 
 def test_a_new_loadings_band_is_t_times_what_the_estimate_takes_as_its_sigma() -> None:

@@ -14,7 +14,7 @@ from service.estimation.effects import WALL_PER_KPA, Effects
 from service.estimation.fitting.dome_model import DomeModel, FittedEffects
 from service.estimation.fitting.effects_fit import (
     collect_loadings,
-    convert_centred_cubic_to_unit,
+    convert_centred_cubic_to_c1_c2_c3,
     fit_determined_effects,
 )
 from service.estimation.fitting.output_error import OutputErrorProblem
@@ -167,7 +167,7 @@ def test_what_a_loading_is_off_by_if_it_is_held_out_is_what_a_fit_without_it_say
     tile = fit_static_curve(recording)
     points, baseline_kpa = collect_loadings([recording])
     static = DomeModel(
-        convert_centred_cubic_to_unit(tile.coefficients),
+        convert_centred_cubic_to_c1_c2_c3(tile.coefficients),
         tile.range_kpa[1],
         baseline_kpa,
         WALL_PER_KPA,

@@ -31,7 +31,7 @@ def mounted_on(
     array: ArrayInfo, gains: dict[str, Parameter], shear: Parameter | None
 ) -> Calibration:
     plan = newton_plan(array, tiles=[newton_tile(tile.serial) for tile in array.tiles])
-    mounted = MountCalibration(against="plate", gains=gains, shear=shear)
+    mounted = MountCalibration(reference="plate", gains=gains, shear=shear)
     return plan.calibration.model_copy(update={"mounted": mounted})
 
 
@@ -112,7 +112,7 @@ def test_newtons_that_a_plate_has_measured_are_assumed_no_more() -> None:
     for serials, assumed in ((("T01", "T02", "T03", "T04"), False), (("T01", "T02"), True)):
         gains = {serial: Parameter(value=1.1, sigma=0.01) for serial in serials}
         calibration = make_paper_shape_preset().model_copy(
-            update={"mounted": MountCalibration(against="plate", gains=gains)}
+            update={"mounted": MountCalibration(reference="plate", gains=gains)}
         )
         again = make_plan(array, calibration, plan.tare, models=("static",))
         e = estimate(again, loaded_frames(held([5, 5, 5, 5])))
@@ -125,7 +125,7 @@ def test_the_mount_calibration_is_part_of_the_id() -> None:
     mounted = calibration.model_copy(
         update={
             "mounted": MountCalibration(
-                against="plate", gains={"T01": Parameter(value=1.1, sigma=0.1)}
+                reference="plate", gains={"T01": Parameter(value=1.1, sigma=0.1)}
             )
         }
     )
@@ -146,4 +146,4 @@ def test_a_mount_that_cannot_be_is_refused(
     gains: dict[str, Parameter], shear: Parameter | None, says: str
 ) -> None:
     with pytest.raises(ValueError, match=says):
-        MountCalibration(against="plate", gains=gains, shear=shear)
+        MountCalibration(reference="plate", gains=gains, shear=shear)
