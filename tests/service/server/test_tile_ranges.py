@@ -16,9 +16,13 @@ ARRAY = make_array([make_tile(0), make_tile(1), make_tile(2, reference=True)])
 
 @pytest.mark.parametrize(
     ("assumed", "mounted", "is_assumed"),
-    [((), (), False), ((0,), (), True), ((0, 1), (0,), True), ((0, 1), (0, 1), False)]
-    + [((2,), (), False)],
-    ids=["none assumed", "one", "one of two mounted", "both mounted", "a reference tile"],
+    [
+        pytest.param((), (), False, id="none assumed"),
+        pytest.param((0,), (), True, id="one assumed"),
+        pytest.param((0, 1), (0,), True, id="one of two mounted"),
+        pytest.param((0, 1), (0, 1), False, id="both mounted"),
+        pytest.param((2,), (), False, id="a reference tile"),
+    ],
 )
 def test_a_mount_gain_makes_an_assumed_scale_a_measured_one(
     assumed: tuple[int, ...], mounted: tuple[int, ...], is_assumed: bool
@@ -37,6 +41,6 @@ def test_a_mount_gain_makes_an_assumed_scale_a_measured_one(
         )
     ranges = TileRanges.from_calibration(ARRAY, calibration)
     assert ranges.is_scale_assumed == is_assumed
-    gain = [1.5 if i in mounted else 1.0 for i in range(2)] + [np.nan]
+    gain = [1.5 if i in mounted else 1.0 for i in range(2)]
     one_n = TileRanges.from_calibration(make_array(1), make_calibration("T01")).full_scale_n[0]
-    np.testing.assert_allclose(ranges.full_scale_n, one_n * np.array(gain))
+    np.testing.assert_allclose(ranges.full_scale_n, one_n * np.array([*gain, np.nan]))
