@@ -64,7 +64,7 @@ def variants(only: list[str]) -> dict[str, tuple[str, ...]]:
 
 def cost(session: Path, words: tuple[str, ...], folder: Path) -> Cost:
     """Of one export."""
-    out = folder / f"out.{FORMATS[words[0]].ending}"
+    out = folder / f"out{FORMATS[words[0]].ending}"
     command = [sys.executable, "-c", _RUN, "export", str(session), "--format", *words]
     begin_s, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
     command += ["--out", str(out)]

@@ -185,7 +185,7 @@ def _download_export(
     with translate_storage_errors(out_folder):
         out_folder.mkdir(parents=True, exist_ok=True)
     end = "end" if selection.end_s is None else f"{selection.end_s:g}s"
-    path = out_folder / f"{stem}_{selection.start_s or 0.0:g}s-{end}.{export_format.ending}"
+    path = out_folder / f"{stem}_{selection.start_s or 0.0:g}s-{end}{export_format.ending}"
     query: dict[str, object] = {
         "format": export_format.name,
         "start_s": selection.start_s,

@@ -11,7 +11,6 @@ import re
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 from devices.errors import (
     DamagedFileError,
@@ -79,15 +78,6 @@ BOOT_ID_PATTERN = re.compile(STREAM_ID_PATTERN)
 HELLO_NAME = "hello.json"
 
 
-class ReceivedFrames(NamedTuple):
-    """Numbers of the frames of one message, and what follows from them."""
-
-    seq_first: int
-    seq_last: int
-    due: list[EstimatedBatch]
-    """Frames whose estimates are due now."""
-
-
 class ServerNode:
     """One node, connected or remembered.
 
@@ -104,8 +94,8 @@ class ServerNode:
         self.estimator = NodeEstimator(folder, hello)
         self.streams: dict[str, ServerStream] = {}
         """Streams by id: stored here, or listed in hello."""
-        self.unreadable_streams: set[str] = set()
-        """Ids of streams whose journals cannot be read now: their frames are unknown."""
+        self.unreadable_streams: dict[str, str] = {}
+        """Streams whose journals cannot be read now, by id: why. Their frames are unknown."""
         self.is_dirty = False
         """True if hello is not saved yet; `save` saves it before its frames are acknowledged."""
         self.has_connected = False
@@ -136,18 +126,19 @@ class ServerNode:
                 except DamagedFileError as error:
                     self._problems.append(f"a journal is left out: {error}")
                 except FootTileError as error:  # a full disk, or another version's file
-                    self.unreadable_streams.add(path.name)
-                    self._problems.append(f"a journal is left out until it can be read: {error}")
+                    text = f"a journal is left out until it can be read: {error}"
+                    self.unreadable_streams[path.name] = text
         self._problems += self.estimator.problems
-        for text in self._problems:
-            log.warning("node %s: %s", self.name, text)
+        for text in self.problems:
+            log.warning("%s", text)
         self.present_stream = self._get_or_create_stream(self.last_info)
         """Stream to which the node adds frames now."""
 
     @property
     def problems(self) -> list[str]:
         """Damage found in its files, and the consequence, as text."""
-        return [f"node {self.name}: {text}" for text in self._problems]
+        found = [*self._problems, *self.unreadable_streams.values()]
+        return [f"node {self.name}: {text}" for text in found]
 
     @property
     def last_info(self) -> ArrayInfo:
@@ -278,8 +269,10 @@ class ServerNode:
         self.is_connected = False
         self._rate_meter.clear()
 
-    def receive_frames(self, stream: ServerStream, payload: bytes, now_t_ns: int) -> ReceivedFrames:
-        """Store one message of frames, and estimate the frames newer than all before.
+    def receive_frames(
+        self, stream: ServerStream, payload: bytes, now_t_ns: int
+    ) -> list[EstimatedBatch]:
+        """Store one message of frames, estimate its newest, and return the estimates due now.
 
         Args:
             stream: stream of the frames.
@@ -293,7 +286,7 @@ class ServerNode:
             frames = stream.decoder.decode(payload)
             if ahead := stream.check_or_refuse_frames(frames, now_t_ns):
                 self._count_ahead_frames(frames, ahead)
-                return ReceivedFrames(int(frames.seq[0]), int(frames.seq[-1]), [])
+                return []
             stream.append_frames(frames, payload, now_t_ns)
         except FileFormatError as error:
             raise LinkError(f"node {self.name!r}: {error}") from error
@@ -302,17 +295,17 @@ class ServerNode:
         first, last = int(frames.seq[0]), int(frames.seq[-1])
         self.last_seen_t_ns = now_t_ns
         if stream is not self.present_stream:
-            return ReceivedFrames(first, last, [])
+            return []
         if self.last_seq is not None and last <= self.last_seq:
             self._update_tare()  # resent for the journal; live is further
-            return ReceivedFrames(first, last, [])
+            return []
         if self.last_seq is not None and first <= self.last_seq:
             frames = frames.slice_rows(self.last_seq + 1 - first, len(frames))
         self.last_seq, self.last_t_ns = last, int(frames.t_ns[-1])
         self._rate_meter.add_frame(int(frames.t_mono_ns[-1]), last)
         due = self.estimator.feed_frames(frames)
         self._update_tare()
-        return ReceivedFrames(first, last, due)
+        return due
 
     def tare_now(self, reason: str = "") -> RecordedTare:
         """Tare from an unloaded interval of the last seconds, and put the tare in force.
@@ -343,7 +336,7 @@ class ServerNode:
                 self._problems.append(f"a journal is left out: {error}")
             except FootTileError:
                 continue
-            self.unreadable_streams.discard(name)
+            del self.unreadable_streams[name]
 
     def to_server_t_ns(self, t_ns: int) -> int:
         """Convert a time of the node's UTC to the server's; unchanged without an offset."""

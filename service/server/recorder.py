@@ -24,7 +24,7 @@ from service.server_clock import server_utc_ns
 from service.sessions.inputs import SessionInputs
 from service.sessions.parts import create_session
 from storage.intervals import NO_END, Intervals, to_open_pairs
-from storage.sessions.folder import Completeness, IdempotencyRecord, Ledger, Session
+from storage.sessions.folder import IdempotencyRecord, Ledger, Session
 from storage.sessions.ledger import group_numbers_by_stream
 
 log = logging.getLogger("foottile.recorder")
@@ -108,7 +108,7 @@ class Recorder:
             take=take,
             request=request,
             missed_slots_at_start=node.present_stream.missed_slots,
-            clock=session_parts.list_clock_offsets_since(node, part),
+            clock=session_parts.list_clock_offsets_since(node.present_stream, part.seq_first),
         )
         return self._store.save(session)
 
@@ -241,10 +241,6 @@ class Recorder:
     def compute_ledger(self, session: Session) -> Ledger:
         """Return the present ledger of a session that may be in the trash."""
         return current_ledger(session, self._nodes.find(session.node))
-
-    def compute_completeness(self, session: Session) -> Completeness:
-        """Return the present completeness of a session."""
-        return self.compute_ledger(session).completeness
 
     def find_problem(self, session: Session) -> str | None:
         """Return the user-visible problem of a session, if any."""

@@ -14,6 +14,7 @@ from contextlib import suppress
 
 from devices.errors import FootTileError
 from service.server.node import ServerNode
+from service.server.streams import ServerStream
 from service.server_clock import server_utc_ns
 from service.sessions.inputs import SessionInputs, make_inputs
 from service.sessions.parts import (
@@ -169,17 +170,17 @@ def iterate_needed_parts(session: Session, node: ServerNode | None) -> Iterator[
             yield Part(stream_id=stream_id, seq_first=0)
 
 
-def list_clock_offsets_since(node: ServerNode, part: Part) -> tuple[ClockOffset, ...]:
-    """Return the present stream's clock measurements since a part begins, and the last before."""
+def list_clock_offsets_since(stream: ServerStream, seq_first: int) -> tuple[ClockOffset, ...]:
+    """Return a stream's clock measurements since a frame, and the last one before."""
     begin_t_ns = (
-        journal.find_batch_t_ns_near(part.seq_first, at_or_before=False)
-        if (journal := node.journal)
+        stream.journal.find_batch_t_ns_near(seq_first, at_or_before=False)
+        if stream.journal is not None
         else None
     )
-    rows = list(node.present_stream.clock_offsets)
+    rows = list(stream.clock_offsets)
     if begin_t_ns is None:
         return tuple(rows[-1:])
-    begin_ns = begin_t_ns - node.last_info.utc_offset_ns
+    begin_ns = begin_t_ns - stream.info.utc_offset_ns
     before = [number for number, row in enumerate(rows) if row.t_mono_ns <= begin_ns]
     return tuple(rows[before[-1] if before else 0 :])
 

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from storage.formats.slice import Slice
 from storage.schema import Array
 from storage.sessions.comparisons import (
     SERIES_NAME,
@@ -56,14 +55,14 @@ class ComparisonSeries:
         frames = _make_bins(table, self._gap_ns)
         self._levels = build_levels(merge_bins(frames, FRAMES_PER_FINEST_BIN)) if len(table) else []
 
-    def get_bins(self, begin_ns: int, time_slice: Slice, min_bins: int) -> MergedBins:
+    def get_bins(self, begin_ns: int | None, end_ns: int | None, min_bins: int) -> MergedBins:
         """Return a slice as `min_bins` to four times as many bins.
 
         Fewer where there are fewer frames, and more where gaps split them: no bin spans a gap.
 
         Args:
-            begin_ns: time of the session's first frame.
-            time_slice: time interval; its columns are ignored.
+            begin_ns: begin of the slice, node's UTC; None: of the session.
+            end_ns: end of the slice, exclusive; None: of the session.
             min_bins: least number of bins.
 
         Returns:
@@ -75,13 +74,12 @@ class ComparisonSeries:
             DamagedFileError: a row group is damaged.
             StorageError: it cannot be read now.
         """
-        bounds_ns = time_slice.compute_bounds_ns(begin_ns)
         for above in reversed(range(len(self._levels))):
-            found = _slice_bins(self._levels[above], *bounds_ns)
+            found = _slice_bins(self._levels[above], begin_ns, end_ns)
             if len(found["frames"]) >= min_bins:
                 return MergedBins(found, FRAMES_PER_FINEST_BIN * BINS_PER_COARSER_BIN**above)
         bins = _make_bins(
-            read_comparison_series_range(self._folder, self._footer, *bounds_ns), self._gap_ns
+            read_comparison_series_range(self._folder, self._footer, begin_ns, end_ns), self._gap_ns
         )
         size = 1
         while len(bins["frames"]) // (size * BINS_PER_COARSER_BIN) >= min_bins:

@@ -156,7 +156,9 @@ class NodeCalibrationView(View):
         used = None
         if live.calibration is not None and live.calibration_id and live.ranges is not None:
             used = CalibrationView.from_calibration(
-                live.calibration, live.calibration_id, live.ranges
+                live.calibration,
+                live.calibration_id,
+                is_scale_assumed=live.ranges.is_scale_assumed,
             )
         return cls(
             node=node.name,

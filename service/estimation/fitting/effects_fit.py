@@ -96,7 +96,8 @@ def _subtract_recovery(
     if not before:
         return soaking
     last = max(before, key=lambda i: ends_ns[i])
-    points = extract_loading_points(pressed[last], measure_initial_unloaded(pressed[last]))
+    zero = measure_initial_unloaded(pressed[last])
+    points = extract_loading_points(pressed[last], zero.reference_zero_n, zero.noise_kpa)
     since_s = (soak_ns - ends_ns[last]) * 1e-9
     t_s = np.concatenate([points.t_s, points.t_s[-1] + since_s])
     force_n = np.concatenate([points.force_n, np.zeros(len(since_s))])
@@ -188,7 +189,7 @@ def collect_loadings(recordings: Sequence[Indentation]) -> TileLoadings:
     baseline_kpa = float(np.mean([zero.baseline_kpa for zero in zeros]))
     parts = []
     for recording, zero in zip(recordings, zeros, strict=True):
-        part = extract_loading_points(recording, zero)
+        part = extract_loading_points(recording, zero.reference_zero_n, zero.noise_kpa)
         parts.append(replace(part, kpa=part.kpa - (zero.baseline_kpa - baseline_kpa)))
     return TileLoadings(join_loading_points(parts), baseline_kpa)
 

@@ -74,7 +74,7 @@ def compute_newest_unloaded_tare(
     begins_ns = begins_ns[begins_ns <= last_ns][::-1]
     firsts = np.searchsorted(since_ns, begins_ns)
     ends = np.searchsorted(since_ns, begins_ns + window_ns, side="right")
-    windows = recent.find_quiet_windows(zip(firsts.tolist(), ends.tolist(), strict=True), usual_kpa)
+    windows = recent.select_quiet_windows(map(slice, firsts.tolist(), ends.tolist()), usual_kpa)
     if not windows:
         raise TareError(
             "the foot moved or was loaded all the time in the last seconds",

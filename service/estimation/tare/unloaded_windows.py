@@ -196,18 +196,19 @@ class TareFrames:
         noise_kpa[known] = np.nanstd(steps_kpa[:, known], axis=0) / np.sqrt(2.0)
         return noise_kpa
 
-    def find_quiet_windows(
-        self, spans: Iterable[tuple[int, int]], noise_kpa: Floats
+    def select_quiet_windows(
+        self, candidate_rows: Iterable[slice], noise_kpa: Floats
     ) -> list[QuietWindow]:
-        """Return the windows among `spans` in which every tile is quiet and still.
+        """Return the candidates in which every tile is quiet and still.
 
         Args:
-            spans: first row, and row after the last, of each window.
+            candidate_rows: rows of each window.
             noise_kpa: (tiles,), noise of an unloaded tile.
         """
         found = []
-        for first, end in spans:
-            kpa, n = self.kpa[first:end], end - first
+        for rows in candidate_rows:
+            kpa = self.kpa[rows]
+            n = len(kpa)
             if n < FRAMES_MIN or not np.isfinite(kpa).all():
                 continue
             sigma_kpa = noise_kpa / np.sqrt(n)
@@ -216,7 +217,7 @@ class TareFrames:
             # Each half has sqrt(2) times the mean's uncertainty, so their difference has twice it.
             still = np.abs(drift_kpa) < STILL_SIGMAS * 2.0 * sigma_kpa
             if (quiet & still).all():
-                found.append(QuietWindow(slice(first, end), kpa.mean(axis=0), sigma_kpa))
+                found.append(QuietWindow(rows, kpa.mean(axis=0), sigma_kpa))
         return found
 
     def compute_tare(self, rows: Bools | slice, source: TareSource) -> Tare:
@@ -404,7 +405,7 @@ def _find_unloaded_rows(seen: TareFrames, calibration: Calibration) -> slice:
     noise_kpa = np.where(seen.is_calibrated, seen.rig_noise_kpa, seen.step_noise_kpa)
     begins_ns = compute_nonempty_window_starts(seen.since_ns, 0, WINDOW_NS // 2, WINDOW_NS)
     firsts, ends = np.searchsorted(seen.since_ns, [begins_ns, begins_ns + WINDOW_NS])
-    windows = seen.find_quiet_windows(zip(firsts.tolist(), ends.tolist(), strict=True), noise_kpa)
+    windows = seen.select_quiet_windows(map(slice, firsts.tolist(), ends.tolist()), noise_kpa)
     near = [
         window
         for window in windows

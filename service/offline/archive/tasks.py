@@ -186,7 +186,7 @@ class ExportTask:
 
     def process_session(self, source: Path, result_folder: Path) -> dict[str, Any]:
         """See `SessionTask`."""
-        name = f"{Path(FRAMES_NAME).stem}.{get_format(self.export.to).ending}"
+        name = f"{Path(FRAMES_NAME).stem}{get_format(self.export.to).ending}"
         done = export_session(get_sealed_frames_path(source), result_folder / name, self.export)
         left_out = {
             marker.marker.label: marker.exclusion_reason for marker in done.left_out_markers

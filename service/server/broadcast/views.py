@@ -72,13 +72,13 @@ class CalibrationView(View):
 
     @classmethod
     def from_calibration(
-        cls, calibration: Calibration, calibration_id: str, ranges: TileRanges
+        cls, calibration: Calibration, calibration_id: str, *, is_scale_assumed: bool
     ) -> CalibrationView:
-        """Return the view of a calibration for an array's tiles."""
+        """Return the view of a calibration."""
         return cls(
             id=calibration_id,
             name=calibration.name,
-            absolute_scale="assumed" if ranges.is_scale_assumed else "measured",
+            absolute_scale="assumed" if is_scale_assumed else "measured",
         )
 
 
@@ -275,7 +275,9 @@ class NodeView(View):
             nominal_rate_hz=info.nominal_rate_hz,
             calibration=None
             if calibration is None or live.calibration_id is None or live.ranges is None
-            else CalibrationView.from_calibration(calibration, live.calibration_id, live.ranges),
+            else CalibrationView.from_calibration(
+                calibration, live.calibration_id, is_scale_assumed=live.ranges.is_scale_assumed
+            ),
             calibration_source=estimates.calibration_source,
             calibration_problem=estimates.calibration_problem,
             tare=TareView.from_recorded(tare) if tare is not None else None,

@@ -65,13 +65,17 @@ class C3dFile:
         return np.empty(0) if value is None or isinstance(value, list) else value
 
     def get_channel_texts(self, parameter_name: str) -> list[str]:
-        """Return a text parameter of ANALOG, one a channel; beyond 255 from NAME2 and so on."""
+        """Return a text parameter of ANALOG, one a channel; empty where none is stated.
+
+        Channels beyond 255 have theirs in NAME2 and so on.
+        """
         more = (f"{parameter_name}{number}" for number in range(2, 2 + self.channel_count // 255))
-        return [
+        texts = [
             text
             for one in (parameter_name, *more)
             for text in self.get_texts_or_empty("ANALOG", one)
         ]
+        return texts + [""] * (self.channel_count - len(texts))
 
     def get_scaled_samples(self, channels: Sequence[int]) -> Floats:
         """Return the scaled samples of channels, (len(channels), n), each in its unit.

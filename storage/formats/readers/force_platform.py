@@ -130,7 +130,7 @@ def _read_plate(file: C3dFile, i: int, values_max: int) -> PlateSignals:
     channels = file.get_scaled_samples([n - 1 for n in numbers])
     notes = [*_mask_unrecorded_samples(file, numbers, channels)]
     stated = file.get_channel_texts("UNITS")
-    units = [stated[n - 1].strip() if n <= len(stated) else "" for n in numbers]
+    units = [stated[n - 1].strip() for n in numbers]
     force = _common_unit(
         {_FORCE_UNITS.get(units[at].lower()) for at in _VERTICAL_FORCE_CHANNELS.get(kind, ())}
     )

@@ -210,11 +210,7 @@ def _metadata_texts(
         "SHEAR": "not measured: Fx, Fy and Mz are 0",
         "EVENTS": text,
     }
-    return texts | (
-        {}
-        if reaction.server_time_bound_s is None
-        else format_largest_clock_bound(reaction.server_time_bound_s)
-    )
+    return texts | format_largest_clock_bound(reaction.server_time_bound_s)
 
 
 def _extra_channels(reaction: GroundReaction, export: Export) -> Iterator[Channel]:

@@ -60,8 +60,8 @@ class ExportFormat:
 
     @property
     def ending(self) -> str:
-        """Ending of its files, without the dot."""
-        return self.suffix or self.name
+        """Ending of its files, with the dot."""
+        return f".{self.suffix or self.name}"
 
     @property
     def missing(self) -> str | None:

@@ -332,11 +332,6 @@ def _make_notes(foot: ExportedFoot, filled: pa.Table) -> dict[str, object]:
         f"frame, as the body {foot.body!r}; where the ground is in the model is not known"
     )
     steady = foot.reaction.resampling
-    bound = (
-        {}
-        if foot.reaction.server_time_bound_s is None
-        else format_largest_clock_bound(foot.reaction.server_time_bound_s)
-    )
     return {
         **format_metadata(foot.export, steady.begin_ns),
         "AXES": to_ascii_line(axes),
@@ -349,7 +344,7 @@ def _make_notes(foot: ExportedFoot, filled: pa.Table) -> dict[str, object]:
         "ROWS": len(foot.loads.table),
         "FILLED_ROWS": dict(by_reason),
         "MARKS": foot.reaction.marker_count,
-        **bound,
+        **format_largest_clock_bound(foot.reaction.server_time_bound_s),
     }
 
 

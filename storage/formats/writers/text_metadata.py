@@ -66,12 +66,14 @@ def _completeness_text(notes: Mapping[str, object], source: Mapping[str, object]
     return f"{text}; {missed} slots in which no frame was taken" if missed else text
 
 
-def format_largest_clock_bound(uncertainty_s: Floats) -> dict[str, str]:
-    """Return the metadata entry with the largest bound of the server's time.
+def format_largest_clock_bound(uncertainty_s: Floats | None) -> dict[str, str]:
+    """Return the metadata entry with the largest bound of the server's time; empty if unknown.
 
     Args:
-        uncertainty_s: bound of each sample; NaN for samples without frames.
+        uncertainty_s: bound of each sample; NaN for samples without frames. None: no clock.
     """
+    if uncertainty_s is None or not np.isfinite(uncertainty_s).any():
+        return {}
     return {
         "CLOCK_UNCERTAINTY": f"the truth is within {np.nanmax(uncertainty_s) * 1e3:.3f} ms of the "
         "axis at most; between two sessions, within the sum of both"

@@ -49,7 +49,7 @@ def test_every_format_that_holds_several_has_all_sessions_in_the_order_of_their_
         assert (
             answer.headers["foottile-markers"] == "placed=0, left-out=1"
         )  # it was not so long ago
-        name = f"both_take-{take.id}.{FORMATS[to].ending}"
+        name = f"both_take-{take.id}{FORMATS[to].ending}"
         assert answer.headers["content-disposition"] == f'attachment; filename="{name}"'
 
 

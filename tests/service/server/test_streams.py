@@ -75,7 +75,7 @@ class Told:
     def take(self, first: int, last: int, boot: str = NEW) -> list[int]:
         """Numbers whose estimates are due then."""
         payload = encode_frames(frames(first, last, boot), wire_schema(self.info[boot]))
-        *_, due = self.node.receive_frames(self.node.streams[boot], payload, UTC_NS)
+        due = self.node.receive_frames(self.node.streams[boot], payload, UTC_NS)
         return [int(seq) for batch, _ in due for seq in batch.seq]
 
     def synced(self) -> dict[str, Intervals]:

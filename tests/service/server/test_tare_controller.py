@@ -95,7 +95,7 @@ class Foot:
         for begin in range(0, len(frames), BATCH):
             rows = frames.slice_rows(begin, begin + BATCH)
             now_t_ns = UTC_NS + int(rows.t_mono_ns[-1])
-            _, _, due = self.node.receive_frames(
+            due = self.node.receive_frames(
                 self.node.present_stream, encode_frames(rows, schema), now_t_ns
             )
             self.due += [int(seq) for piece, _ in due for seq in piece.seq]

@@ -20,7 +20,6 @@ from storage.sessions.comparisons import SERIES_NAME, SERIES_SCHEMA, write_compa
 from storage.sessions.pyramid import Bins
 
 BEGIN_NS = 1_700_000_000_000_000_000
-ALL = Slice()
 
 
 def series(t_ms: Any, ours_n: Any, reference_n: Any) -> pa.Table:
@@ -70,7 +69,7 @@ def test_no_peak_of_the_reference_hides_and_no_bin_reaches_over_a_gap(
         patch.setattr(storage.sessions.comparisons, "_GROUP_ROWS", 50)
         found = kept(folder, series(t_ms, ours_n, theirs_n))
     part = Slice(1e-3 * begin, 1e-3 * (begin + length))
-    bins, size = found.get_bins(BEGIN_NS, part, points)
+    bins, size = found.get_bins(*part.compute_bounds_ns(BEGIN_NS), points)
     inside = np.flatnonzero((t_ms >= begin) & (t_ms < begin + length))
     rows = [rows_of(bins, i, t_ms) for i in range(len(bins["frames"]))]
     assert bins["frames"].tolist() == [len(each) for each in rows]
@@ -103,14 +102,14 @@ def test_a_zoom_costs_the_same_wherever_it_is_and_however_long_the_series(
         return within(folder, footer, *bounds_ns)
 
     monkeypatch.setattr(service.sessions.comparison_series, "read_comparison_series_range", counted)
-    for part in (ALL, Slice(0.0, 550.0), Slice(100.0, 400.0)):
-        bins, size = whole.get_bins(BEGIN_NS, part, 500)
+    for part in (Slice(), Slice(0.0, 550.0), Slice(100.0, 400.0)):
+        bins, size = whole.get_bins(*part.compute_bounds_ns(BEGIN_NS), 500)
         assert 500 <= len(bins["frames"]) <= 2000 + 2
         assert size >= 64
         assert bins["error_n_max"].max() == 0.0
     assert read == []
     for start_s in (0.0, 300.0, 595.0):
-        bins, size = whole.get_bins(BEGIN_NS, Slice(start_s, start_s + 2.0), 800)
+        bins, size = whole.get_bins(*Slice(start_s, start_s + 2.0).compute_bounds_ns(BEGIN_NS), 800)
         assert (len(bins["frames"]), size) == (1000, 1)
     assert read == [1, 1, 1]
 
@@ -133,7 +132,7 @@ def test_it_is_read_whole_once_and_again_when_it_is_another(
     write_comparison_series(tmp_path / SERIES_NAME, series([0, 2], [1.0, 1.0], [5.0, 2.0]))
     second = series_kept.get_or_read(tmp_path)
     assert second is not None
-    assert second.get_bins(BEGIN_NS, ALL, 10)[0]["reference_grf_n_max"].tolist() == [5.0, 2.0]
+    assert second.get_bins(None, None, 10)[0]["reference_grf_n_max"].tolist() == [5.0, 2.0]
     assert len(read) == 2
     for folder in (tmp_path / str(i) for i in range(6)):
         folder.mkdir()
@@ -144,16 +143,16 @@ def test_it_is_read_whole_once_and_again_when_it_is_another(
 
 def test_what_is_asked_for_is_some_time_of_it_and_nothing_is_no_error(tmp_path: Path) -> None:
     table = kept(tmp_path, series(range(0, 100, 2), [1.0] * 50, [2.0] * 50))
-    bins, size = table.get_bins(BEGIN_NS, Slice(start_s=0.01, end_s=0.02), 100)
+    bins, size = table.get_bins(*Slice(start_s=0.01, end_s=0.02).compute_bounds_ns(BEGIN_NS), 100)
     assert size == 1
     assert ((bins["t_first_ns"] - BEGIN_NS) * 1e-6).tolist() == pytest.approx([10, 12, 14, 16, 18])
-    bins, _ = table.get_bins(BEGIN_NS, Slice(start_s=5.0), 100)
+    bins, _ = table.get_bins(*Slice(start_s=5.0).compute_bounds_ns(BEGIN_NS), 100)
     assert {len(values) for values in bins.values()} == {0}
 
 
 def test_bins_are_broken_where_something_is_missing(tmp_path: Path) -> None:
     t_ms = [*range(0, 20, 2), *range(100, 120, 2)]
-    bins, size = kept(tmp_path, series(t_ms, [1.0] * 20, [2.0] * 20)).get_bins(BEGIN_NS, ALL, 3)
+    bins, size = kept(tmp_path, series(t_ms, [1.0] * 20, [2.0] * 20)).get_bins(None, None, 3)
     assert size == 4
     assert bins["frames"].tolist() == [4, 4, 2, 4, 4, 2]
     assert bins["missing"].tolist() == [0, 0, 0, 1, 0, 0]

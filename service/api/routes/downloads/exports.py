@@ -189,7 +189,7 @@ async def export_response(
     first = await run_in_threadpool(next, chunks, None)
     if first is None:
         raise UsageError("the session has no frames")
-    headers["Content-Disposition"] = f'attachment; filename="{stem}.{query.format_spec.ending}"'
+    headers["Content-Disposition"] = f'attachment; filename="{stem}{query.format_spec.ending}"'
     return StreamingResponse(
         iterate_chunks(chunks, first), headers=headers, media_type=query.format_spec.media_type
     )

@@ -8,7 +8,6 @@ opens the incomplete archive.
 from __future__ import annotations
 
 import hashlib
-import io
 import time
 import zipfile
 from collections.abc import Generator, Iterable
@@ -24,6 +23,7 @@ from devices.errors import DamagedFileError, StateError, StorageError, UnknownEr
 from service.api.routes.common import ServerState, problem_responses, require_file
 from service.api.routes.downloads.exports import iterate_chunks
 from storage.clock.table import CLOCK_NAME
+from storage.formats.writers.format import DrainedBuffer
 from storage.sessions.folder import FRAMES_NAME, Session
 from storage.sessions.metadata import MARKERS_NAME, SESSION_NAME
 from storage.sessions.stances import STANCES_NAME
@@ -54,7 +54,7 @@ def stream_zip(sessions: Iterable[ZippedSession]) -> Generator[bytes, None, None
         DamagedFileError: a session's frames differ from the sealed ones.
         StorageError: a file cannot be read, or was removed.
     """
-    sink = _DrainedBuffer()
+    sink = DrainedBuffer()
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_STORED, allowZip64=True) as file:
         for session in sessions:
             yield from _put(file, sink, session.folder / FRAMES_NAME, session.frames_sha256)
@@ -67,7 +67,7 @@ def stream_zip(sessions: Iterable[ZippedSession]) -> Generator[bytes, None, None
 
 
 def _put(
-    file: zipfile.ZipFile, sink: _DrainedBuffer, path: Path, sha256: str | None = None
+    file: zipfile.ZipFile, sink: DrainedBuffer, path: Path, sha256: str | None = None
 ) -> Generator[bytes, None, None]:
     found = hashlib.sha256()
     try:
@@ -86,29 +86,6 @@ def _put(
     if sha256 is not None and found.hexdigest() != sha256:
         raise DamagedFileError("its bytes are not those that were sealed", where=str(path))
     yield sink.drain()
-
-
-class _DrainedBuffer(io.RawIOBase):
-    """Buffer of written bytes until they are drained; not seekable, which zipfile detects."""
-
-    def __init__(self) -> None:
-        self._pieces: list[bytes] = []
-
-    def writable(self) -> bool:
-        """Return True."""
-        return True
-
-    def write(self, chunk: object) -> int:
-        """Append a chunk."""
-        content = bytes(chunk)  # type: ignore[call-overload]  # any object with a buffer
-        self._pieces.append(content)
-        return len(content)
-
-    def drain(self) -> bytes:
-        """Remove and return the bytes written since the last call."""
-        content = b"".join(self._pieces)
-        self._pieces.clear()
-        return content
 
 
 router = APIRouter(prefix="/sessions", tags=["data"])

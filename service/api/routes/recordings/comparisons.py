@@ -196,7 +196,7 @@ def _encode_series(session: Session, name: str, query: SeriesQuery, server: Serv
     with server.sessions.open_frames(session.id, only_slices=True) as reader:
         begin_ns, end_ns = reader.read_span_ns()
     part = Slice(query.start_s, query.end_s)
-    bins, size = cached.get_bins(begin_ns, part, query.points)
+    bins, size = cached.get_bins(*part.compute_bounds_ns(begin_ns), query.points)
     columns = {column: values for column, values in bins.items() if column != "part"}
     times = {
         f"t_{which}_s": (columns.pop(f"t_{which}_ns") - begin_ns) * 1e-9

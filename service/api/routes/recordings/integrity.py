@@ -131,7 +131,9 @@ def _make_view(
         ranges = None
     calibration_view = None
     if calibration is not None and ranges is not None:
-        calibration_view = CalibrationView.from_calibration(calibration, calibration.id, ranges)
+        calibration_view = CalibrationView.from_calibration(
+            calibration, calibration.id, is_scale_assumed=ranges.is_scale_assumed
+        )
     return ArrayView(
         session_id=session_id,
         node=info.node,

@@ -248,8 +248,11 @@ async def list_sessions(
     since_t_ns = choice.from_t_ns or 0
     listed = server.sessions.iterate_newest_first(min(ends, default=None))
     recent = takewhile(lambda session: session.started_t_ns >= since_t_ns, listed)
-    get_completeness = server.recorder.compute_completeness
-    found = (session for session in recent if choice.accepts(session, get_completeness))
+    found = (
+        session
+        for session in recent
+        if choice.accepts(session, lambda each: server.recorder.compute_ledger(each).completeness)
+    )
     page = list(islice(found, limit))
     more = next(found, None) is not None
     return SessionPage(

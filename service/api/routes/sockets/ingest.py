@@ -226,7 +226,7 @@ async def _receive_messages(socket: WebSocket, server: Server, link: NodeLink) -
         if isinstance(message, bytes):
             tare_before = node.estimator.live.tare
             try:
-                *_, due = node.receive_frames(link.stream, _verify_frames(message), server_utc_ns())
+                due = node.receive_frames(link.stream, _verify_frames(message), server_utc_ns())
             except LinkError as error:
                 raise CloseConnection(LinkCloseCode.REFUSED, str(error)) from error
             server.broadcaster.add_to_history_and_updates(node, due)

@@ -18,7 +18,7 @@ import numpy as np
 from devices.arrays import ArrayRecord, Bools, Floats, Ints
 from devices.errors import CalibrationError
 from service.estimation.dead_weights import DeadWeight, parse_weight
-from service.estimation.fitting.rig.indentation import Indentation, UnloadedState, format_origin
+from service.estimation.fitting.rig.indentation import Indentation, format_origin
 from service.estimation.models.denoise import find_outliers
 
 BLOCK_READINGS = 10  # readings: 20 ms of a stroke that lasts seconds
@@ -54,18 +54,20 @@ class LoadingPoints(ArrayRecord):
         return int(self.loading.max()) + 1
 
 
-def extract_loading_points(recording: Indentation, zero: UnloadedState) -> LoadingPoints:
-    """Reduce a recording to the points of its loadings."""
+def extract_loading_points(
+    recording: Indentation, reference_zero_n: float, noise_kpa: float
+) -> LoadingPoints:
+    """Reduce a recording to the points of its loadings; pressures stay absolute."""
     rows = recording.is_under_indenter & np.isfinite(recording.reference_n)
     rows &= recording.phase != "soak"
     t_s = (recording.t_ns[rows] - recording.t_ns[rows][0]) * 1e-9
-    force_n = recording.reference_n[rows] - zero.reference_zero_n
+    force_n = recording.reference_n[rows] - reference_zero_n
     phase = recording.phase[rows]
     kpa = np.where(np.isfinite(recording.kpa), recording.kpa, np.nan)[rows]
     # Less the part that the reference explains: the top of a tap is a single reading, too.
     unexplained_kpa = kpa - _compute_slope_kpa_per_n(kpa, force_n) * force_n
     kpa = np.where(
-        find_outliers(unexplained_kpa[:, None], np.array([zero.noise_kpa]))[:, 0], np.nan, kpa
+        find_outliers(unexplained_kpa[:, None], np.array([noise_kpa]))[:, 0], np.nan, kpa
     )
     active = phase != "rest"
     before = np.concatenate([["rest"], phase[:-1]])
@@ -94,7 +96,7 @@ def extract_loading_points(recording: Indentation, zero: UnloadedState) -> Loadi
         t_s=np.bincount(block, t_s) / size,
         force_n=np.bincount(block, force_n) / size,
         kpa=mean_kpa,
-        weight=np.sqrt(counted) / max(zero.noise_kpa, _NOISE_MIN_KPA),
+        weight=np.sqrt(counted) / max(noise_kpa, _NOISE_MIN_KPA),
         loading=loading[last],
         is_fast=fast[last],
     )

@@ -154,7 +154,7 @@ class World:
     def _send(self, stream: Taken, first: int, last: int) -> None:
         stream_id = stream.info.stream_id
         payload = encode_frames(stream.frames(first, last), wire_schema(stream.info))
-        *_, due = self.node.receive_frames(self.node.streams[stream_id], payload, UTC_NS)
+        due = self.node.receive_frames(self.node.streams[stream_id], payload, UTC_NS)
         self.memory.add_batches(self.node.stream_id, due)
         for frames, columns in due:
             for at, seq in enumerate(frames.seq.tolist()):

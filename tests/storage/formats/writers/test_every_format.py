@@ -212,7 +212,7 @@ def test_a_full_disk_leaves_no_file_and_what_was_there_before(
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
-    out = tmp_path / f"session.{FORMATS[to].ending}"
+    out = tmp_path / f"session{FORMATS[to].ending}"
     out.write_bytes(b"of before")
     with disk_with_room_for(2_000), pytest.raises(StorageError):
         export_session(sealed, out, ExportOptions(to))

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from service.estimation.fitting.rig.indentation import Indentation, UnloadedState
+from service.estimation.fitting.rig.indentation import Indentation
 from service.estimation.fitting.rig.loading import extract_loading_points, join_loading_points
 
-ZERO = UnloadedState(baseline_kpa=100.0, noise_kpa=0.1, reference_zero_n=0.0)
+ZERO = (0.0, 0.1)  # of the reference, N; noise, kPa
 
 
 def taps(n: int = 3, *, outlier_at: int | None = None) -> Indentation:
@@ -32,17 +32,22 @@ def taps(n: int = 3, *, outlier_at: int | None = None) -> Indentation:
 
 
 def test_the_top_of_a_tap_stays_in_although_it_is_a_single_reading() -> None:
-    points = extract_loading_points(taps(), ZERO)
+    points = extract_loading_points(taps(), *ZERO)
     assert np.isfinite(points.kpa[points.force_n == 15.0]).all()
 
 
 def test_a_spike_that_no_force_explains_is_left_out() -> None:
-    points = extract_loading_points(taps(outlier_at=60), ZERO)  # at rest between the first two taps
+    points = extract_loading_points(
+        taps(outlier_at=60), *ZERO
+    )  # at rest between the first two taps
     assert np.flatnonzero(np.isnan(points.kpa)).tolist() == [60]
 
 
 def test_joined_recordings_keep_their_loadings_apart_and_far_apart() -> None:
-    one, other = extract_loading_points(taps(3), ZERO), extract_loading_points(taps(2), ZERO)
+    one, other = (
+        extract_loading_points(taps(3), *ZERO),
+        extract_loading_points(taps(2), *ZERO),
+    )
     both = join_loading_points([one, other])
     assert both.n_loadings == one.n_loadings + other.n_loadings == 5
     assert (np.diff(both.t_s) > 0.0).all()
@@ -63,7 +68,7 @@ def test_strokes_that_follow_one_another_without_a_rest_are_loadings_of_their_ow
         is_under_indenter=np.ones(len(phase), dtype=bool),
         temperature_raw=np.full(len(phase), 500.0),
     )
-    points = extract_loading_points(no_rests, ZERO)
+    points = extract_loading_points(no_rests, *ZERO)
     assert points.n_loadings == 3
     assert points.is_fast[points.loading == 2].all()
     assert not points.is_fast[points.loading < 2].any()
@@ -72,7 +77,8 @@ def test_strokes_that_follow_one_another_without_a_rest_are_loadings_of_their_ow
 def test_readings_of_the_same_instant_are_one_point() -> None:
     bench = taps()
     coarse = extract_loading_points(
-        replace(bench, t_ns=bench.t_ns // 12_000_000 * 12_000_000), ZERO
+        replace(bench, t_ns=bench.t_ns // 12_000_000 * 12_000_000),
+        *ZERO,
     )
     assert (np.diff(coarse.t_s) > 0.0).all()
     assert coarse.force_n.max() > 5.0
