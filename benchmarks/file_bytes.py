@@ -68,7 +68,7 @@ def measured(recording: data.Recording, folder: Path, *, with_ladder: bool) -> l
         sources = sealing.sources_of(journal, calibration, models)
         now, exact = folder / "now.parquet", folder / "exact.parquet"
         sealing.seal(sources, now)
-        sealing.seal(replace(sources, exact=True), exact)
+        sealing.seal(replace(sources, unquantized=True), exact)
         rows = formats.minute(recording.frames)
         columns[f"{name}, before"] = bytes_by_quantity(rewritten(exact, rows, as_before))
         columns[f"{name}, now"] = bytes_by_quantity(now)

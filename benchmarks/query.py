@@ -50,11 +50,11 @@ def sealed(recording: Recording, folder: SessionsFolder, session_id: str, work: 
         **{**vars(sources), "session": sources.session.model_copy(update=named)}
     )
     held = {journal.info.stream_id: StreamState(stored=journal.stored)}
-    ledger = compute_ledger(sources.session.parts, held, is_finished=True)
-    folder.save(sources.session)
+    ledger = compute_ledger(sources.session.parts, held, has_all_parts=True)
+    folder.save_session_json(sources.session)
     done = seal_session(sources, folder.get_path(session_id), ledger)
     assert done.problem is None, done.problem
-    folder.save(done)
+    folder.save_session_json(done)
     return done
 
 
@@ -68,7 +68,7 @@ def fill(data: Path, sessions: int, extent: Extent) -> None:
     first = sealed(of_scene("mud", extent.hops_s), folder, ids[0], work)
     for session_id in ids[1:]:
         shutil.copytree(folder.get_path(first.id), folder.get_path(session_id))
-        folder.save(first.model_copy(update={"id": session_id}))
+        folder.save_session_json(first.model_copy(update={"id": session_id}))
 
 
 def questions(second_t_ns: int) -> dict[str, str]:

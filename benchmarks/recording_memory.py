@@ -100,10 +100,10 @@ def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
     hash_s = 0.0
 
     class Timed(ContentDigest):
-        def feed(self, table: Any) -> None:
+        def add_table_and_collect_disorder(self, table: Any) -> None:
             nonlocal hash_s
             begin = time.perf_counter()
-            super().add_table_and_check_order(table)
+            super().add_table_and_collect_disorder(table)
             hash_s += time.perf_counter() - begin
 
     def timed(path: Path) -> None:
@@ -112,7 +112,7 @@ def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
         fill_hash_placeholders_and_sync(path)
         hash_s += time.perf_counter() - begin
 
-    vars(session_file).update(ContentDigest=Timed, write_file_hash=timed)
+    vars(session_file).update(ContentDigest=Timed, fill_hash_placeholders_and_sync=timed)
     info = array(asked.tiles, asked.rate)
     journal = Journal(folder / "journal" / "bench" / STREAM_ID, info)
     last = journal.stored.last
@@ -132,14 +132,14 @@ def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
     )
     sources = SessionInputs(session, info, {STREAM_ID: journal}, calibration, None, (), {})
     ledger = compute_ledger(
-        session.parts, {STREAM_ID: StreamState(stored=journal.stored)}, is_finished=True
+        session.parts, {STREAM_ID: StreamState(stored=journal.stored)}, has_all_parts=True
     )
     sessions = SessionsFolder(folder / "sessions")
-    sessions.save(session)
+    sessions.save_session_json(session)
     begin = time.perf_counter()
     sealed = seal_session(sources, sessions.get_path(SESSION_ID), ledger)
     seal_s = time.perf_counter() - begin
-    sessions.save(sealed)
+    sessions.save_session_json(sealed)
     return {
         "seconds": seal_s,
         "bytes": sealed.bytes,

@@ -60,7 +60,7 @@ def seal(sources: SessionInputs, path: Path, *, with_stances: bool = True) -> in
         for batch, columns in frames:
             writer.append_frames(batch, columns)
             if with_stances:
-                stances.add_frames(batch.seq, batch.t_ns, columns)
+                stances.try_add_frames(batch.seq, batch.t_ns, columns)
             count += len(batch)
     stances.try_write_or_delete_file(path.parent, compute_sha256(path))
     if sources.calibration is not None:

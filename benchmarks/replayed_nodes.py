@@ -36,7 +36,7 @@ from storage.intervals import EVICTED, Intervals
 from storage.journal.node.retention_requests import RetentionRequests
 from storage.journal.node.stream import NodeStream
 from storage.journal.stream_notes import StreamNotes
-from storage.message_layout import compute_layout
+from storage.message_layout import check_and_compute_layout
 from storage.schema import MEASURED_COLUMNS, wire_schema
 from storage.wire import EncodedBatch, encode_frames
 
@@ -123,7 +123,7 @@ def played(tiles: int, rate_hz: float) -> Played:
             "models": load_scene(SCENE).models,
         }
     )
-    known = [bench.get_tile(serial) for serial in foot.info.serials]
+    known = [bench.get_tile_or_preset(serial) for serial in foot.info.serials]
     calibration = bench.model_copy(
         update={
             "tiles": tuple(
@@ -187,7 +187,9 @@ class Renumbered:
         self._content: dict[int, tuple[bytearray, list[Any], list[Any]]] = {}
         for message in (*played.lead, *played.lap):
             content = bytearray(message.payload)
-            layout = compute_layout(pa.ipc.read_message(pa.py_buffer(message.payload)), schema)
+            layout = check_and_compute_layout(
+                pa.ipc.read_message(pa.py_buffer(message.payload)), schema
+            )
             views = []
             for name in _NUMBERED:
                 at, _ = layout.columns[names.index(name)]

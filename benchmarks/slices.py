@@ -96,7 +96,7 @@ def write(
     of_part = PartLedger(
         stream_id=STREAM_ID, seq_first=0, seq_last=count - 1, recorded=count, lost={}, pending=0
     )
-    sessions.save(
+    sessions.save_session_json(
         Session(
             id=name,
             name=f"{minutes} min",

@@ -81,7 +81,7 @@ def read_small_file(path: Path, *, max_bytes: int = MAX_READ_BYTES) -> bytes:
         StorageError: it may be whole but cannot be read now: it is another user's, or memory or
             descriptors are used up. Do not set it aside or overwrite it.
     """
-    with open_regular_file(path) as file, translate_read_errors(path):
+    with open_regular_file(path) as file, translate_read_errors_unless_missing(path):
         size = os.fstat(file.fileno()).st_size
         if size > max_bytes:
             raise DamagedFileError(
@@ -92,7 +92,7 @@ def read_small_file(path: Path, *, max_bytes: int = MAX_READ_BYTES) -> bytes:
 
 def open_regular_file(path: Path) -> io.BufferedReader:
     """Open a regular file of any length for reading; raises as `read_small_file`."""
-    with translate_read_errors(path):
+    with translate_read_errors_unless_missing(path):
         # A link may lead anywhere, and a pipe would be waited for.
         if not stat.S_ISREG(path.lstat().st_mode):
             raise DamagedFileError("it is not a file", where=str(path))
@@ -100,7 +100,7 @@ def open_regular_file(path: Path) -> io.BufferedReader:
 
 
 @contextmanager
-def translate_read_errors(path: Path) -> Iterator[None]:
+def translate_read_errors_unless_missing(path: Path) -> Iterator[None]:
     """Context manager: turn an OSError into `read_small_file`'s errors."""
     try:
         yield
@@ -155,7 +155,7 @@ def make_temporary_path(path: Path) -> Path:
     return path.with_name(name)
 
 
-def remove_dead_process_temporaries(folder: Path) -> list[Path]:
+def remove_dead_process_temporaries(folder_tree: Path) -> list[Path]:
     """Delete half-written files of dead processes in a folder tree; return their paths.
 
     Files of living processes stay: they may still be written. If a process number was given to
@@ -165,9 +165,9 @@ def remove_dead_process_temporaries(folder: Path) -> list[Path]:
         StorageError: the folder cannot be read, or a file not deleted.
     """
     removed = []
-    with translate_storage_errors(folder):
-        folder.stat()  # fails if the folder is missing, where rglob just finds no files
-        for path in sorted(folder.rglob(".*.tmp")):
+    with translate_storage_errors(folder_tree):
+        folder_tree.stat()  # fails if the folder is missing, where rglob just finds no files
+        for path in sorted(folder_tree.rglob(".*.tmp")):
             if is_dead_process_temporary(path.name) and path.is_file():
                 path.unlink(missing_ok=True)
                 removed.append(path)
@@ -393,7 +393,7 @@ def set_aside_damaged(path: Path) -> Path:
     return aside
 
 
-def set_aside_and_describe(path: Path, damage: FootTileError) -> str:
+def try_set_aside_and_describe(path: Path, damage: FootTileError) -> str:
     """Set a damaged file aside if possible; return a message of what happened."""
     try:
         return escape_control_chars(f"{damage}; it is kept as {set_aside_damaged(path).name}")

@@ -28,7 +28,7 @@ ViolationMask = npt.NDArray[np.bool_]
 """Mask of the rows that break a rule."""
 
 
-def describe_first_broken_rule(frames: FrameBatch, info: ArrayInfo) -> str:
+def describe_first_impossible_value(frames: FrameBatch, info: ArrayInfo) -> str:
     """Return a text that names the first broken rule and frame; empty if there is none.
 
     Args:
@@ -42,7 +42,7 @@ def describe_first_broken_rule(frames: FrameBatch, info: ArrayInfo) -> str:
     return ""
 
 
-def mask_impossible_times(t_mono_ns: Times, t_ns: Times) -> ViolationMask:
+def mask_out_of_range_times(t_mono_ns: Times, t_ns: Times) -> ViolationMask:
     """Return a mask of impossible instants, int64[n] each.
 
     Differences of all others fit 64 bits.
@@ -66,7 +66,7 @@ def _rules(frames: FrameBatch, info: ArrayInfo) -> Iterator[tuple[str, Violation
     # This first: within the range no difference of instants wraps.
     yield (
         "t_ns is outside of the years 1970 to 2199, or t_mono_ns beyond 36 years",
-        mask_impossible_times(t_mono_ns, t_ns),
+        mask_out_of_range_times(t_mono_ns, t_ns),
     )
     yield (
         f"t_ns is not t_mono_ns plus the {info.utc_offset_ns} ns announced with the stream",

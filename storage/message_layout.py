@@ -160,7 +160,7 @@ class MessageLayout:
     columns: tuple[tuple[int, int], ...]
 
 
-def compute_layout(message: pa.ipc.Message, schema: pa.Schema) -> MessageLayout:
+def check_and_compute_layout(message: pa.ipc.Message, schema: pa.Schema) -> MessageLayout:
     """Compute a message's layout; check that its size fits its number of frames first.
 
     Args:
@@ -217,7 +217,7 @@ class MessageLayoutCache:
         self.schema = schema
         self._cache: dict[bytes, MessageLayout] = {}
 
-    def get_layout(self, message: bytes | memoryview) -> MessageLayout:
+    def validate_and_get_layout(self, message: bytes | memoryview) -> MessageLayout:
         """Return the layout of a message; validate a header that is not cached yet.
 
         Raises:
@@ -241,7 +241,7 @@ class MessageLayoutCache:
         if not head.startswith(_CONTINUATION_MARKER):
             raise HeaderError("it does not begin as messages do since Arrow 0.15")
         found = pa.ipc.read_message(pa.py_buffer(message))
-        layout = compute_layout(found, self.schema)
+        layout = check_and_compute_layout(found, self.schema)
         if layout.message_bytes == len(message):
             record = pa.ipc.read_record_batch(found, self.schema)
             record.validate(full=True)  # checks the values, which the header does not describe

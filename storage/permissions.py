@@ -35,7 +35,7 @@ _CHMOD_UNSUPPORTED = {
 """Errors of `chmod` on another user's folder, or without permissions, such as vfat and CIFS."""
 
 
-def set_umask_and_restrict_folder(folder: Path) -> None:
+def set_umask_and_create_private_folder(folder: Path) -> None:
     """Set the umask, create the folder, and close it to other users if it is only ours.
 
     A folder is closed to others if it is created here, is empty, or holds only files of ours. One

@@ -216,12 +216,12 @@ COLUMNS_BY_NAME = {
 """Every column by its name."""
 
 
-def numpy_dtype_of(kind: pa.DataType) -> np.dtype[Any]:
+def numpy_dtype_of(number_type: pa.DataType) -> np.dtype[Any]:
     """Return the numpy type of an Arrow type of numbers.
 
     `DataType.to_pandas_dtype` returns it, too, but imports pandas in pyarrow up to 25.
     """
-    return pa.array([], kind).to_numpy().dtype
+    return pa.array([], number_type).to_numpy().dtype
 
 
 # --- wire -----------------------------------------------------------------------------------------
@@ -375,11 +375,13 @@ def read_quantity(column: Column, table: pa.Table, tiles: int) -> Array:
         KeyError: the table has no such column.
         ValueError: its type is not the column's.
     """
-    parts = [read_flat_column(column, name, table) for name in column.flat_names(tiles)]
+    parts = [
+        read_flat_column_and_fill_nulls(column, name, table) for name in column.flat_names(tiles)
+    ]
     return np.stack(parts, axis=1) if column.per_tile else parts[0]
 
 
-def read_flat_column(column: Column, name: str, table: pa.Table) -> Array:
+def read_flat_column_and_fill_nulls(column: Column, name: str, table: pa.Table) -> Array:
     """Read one flat column, (n,); nulls become missing values.
 
     Raises:

@@ -13,7 +13,7 @@ SERVER_ID_NAME = "server_id"
 _FORM = re.compile(r"([0-9a-f]{32}) ([0-9a-f]{8})")
 
 
-def read_server_id(path: Path) -> str:
+def read_existing_server_id(path: Path) -> str:
     """Read the id and verify its CRC-32.
 
     Raises:

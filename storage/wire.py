@@ -63,11 +63,13 @@ def encode_frames(batch: FrameBatch, schema: pa.Schema) -> bytes:
     return frames_to_record_batch(batch, schema).serialize().to_pybytes()
 
 
-def encode_as_messages(frames: FrameBatch, info: ArrayInfo) -> Iterator[EncodedBatch]:
+def encode_as_messages(consecutive_frames: FrameBatch, info: ArrayInfo) -> Iterator[EncodedBatch]:
     """Encode frames as messages of the size that nodes send."""
     schema = wire_schema(info)
-    for begin in range(0, len(frames), _MAX_BATCH_FRAMES):
-        rows = frames.slice_rows(begin, min(begin + _MAX_BATCH_FRAMES, len(frames)))
+    for begin in range(0, len(consecutive_frames), _MAX_BATCH_FRAMES):
+        rows = consecutive_frames.slice_rows(
+            begin, min(begin + _MAX_BATCH_FRAMES, len(consecutive_frames))
+        )
         yield EncodedBatch.from_frames_and_payload(rows, encode_frames(rows, schema))
 
 
@@ -90,7 +92,7 @@ class Decoder:
             FileFormatError: it is no message of this stream, is cut off, or its frames are out of
                 order.
         """
-        layout = self._layouts.get_layout(payload)
+        layout = self._layouts.validate_and_get_layout(payload)
         by_frame, by_tile = (layout.rows,), (layout.rows, self._tiles)
         batch = FrameBatch(
             **{
@@ -156,7 +158,7 @@ class MessageBatchDecoder:
         self.schema = schema
         self._layouts = MessageLayoutCache(schema)
 
-    def decode(self, messages: MessageBatch) -> FrameBatch | None:
+    def decode_or_none_if_damaged(self, messages: MessageBatch) -> FrameBatch | None:
         """Decode all messages into copied columns; None if any check against the index fails.
 
         The rules of frames (`storage.frame_rules`) are not checked.
@@ -183,7 +185,7 @@ class MessageBatchDecoder:
             if zlib.crc32(message) != crc32:
                 return None
             try:
-                layout = self._layouts.get_layout(message)
+                layout = self._layouts.validate_and_get_layout(message)
             except FileFormatError:
                 return None
             if layout.rows != count:

@@ -214,7 +214,9 @@ def test_every_route_is_documented() -> None:
 def test_every_live_message_field_is_documented() -> None:
     summary = PendingUpdate()
     frames = make_frames(1, 1)
-    summary.add_summary("node", summarize_frames("0" * 32, summarize_force(frames, {}), frames, {}))
+    summary.join_summary_or_drop_older(
+        "node", summarize_frames("0" * 32, summarize_force(frames, {}), frames, {})
+    )
     (text,) = summary.pop_update().encode_messages({"node": 1.0})
     frame = json.loads(text)
     for name in frame:

@@ -24,8 +24,8 @@ from devices.errors import DamagedFileError, LinkError, UsageError
 from foottile.local_server import LocalServer, is_loopback, publish_local_server
 from storage.durable_files import (
     read_small_file,
-    set_aside_and_describe,
     translate_storage_errors,
+    try_set_aside_and_describe,
     write_atomically,
 )
 
@@ -193,7 +193,7 @@ def load_or_create_token(given: str | None, data: Path) -> str:
     except FileNotFoundError:
         pass
     except DamagedFileError as error:
-        log.warning("%s, and a new token is generated", set_aside_and_describe(path, error))
+        log.warning("%s, and a new token is generated", try_set_aside_and_describe(path, error))
     with translate_storage_errors(path):
         data.mkdir(parents=True, exist_ok=True)
         token = secrets.token_urlsafe(18)

@@ -108,7 +108,7 @@ class TileCalibration(CalibrationPart):
     loop_misfit_n: NonNegative
     """Scatter of a new loading's force about the curve: its variance is the sum of
     (`relative_misfit` F)^2, a gain that differs between loadings, and (`loop_misfit_n`
-    `compute_relative_loop_width(F)`)^2, a hysteresis loop that opens with the first newton."""
+    `compute_share_of_final_loop_width(F)`)^2, a hysteresis loop that opens at once."""
     r2: Number | None
     rmse_n: Number | None
     cv_rmse_n: Number | None
@@ -177,21 +177,21 @@ class Calibration(CalibrationPart):
         """Identifier: first 16 hexadecimal digits of the SHA-256 of the content."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
 
-    def find_tile(self, serial: str) -> TileCalibration | None:
+    def find_tile_or_preset(self, serial: str) -> TileCalibration | None:
         """Return the entry for a serial, else for any (`*`); None without, as for bare tiles."""
         by_serial = {tile.serial: tile for tile in self.tiles}
         return by_serial.get(serial, by_serial.get(ANY_SERIAL))
 
-    def get_tile(self, serial: str) -> TileCalibration:
+    def get_tile_or_preset(self, serial: str) -> TileCalibration:
         """Return the entry for a serial, else that for any (`*`).
 
         Raises:
             CalibrationError: there is none.
         """
-        return self.get_tiles([serial])[0]
+        return self.get_tiles_or_preset([serial])[0]
 
-    def get_tiles(self, serials: Sequence[str]) -> list[TileCalibration]:
-        """Return the entries for serials, as `get_tile`.
+    def get_tiles_or_preset(self, serials: Sequence[str]) -> list[TileCalibration]:
+        """Return the entries for serials, as `get_tile_or_preset`.
 
         Raises:
             CalibrationError: one is missing.
@@ -203,11 +203,13 @@ class Calibration(CalibrationPart):
                 remedy="Load these tiles too and fit all recordings with `foottile calibrate`, or "
                 "name another calibration with --calibration",
             )
-        return [found for serial in serials if (found := self.find_tile(serial)) is not None]
+        return [
+            found for serial in serials if (found := self.find_tile_or_preset(serial)) is not None
+        ]
 
     def describe_missing_tiles(self, serials: Sequence[str]) -> str:
         """Return which tiles it covers and which of the serials it does not; empty: it does all."""
-        missing = [serial for serial in serials if self.find_tile(serial) is None]
+        missing = [serial for serial in serials if self.find_tile_or_preset(serial) is None]
         if not missing:
             return ""
         known = _format_serials([tile.serial for tile in self.tiles]) or "nothing"
@@ -231,7 +233,7 @@ class Calibration(CalibrationPart):
         """
         return any(
             tile.absolute_scale == "assumed" and self.find_mount_gain(serial) is None
-            for serial, tile in zip(serials, self.get_tiles(serials), strict=True)
+            for serial, tile in zip(serials, self.get_tiles_or_preset(serials), strict=True)
         )
 
     def to_json(self) -> str:
@@ -240,7 +242,7 @@ class Calibration(CalibrationPart):
         return json.dumps(content, indent=2) + "\n"
 
     @classmethod
-    def from_json(cls, text: str, *, where: str) -> Calibration:
+    def from_json_marking_unproven(cls, text: str, *, where: str) -> Calibration:
         """Parse a calibration file and check its id; without an id the name gets ", unproven".
 
         Raises:
@@ -274,7 +276,7 @@ class Calibration(CalibrationPart):
         return calibration
 
 
-def compute_relative_loop_width(force_n: Floats) -> Floats:
+def compute_share_of_final_loop_width(force_n: Floats) -> Floats:
     """Return the loop's width at each force, relative to its final width: 0 at 0 N, 0.5 at 1 N."""
     return np.asarray(1.0 - LOOP_HALF_WIDTH_FORCE_N / (np.abs(force_n) + LOOP_HALF_WIDTH_FORCE_N))
 

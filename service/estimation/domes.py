@@ -117,7 +117,7 @@ def compute_ambient_transmission(dome: Dome, seal_kpa: float = SEAL_KPA) -> floa
 
 
 @dataclass(frozen=True)
-class SaturationLoad:
+class SlowSaturationLoad:
     """Range of slow loads at which a dome saturates its chip, with its source."""
 
     dome: Dome
@@ -132,26 +132,26 @@ class SaturationLoad:
         return "perhaps" if load_n <= self.high_n else "saturates"
 
 
-def compute_saturation_load(dome: Dome) -> SaturationLoad:
+def compute_saturation_load(dome: Dome) -> SlowSaturationLoad:
     """Return the saturation load: the paper's for its dome, else scaled by modulus and area.
 
     The scaling assumes the same shape and strain at full scale. It agrees with the paper in
     direction only: stiffer and larger domes shift the curve to higher force (PAPER Fig. 5).
     """
     if dome == PAPER_DOME:
-        return SaturationLoad(dome, *PAPER_RANGE_N, "paper")
+        return SlowSaturationLoad(dome, *PAPER_RANGE_N, "paper")
     scale = (dome.material.modulus_mpa * dome.base_area_mm2) / (
         PAPER_DOME.material.modulus_mpa * PAPER_DOME.base_area_mm2
     )
-    return SaturationLoad(dome, scale * PAPER_RANGE_N[0], scale * PAPER_RANGE_N[1], "estimate")
+    return SlowSaturationLoad(dome, scale * PAPER_RANGE_N[0], scale * PAPER_RANGE_N[1], "estimate")
 
 
-def list_saturation_loads() -> list[SaturationLoad]:
+def list_saturation_loads() -> list[SlowSaturationLoad]:
     """Return the saturation loads of all domes of Table I, weakest first."""
     return sorted((compute_saturation_load(dome) for dome in DOMES), key=lambda found: found.low_n)
 
 
-def select_dome_for_load(load_n: float) -> SaturationLoad | None:
+def select_likely_covering_dome(load_n: float) -> SlowSaturationLoad | None:
     """Return the weakest dome that covers a slow load; it resolves the load best.
 
     If none does for certain, the weakest that perhaps does; None if all saturate.

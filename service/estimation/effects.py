@@ -191,7 +191,7 @@ class Effects(CalibrationPart):
         return self
 
     @property
-    def wall_compliance_per_kpa(self) -> float:
+    def wall_compliance_or_default_per_kpa(self) -> float:
         """Compliance of the wall per kPa from the thermal soak, else the default `WALL_PER_KPA`."""
         return WALL_PER_KPA if self.temperature is None else self.temperature.wall_per_kpa.value
 

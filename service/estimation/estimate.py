@@ -293,14 +293,16 @@ def _estimate_due_rows(
         row = buffer.rows[i]
         out[:] = math.nan
         if foot_params.has_denoise == 1:
-            rows = denoise.find_window_rows(buffer.t_mono_ns, i, 0, end, rows, look_ns)
+            rows = denoise.find_oldest_and_newest_window_rows(
+                buffer.t_mono_ns, i, 0, end, rows, look_ns
+            )
         unsettled = compute_forces_and_after_saturation(
             params, tile_states, buffer, i, rows, windows, forces
         )
         if foot_params.has_servo == 1:
             counts = interpolate_servo_counts(buffer.readings, i, end, lookahead_ns)
             out[grf_cop.FOOT_ANGLE] = (counts - foot_params.zero_counts) * foot_params.rad_per_count
-        grf_cop.set_vertical_fractions(params, forces, out[grf_cop.FOOT_ANGLE])
+        grf_cop.set_vertical_fractions_and_shear_sigma(params, forces, out[grf_cop.FOOT_ANGLE])
         grf_cop.compute_grf_cop(params, forces, out)
         min_ns = foot_params.contact_min_ns
         if is_debounced(buffer.since_ns, buffer.t_mono_ns, i, end, min_ns, lookahead_ns):

@@ -77,7 +77,7 @@ class OmittedModelEffect:
             off_n = np.abs(without_n - whole_n)[judged]
             self._sums[name] += int(np.rint(_NANONEWTONS * off_n).astype(np.int64).sum())
 
-    def compute_notable_mean_effects_n(self) -> dict[str, float]:
+    def compute_notable_mean_grf_effects_by_model_n(self) -> dict[str, float]:
         """Return mean absolute effects of omitted models, from `EFFECT_MIN_N` on, largest first."""
         if not self._frames:
             return {}

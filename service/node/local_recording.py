@@ -16,11 +16,11 @@ from service.estimation.calibration import Calibration
 from service.server_clock import server_utc_ns
 from service.sessions.parts import (
     SessionStream,
-    close_at_stream_end,
+    close_at_stream_end_or_newest_frame,
     close_unfinished,
     continue_session,
     create_session,
-    split_number,
+    split_number_in_parentheses,
 )
 from storage.durable_files import remove_dead_process_temporaries
 from storage.intervals import NO_END, Intervals
@@ -30,7 +30,7 @@ from storage.sessions.folder import Part, Session, SessionsFolder
 from storage.sessions.ledger import (
     compute_ledger,
     group_numbers_by_stream,
-    settle_losses,
+    mark_damaged_and_abandoned_lost,
 )
 
 
@@ -74,7 +74,7 @@ class LocalRecording:
         """Unreadable sessions. They may need any frame, so all frames are retained."""
         for session_id, error in self._unreadable.items():
             report(f"session {session_id} is left out: {error}")
-        for stray in self._folder.find_strays():
+        for stray in self._folder.find_renamed_or_copied_sessions():
             report(f"session folder {stray.name} is left out: {stray.error}")
             if stray.may_need_frames:
                 self._unreadable[stray.name] = stray.error
@@ -101,7 +101,7 @@ class LocalRecording:
         else:
             streams = self._collect_streams(session)
             before = streams[session.parts[-1].stream_id].info
-            session = close_at_stream_end(session, streams)
+            session = close_at_stream_end_or_newest_frame(session, streams)
             if before is None or before.has_same_tiles_as(stream.info):
                 session = session.model_copy(update={"parts": (*session.parts, part)})
             else:
@@ -152,14 +152,17 @@ class LocalRecording:
     def _find_interrupted_session(self) -> Session | None:
         """Find the newest interrupted session of this name that no other one continues."""
         for session in self._unsealed:
-            is_its_own = self._name in (session.name, split_number(session.name).given)
+            is_its_own = self._name in (
+                session.name,
+                split_number_in_parentheses(session.name).given,
+            )
             if is_its_own and session.state != "pending":
                 return session
         return None
 
     def _save(self, session: Session) -> None:
         try:
-            self._folder.save(session)
+            self._folder.save_session_json(session)
         except StorageError as error:  # its frames are retained nevertheless
             self._report(f"session {session.id} cannot be saved: {error}")
 
@@ -170,13 +173,15 @@ class LocalRecording:
 
         streams = self._collect_streams(session)
         session = close_unfinished(session, streams).model_copy(update={"state": "sealing"})
-        self._folder.save(session)
+        self._folder.save_session_json(session)
         folder = self._folder.get_path(session.id)
         remove_dead_process_temporaries(folder)
         sources = make_inputs(session, streams, load_tares=None, emulated=self._emulated)
-        ledger = compute_ledger(session.parts, settle_losses(session, streams), is_finished=True)
+        ledger = compute_ledger(
+            session.parts, mark_damaged_and_abandoned_lost(session, streams), has_all_parts=True
+        )
         sealed = seal_session(sources, folder, ledger)
-        self._folder.save(sealed)
+        self._folder.save_session_json(sealed)
         return sealed
 
     def _collect_streams(self, session: Session) -> dict[str, SessionStream]:

@@ -14,7 +14,7 @@ from devices.errors import DamagedFileError, StorageError
 from service.estimation.calibration import Calibration
 from service.node_identity import generate_secret
 from service.rig.emulated_foot import RigOptions
-from storage.durable_files import set_aside_and_describe
+from storage.durable_files import try_set_aside_and_describe
 from storage.permissions import SECRETS_NAME, read_secrets_or_empty, write_secrets
 
 
@@ -82,8 +82,8 @@ class ServerSecrets:
             return read_secrets_or_empty(self._path)
         except DamagedFileError as error:
             self._report_once(
-                f"{set_aside_and_describe(self._path, error)}; servers that know this node refuse "
-                "it until a person accepts it"
+                f"{try_set_aside_and_describe(self._path, error)}; servers that know this node "
+                "refuse it until a person accepts it"
             )
             return {}
 

@@ -252,7 +252,7 @@ class RunningNode:
             warnings=(
                 *self._stall_warnings(),
                 *self._health.warnings,
-                *self._journal.disk_warnings,
+                *self._journal.disk_refusal_warnings,
                 *(problem[:_PROBLEM_LENGTH] for problem in self._journal.problems[:_PROBLEMS_MAX]),
             ),
             counts={serial: dict(counts) for serial, counts in self._health.fault_counts.items()},
@@ -276,7 +276,7 @@ class RunningNode:
         """Report stalls of acquisition and problems of the disk, and their end."""
         while True:
             await asyncio.sleep(_WARNINGS_INTERVAL_S)
-            warnings = (*self._stall_warnings(), *self._journal.disk_warnings)
+            warnings = (*self._stall_warnings(), *self._journal.disk_refusal_warnings)
             kinds = tuple(warning.partition(";")[0] for warning in warnings)
             for kind in kinds:
                 if kind not in self._reported_warnings:
@@ -322,7 +322,9 @@ class RunningNode:
         recorded, is_lossy = self._recording.stop_and_seal()
         lost = 0
         for stream in self._journal.streams:
-            wanted = self._journal.retention_requests.required_numbers_of(stream.stream_id)
+            wanted = self._journal.retention_requests.node_session_or_server_numbers_of(
+                stream.stream_id
+            )
             lost += sum(
                 numbers.number_count for numbers in stream.lost.restricted_to(wanted).values()
             )

@@ -32,7 +32,7 @@ from service.estimation.fitting.static_fit import fit_static_curve
 from service.estimation.fitting.weights_fit import fit_dead_weights
 from storage.schema import UNKNOWN_T_NS
 from storage.sessions.folder import Marker
-from storage.sessions.metadata import MARKERS_NAME, load_clock_table, read_markers
+from storage.sessions.metadata import MARKERS_NAME, load_clock_table, read_existing_markers
 from storage.sessions.reader import SealedFileReader
 
 TILE_STEPS = ("rest", "load", "unload", "hold", "release", "tap")
@@ -58,7 +58,7 @@ def _read_rig_programme(session: SealedFileReader) -> RigProgramme | None:
         FileFormatError: the markers file is damaged.
     """
     try:
-        events = read_markers(session.path.with_name(MARKERS_NAME))
+        events = read_existing_markers(session.path.with_name(MARKERS_NAME))
     except FileNotFoundError:
         return None
     serials, where = session.info.serials, str(session.path.parent)
@@ -68,7 +68,9 @@ def _read_rig_programme(session: SealedFileReader) -> RigProgramme | None:
         return None
     clock = load_clock_table(session)
     pieces = [
-        clock.compute_server_time_columns(piece["t_mono_ns"], piece["t_ns"], None)["t_server_ns"]
+        clock.compute_server_time_columns_or_unknown(piece["t_mono_ns"], piece["t_ns"], None)[
+            "t_server_ns"
+        ]
         for piece in session.read_quantities("t_mono_ns", "t_ns")
     ]
     t_server_ns = np.concatenate(pieces)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from service.estimation.calibration import Calibration, TileCalibration
-from service.estimation.fitting.effects_fit import ReplaySection, replay_release_and_tap
+from service.estimation.fitting.effects_fit import ReplaySection, simulate_release_and_tap_pressure
 from service.estimation.fitting.least_squares import (
     compute_curve_n,
     compute_curve_student_t_half_width_95_n,
@@ -48,7 +48,10 @@ def plot_calibration(
         MissingExtraError: matplotlib is not installed.
     """
     tiles = calibration.tiles
-    fast = {tile.serial: replay_release_and_tap(recordings[tile.serial], tile) for tile in tiles}
+    fast = {
+        tile.serial: simulate_release_and_tap_pressure(recordings[tile.serial], tile)
+        for tile in tiles
+    }
     kinds = [kind for kind in FAST_LOADS if any(kind in found for found in fast.values())]
     lines = [tiles[i : i + MAX_TILES_PER_LINE] for i in range(0, len(tiles), MAX_TILES_PER_LINE)]
     columns = min(MAX_TILES_PER_LINE, len(tiles))

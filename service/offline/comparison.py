@@ -56,7 +56,7 @@ from storage.sessions.comparisons import (
     SERIES_SCHEMA,
     write_comparison_series,
 )
-from storage.sessions.metadata import MARKERS_NAME, load_clock_table, read_markers
+from storage.sessions.metadata import MARKERS_NAME, load_clock_table, read_existing_markers
 from storage.sessions.reader import SealedFileReader
 
 ROW_COLUMN = "row"
@@ -157,7 +157,7 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
     with SealedFileReader(path) as session:
         columns, force_n = _read_columns(session)
         markers, notes = _read_trial_markers(session, path, columns)
-        notes += [remark] if (remark := session.time_axis.describe_shift()) else []
+        notes += [remark] if (remark := session.time_axis.explain_shift_or_empty()) else []
         tiles, identity = session.info.tiles, session.source_reference
     known = np.isfinite(columns["grf_n"])
     if not known.any():
@@ -254,7 +254,7 @@ def _read_trial_markers(
     beside = path.with_name(MARKERS_NAME)
     if not beside.is_file():
         return [], []
-    placed = place_session_markers(session, read_markers(beside), Slice())
+    placed = place_session_markers(session, read_existing_markers(beside), Slice())
     markers = []
     for marker in placed.markers:
         if marker.frame is not None:
@@ -293,7 +293,7 @@ def _compute_server_offset_ns(path: Path, at_ns: int) -> tuple[int, int] | None:
             if nearest is None or apart_ns < abs(int(nearest["axis_ns"][0]) - at_ns):
                 nearest = one
     assert nearest is not None  # noqa: S101  # both have been compared
-    server_times = clock.compute_server_time_columns(
+    server_times = clock.compute_server_time_columns_or_unknown(
         nearest["t_mono_ns"], nearest["t_ns"], nearest.get("part")
     )
     server_ns = int(server_times["t_server_ns"][0])

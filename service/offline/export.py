@@ -14,7 +14,7 @@ from storage.formats.markers import PlacedMarker
 from storage.formats.sealed_export import make_sealed_export, place_session_markers
 from storage.formats.slice import NO_OPTIONS, FormatOptions, Slice
 from storage.formats.writers.registry import get_format, get_multi_session_format
-from storage.sessions.metadata import MARKERS_NAME, read_markers
+from storage.sessions.metadata import MARKERS_NAME, read_existing_markers
 from storage.sessions.reader import SealedFileReader
 
 _ALL = Slice()
@@ -60,7 +60,7 @@ def export_session(source: Path, out: Path, options: ExportOptions) -> ExportRes
         StorageError: `out` cannot be written.
     """
     to = get_format(options.to)
-    with SealedFileReader(source, only_slices=not options.part.is_unrestricted) as reader:
+    with SealedFileReader(source, only_slices=not options.part.has_all_rows_and_columns) as reader:
         export, lacks_marks = _prepare_export(reader, options)
         return _write_export(out, to.encode(export), [export], lacks_marks)
 
@@ -82,20 +82,22 @@ def export_merged(sources: Sequence[Path], out: Path, options: ExportOptions) ->
     with ExitStack() as opened:
         readers = [
             opened.enter_context(
-                SealedFileReader(source, only_slices=not options.part.is_unrestricted)
+                SealedFileReader(source, only_slices=not options.part.has_all_rows_and_columns)
             )
             for source in sources
         ]
         found = [_prepare_export(reader, options) for reader in readers]
         exports = [export for export, _ in found]
         lacks_marks = any(lacks for _, lacks in found)
-        return _write_export(out, to.encode_together(exports), exports, lacks_marks)
+        return _write_export(out, to.encode_together_on_server_clock(exports), exports, lacks_marks)
 
 
 def _prepare_export(reader: SealedFileReader, options: ExportOptions) -> tuple[Export, bool]:
     """Prepare an export; also return True if an expected markers file is missing."""
     beside = reader.path.with_name(MARKERS_NAME)
-    stored = read_markers(beside) if options.markers is not False and beside.is_file() else None
+    stored = (
+        read_existing_markers(beside) if options.markers is not False and beside.is_file() else None
+    )
     if options.markers and stored is None:
         raise UsageError(
             f"there is no {MARKERS_NAME} beside {reader.path.name}, so its markers are unknown",
@@ -119,8 +121,8 @@ def _write_export(
         marker for export in exports if export.markers for marker in export.markers.excluded
     ]
     remarks = [
-        f"{export.display_name}: {remark}"
+        f"{export.session_and_node_text}: {remark}"
         for export in exports
-        if (remark := export.frame_source.axis.describe_shift())
+        if (remark := export.frame_source.axis.explain_shift_or_empty())
     ]
     return ExportResult(out.stat().st_size, tuple(left_out), lacks_marks, tuple(remarks))

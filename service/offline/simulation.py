@@ -188,7 +188,9 @@ def run_simulation(
         began_s = time.perf_counter()
         for batch, extra in pieces:
             if stream is not None and stream.plan is not None and not frames:
-                writer.add_notes(make_estimate_metadata(stream.plan, stream.rounding))
+                writer.add_notes_before_first_row_group(
+                    make_estimate_metadata(stream.plan, stream.rounding)
+                )
             writer.append_frames(batch, extra)
             first_ns = first_ns or int(batch.t_ns[0])
             last_ns = int(batch.t_ns[-1])

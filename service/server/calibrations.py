@@ -38,9 +38,9 @@ from service.sessions.calibration_file import encode_calibration, parse_calibrat
 from storage.durable_files import (
     make_synced_folder,
     read_small_file,
-    set_aside_and_describe,
     sync_folder,
     translate_storage_errors,
+    try_set_aside_and_describe,
     write_atomically,
 )
 from storage.sessions.folder import FRAMES_NAME
@@ -104,7 +104,7 @@ class CalibrationStore:
             try:
                 calibration = self._read_file(path.stem)
             except (CalibrationError, FileFormatError) as error:
-                self.problems.append(f"a calibration: {set_aside_and_describe(path, error)}")
+                self.problems.append(f"a calibration: {try_set_aside_and_describe(path, error)}")
             except FootTileError as error:
                 self.problems.append(f"a calibration is left out: {error}")
             else:
@@ -153,7 +153,7 @@ class CalibrationStore:
         self._summaries[summary.id] = summary
         return summary
 
-    def delete(self, calibration_id: str) -> None:
+    def delete_even_if_in_use(self, calibration_id: str) -> None:
         """Delete a calibration; nodes and sessions that use it have a copy.
 
         Raises:
@@ -241,7 +241,7 @@ class CalibrationJobs:
         """True if a job is running."""
         return self._running is not None
 
-    def list_jobs(self) -> list[CalibrationJob]:
+    def list_jobs_newest_first(self) -> list[CalibrationJob]:
         """Return the known jobs, newest first."""
         return [*reversed(self._jobs.values())]
 

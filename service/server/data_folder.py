@@ -19,12 +19,12 @@ from storage.durable_files import (
     is_locked_folder_in_place,
     lock_folder,
     make_synced_folder,
-    set_aside_and_describe,
     set_aside_damaged,
     translate_storage_errors,
+    try_set_aside_and_describe,
     write_atomically,
 )
-from storage.server_id import SERVER_ID_NAME, read_server_id, write_server_id
+from storage.server_id import SERVER_ID_NAME, read_existing_server_id, write_server_id
 from storage.sessions.folder import Session
 
 log = logging.getLogger("foottile.server")
@@ -136,7 +136,7 @@ class DataFolder:
     def _read_id_at_path(self) -> str | None:
         """Read the id of the folder at the path; None if it has none."""
         with suppress(DamagedFileError, FileNotFoundError):
-            return read_server_id(self.path / SERVER_ID_NAME)
+            return read_existing_server_id(self.path / SERVER_ID_NAME)
         return None
 
     def _acquire_lock(self) -> ExitStack:
@@ -158,12 +158,12 @@ class DataFolder:
         """
         path = self.path / SERVER_ID_NAME
         try:
-            return read_server_id(path)
+            return read_existing_server_id(path)
         except FileNotFoundError:
             return None
         except DamagedFileError as error:
             self.problems.append(
-                f"{set_aside_and_describe(path, error)}; nodes treat this server as a new one"
+                f"{try_set_aside_and_describe(path, error)}; nodes treat this server as a new one"
             )
             log.warning("%s", self.problems[-1])
             return None

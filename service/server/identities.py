@@ -14,7 +14,7 @@ from typing import Literal
 from devices.errors import ChangedError, DamagedFileError, StateError, StorageError
 from service.node_identity import compute_fingerprint, generate_secret, is_proof_valid
 from service.protocol import PROTOCOL, Challenge, CloseConnection, LinkCloseCode, Proof
-from storage.durable_files import set_aside_and_describe
+from storage.durable_files import try_set_aside_and_describe
 from storage.permissions import SECRETS_NAME, read_secrets_or_empty, write_secrets
 
 log = logging.getLogger("foottile.nodes")
@@ -57,7 +57,7 @@ class RefusedMachine:
         return compute_fingerprint(self.secret)
 
 
-VerifiedClaim = Literal["proven", "first_contact"]
+ProvenOrFirstContact = Literal["proven", "first_contact"]
 
 
 class NodeIdentities:
@@ -89,7 +89,7 @@ class NodeIdentities:
         except DamagedFileError as error:
             # The true node sends it again. Otherwise a flipped bit would lock it out.
             self.problems.append(
-                f"node {node}: {set_aside_and_describe(path, error)}; "
+                f"node {node}: {try_set_aside_and_describe(path, error)}; "
                 "the next machine that connects under this name is taken for it"
             )
             log.warning("%s", self.problems[-1])
@@ -106,7 +106,7 @@ class NodeIdentities:
             protocol=PROTOCOL, server_id=server_id, nonce=generate_secret(), is_known=is_known
         )
 
-    def verify_or_refuse_claim(self, claim: IdentityClaim, now_t_ns: int) -> VerifiedClaim:
+    def verify_or_refuse_claim(self, claim: IdentityClaim, now_t_ns: int) -> ProvenOrFirstContact:
         """Refuse a false claim; a node without a secret here makes its first contact.
 
         Raises:

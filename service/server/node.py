@@ -128,14 +128,14 @@ class ServerNode:
                 except FootTileError as error:  # a full disk, or another version's file
                     text = f"a journal is left out until it can be read: {error}"
                     self.unreadable_streams[path.name] = text
-        self._problems += self.estimator.problems
-        for text in self.problems:
+        self._problems += self.estimator.file_problems
+        for text in self.file_problems:
             log.warning("%s", text)
         self.present_stream = self._get_or_create_stream(self.last_info)
         """Stream to which the node adds frames now."""
 
     @property
-    def problems(self) -> list[str]:
+    def file_problems(self) -> list[str]:
         """Damage found in its files, and the consequence, as text."""
         found = [*self._problems, *self.unreadable_streams.values()]
         return [f"node {self.name}: {text}" for text in found]
@@ -151,7 +151,7 @@ class ServerNode:
         return self.last_info.stream_id
 
     @property
-    def stream_order(self) -> tuple[str, ...]:
+    def announced_stream_order(self) -> tuple[str, ...]:
         """Ids of its streams from its last hello, oldest first; the present one is last."""
         return (*(each.array_info.stream_id for each in self.hello.earlier), self.stream_id)
 
@@ -171,22 +171,22 @@ class ServerNode:
         return self.present_stream.clock_offset
 
     @property
-    def present_stream_missing(self) -> Intervals:
+    def present_stream_lost_or_pending(self) -> Intervals:
         """Frames of the present stream that are not stored: lost, or still to come."""
         newest = -1 if self.last_seq is None else self.last_seq
         if self.has_connected:
             newest = max(newest, self.hello.next_seq - 1)
-        return self.present_stream.missing_up_to(newest)
+        return self.present_stream.lost_or_pending_up_to(newest)
 
     @property
-    def backlog_frames(self) -> int:
+    def present_stream_backlog_frames(self) -> int:
         """Number of missing frames that the node can still send."""
-        return (self.present_stream_missing & self.present_stream.obtainable).number_count
+        return (self.present_stream_lost_or_pending & self.present_stream.obtainable).number_count
 
     @property
     def present_stream_lost_by_reason(self) -> dict[str, int]:
         """Number of lost frames of the present stream, by reason; unexplained: node_restarted."""
-        unobtainable = self.present_stream_missing - self.present_stream.obtainable
+        unobtainable = self.present_stream_lost_or_pending - self.present_stream.obtainable
         named = {
             why: lost.number_count
             for why, lost in self.present_stream.lost.restricted_to(unobtainable).items()
@@ -196,7 +196,7 @@ class ServerNode:
         return named
 
     @property
-    def refusal_warnings(self) -> list[str]:
+    def frames_ahead_warnings(self) -> list[str]:
         """Warnings about refused frames of the present stream."""
         if not self.refused_ahead_frames:
             return []
@@ -212,7 +212,7 @@ class ServerNode:
         silent_ns = None if seen_t_ns is None else server_utc_ns() - seen_t_ns
         return self._rate_meter.rate_hz(self.last_info.nominal_rate_hz, silent_ns)
 
-    def apply_hello(self, hello: Hello, now_t_ns: int) -> None:
+    def apply_checked_hello(self, hello: Hello, now_t_ns: int) -> None:
         """Update streams and estimates from hello; the caller sets `is_connected`.
 
         Args:
@@ -228,8 +228,8 @@ class ServerNode:
         self.has_connected, self.hello_t_ns = True, now_t_ns
         for stream in list(self.streams.values()):
             stream.unacked = Intervals()
-            if stream.stream_id not in self.stream_order and not hello.has_more:
-                stream.retire_stream()
+            if stream.stream_id not in self.announced_stream_order and not hello.has_more:
+                stream.expect_no_more_frames()
                 if stream.journal is None:  # no frame ever came
                     del self.streams[stream.stream_id]
         for earlier in hello.earlier:
@@ -237,13 +237,15 @@ class ServerNode:
         self.present_stream = self._get_or_create_stream(hello.array_info)
         self.present_stream.apply_present_hello(hello, now_t_ns)
         # Acknowledge stored frames again: a link may have broken before their acknowledgement.
-        for name in self.stream_order:
+        for name in self.announced_stream_order:
             stream = self.streams[name]
             stream.unacked = stream.stored & stream.obtainable
         self.estimator.restart_if_changed(hello)
         self.is_dirty = True
 
-    def frames_to_request(self, needed_first: Mapping[str, Intervals]) -> tuple[StreamNumbers, ...]:
+    def needed_and_present_frames_to_request(
+        self, needed_first: Mapping[str, Intervals]
+    ) -> tuple[StreamNumbers, ...]:
         """Return the frames to request: first those needed by sessions, then the others.
 
         Of earlier streams only the needed ones.
@@ -252,7 +254,7 @@ class ServerNode:
             needed_first: frames that sessions need, by stream id.
         """
         found = []
-        for name in self.stream_order:
+        for name in self.announced_stream_order:
             stream, present = self.streams[name], name == self.stream_id
             wanted = needed_first.get(name, Intervals())
             requested = stream.frames_to_request(wanted, include_unneeded=present)
@@ -284,7 +286,7 @@ class ServerNode:
         """
         try:
             frames = stream.decoder.decode(payload)
-            if ahead := stream.check_or_refuse_frames(frames, now_t_ns):
+            if ahead := stream.check_frames_and_describe_ahead(frames, now_t_ns):
                 self._count_ahead_frames(frames, ahead)
                 return []
             stream.append_frames(frames, payload, now_t_ns)
@@ -303,7 +305,7 @@ class ServerNode:
             frames = frames.slice_rows(self.last_seq + 1 - first, len(frames))
         self.last_seq, self.last_t_ns = last, int(frames.t_ns[-1])
         self._rate_meter.add_frame(int(frames.t_mono_ns[-1]), last)
-        due = self.estimator.feed_frames(frames)
+        due = self.estimator.estimate_or_pass_frames(frames)
         self._update_tare()
         return due
 
@@ -331,7 +333,7 @@ class ServerNode:
                     else:
                         self.streams[name] = opened
                         if self.has_connected:
-                            opened.retire_stream()
+                            opened.expect_no_more_frames()
             except DamagedFileError as error:
                 self._problems.append(f"a journal is left out: {error}")
             except FootTileError:
@@ -350,7 +352,7 @@ class ServerNode:
             self.clock_offset.server_minus_node_ns if self.clock_offset is not None else 0
         )
 
-    def delete_unneeded_step(self, keep: Mapping[str, Intervals]) -> bool:
+    def delete_old_frames_or_one_ended_journal(self, keep: Mapping[str, Intervals]) -> bool:
         """Delete frames older than the ring and not in `keep`, at most one whole journal per call.
 
         Args:
@@ -372,7 +374,7 @@ class ServerNode:
                 # The node waits for their acknowledgement; on a full disk, room comes first.
                 is_there = stream.journal is not None
                 stream.delete_journal()
-                if name not in self.stream_order:
+                if name not in self.announced_stream_order:
                     del self.streams[name]
                 if is_there:
                     return True

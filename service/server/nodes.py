@@ -22,7 +22,7 @@ from devices.errors import (
 from service.protocol import PROTOCOL, Hello
 from service.server.node import BOOT_ID_PATTERN, HELLO_NAME, ServerNode
 from storage.checksummed_json import read_checksummed_json
-from storage.durable_files import set_aside_and_describe, translate_storage_errors
+from storage.durable_files import translate_storage_errors, try_set_aside_and_describe
 
 log = logging.getLogger("foottile.nodes")
 
@@ -57,7 +57,7 @@ class NodeRegistry:
                 continue
             except DamagedFileError as error:
                 self._add_problem(
-                    f"node {folder.name}: {set_aside_and_describe(folder / HELLO_NAME, error)}"
+                    f"node {folder.name}: {try_set_aside_and_describe(folder / HELLO_NAME, error)}"
                 )
                 continue
             except FileFormatError as error:
@@ -74,7 +74,7 @@ class NodeRegistry:
     @property
     def file_problems(self) -> list[str]:
         """Damage found in the files of nodes, and the consequence, as text."""
-        return self._problems + [text for node in self for text in node.problems]
+        return self._problems + [text for node in self for text in node.file_problems]
 
     def _add_problem(self, text: str) -> None:
         text = escape_control_chars(text)
@@ -99,7 +99,7 @@ class NodeRegistry:
             raise UnknownError(f"no node {name[:80]!r}", expected=f"one of: {names}")
         return self._nodes[name]
 
-    def get_or_create(self, hello: Hello) -> ServerNode:
+    def check_hello_and_get_or_create(self, hello: Hello) -> ServerNode:
         """Return the node that sent this hello, created if new. It is not connected yet.
 
         Raises:

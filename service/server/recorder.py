@@ -63,7 +63,7 @@ class Recorder:
         """Return the sessions that are being recorded on a node."""
         return [s for s in self._store.list_unsealed(node) if s.state == "recording"]
 
-    def start_session(
+    def start_another_session(
         self,
         node_name: str,
         name: str,
@@ -73,7 +73,7 @@ class Recorder:
         notes: str = "",
         tags: tuple[str, ...] = (),
         take: str | None = None,
-        request: IdempotencyRecord | None = None,
+        request_to_store: IdempotencyRecord | None = None,
     ) -> Session:
         """Start a session with the next frame, or `pre_roll_s` earlier if still stored.
 
@@ -106,7 +106,7 @@ class Recorder:
             notes=notes,
             tags=tags,
             take=take,
-            request=request,
+            request=request_to_store,
             missed_slots_at_start=node.present_stream.missed_slots,
             clock=session_parts.list_clock_offsets_since(node.present_stream, part.seq_first),
         )
@@ -242,9 +242,9 @@ class Recorder:
         """Return the present ledger of a session that may be in the trash."""
         return current_ledger(session, self._nodes.find(session.node))
 
-    def find_problem(self, session: Session) -> str | None:
+    def find_problem_to_show(self, session: Session) -> str | None:
         """Return the user-visible problem of a session, if any."""
-        return self._sealer.find_problem(session)
+        return self._sealer.find_problem_to_show(session)
 
     def compute_duration_s(self, session: Session, frame_count: int) -> float:
         """Return the session's length: exact if sealed, else the time over which frames have come.
@@ -267,7 +267,7 @@ class Recorder:
             return "frames"
         return "end" if session.parts[-1].seq_last is None else None
 
-    def collect_inputs(self, session_id: str) -> SessionInputs:
+    def collect_unsealed_inputs(self, session_id: str) -> SessionInputs:
         """Collect the inputs from which a session can be sealed or exported.
 
         Raises:
@@ -288,7 +288,7 @@ class Recorder:
             part
             for session in (*self._store.list_unsealed(), *self._store.trash.list_unsealed())
             if session.node == node_name
-            for part in session_parts.iterate_needed_parts(session, node)
+            for part in session_parts.iterate_own_and_possible_later_parts(session, node)
         )
 
     def make_retention_request(self, node_name: str) -> RetentionMessage:

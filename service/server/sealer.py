@@ -44,7 +44,7 @@ class SessionSealer:
         store: sessions to seal.
         nodes: nodes with the sessions' frames.
         request_resend: called with a node that may still have frames that are damaged here.
-        exact: True: estimates are not rounded.
+        unquantized: True: estimates are not rounded.
     """
 
     def __init__(
@@ -53,9 +53,9 @@ class SessionSealer:
         nodes: NodeRegistry,
         request_resend: Callable[[ServerNode], None],
         *,
-        exact: bool = False,
+        unquantized: bool = False,
     ) -> None:
-        self._exact = exact
+        self._exact = unquantized
         self._store = store
         self._nodes = nodes
         self._request_resend = request_resend
@@ -81,7 +81,7 @@ class SessionSealer:
 
     def collect_inputs(self, session: Session) -> SessionInputs:
         """Collect the present inputs of a session; missing ones are left out (`problem`)."""
-        return current_inputs(session, self._nodes.get(session.node), exact=self._exact)
+        return current_inputs(session, self._nodes.get(session.node), unquantized=self._exact)
 
     def advance_unsealed_sessions(self) -> None:
         """Find the ends of stopped sessions, and start to seal those whose frames are all here."""
@@ -114,7 +114,7 @@ class SessionSealer:
         self._retry_after_s.pop(session_id, None)
         self._failures.pop(session_id, None)
 
-    def find_problem(self, session: Session) -> str | None:
+    def find_problem_to_show(self, session: Session) -> str | None:
         """Return the user-visible problem of a session, if any."""
         return self._failures.get(session.id, session.problem)
 
@@ -143,7 +143,7 @@ class SessionSealer:
         node = self._nodes.find(session.node)
         if node is None:
             return session
-        followed = session_parts.extend_or_continue_session(session, node)
+        followed = session_parts.extend_session_or_continue_with_other_tiles(session, node)
         # Save the sessions that continue it first: if the server is killed between, none is lost.
         continuations = followed[1:]
         if continuations and not any(

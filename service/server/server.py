@@ -88,13 +88,13 @@ class Server:
 
     Args:
         data: data folder.
-        exact: True: estimates of recorded sessions are not rounded.
+        unquantized: True: estimates of recorded sessions are not rounded.
 
     Raises:
         StorageError: the folder cannot be written.
     """
 
-    def __init__(self, data: Path, *, exact: bool = False) -> None:
+    def __init__(self, data: Path, *, unquantized: bool = False) -> None:
         self.data = data
         register_private_folder(data)
         self.data_folder = DataFolder(data)
@@ -116,7 +116,7 @@ class Server:
                 self._notify_session_changed,
             )
             self.sealer = SessionSealer(
-                self.sessions, self.nodes, self._request_resend, exact=exact
+                self.sessions, self.nodes, self._request_resend, unquantized=unquantized
             )
             self.recorder = Recorder(self.sessions, self.nodes, self.sealer)
             self.takes = TakeRecorder(self.recorder, self.sessions, self.nodes)
@@ -174,7 +174,9 @@ class Server:
         until_s = time.monotonic() + _DELETE_BUDGET_S
         for node in list(self.nodes):
             with self._isolate_errors(f"node {node.name}, deleting unneeded journals"):
-                while node.delete_unneeded_step(self.recorder.needed_frames(node.name)):
+                while node.delete_old_frames_or_one_ended_journal(
+                    self.recorder.needed_frames(node.name)
+                ):
                     await asyncio.sleep(0)
                     if time.monotonic() >= until_s:
                         return False
@@ -227,7 +229,7 @@ class Server:
         self.data_folder.check_writable()
 
     @property
-    def problems(self) -> list[str]:
+    def file_problems(self) -> list[str]:
         """Damage found in the data folder, and the consequence, as text."""
         return [
             *self.data_folder.problems,
@@ -289,7 +291,7 @@ class Server:
             self.broadcaster.subscriber_count
             and (view := self.try_make_node_json(node)) is not None
         ):
-            self.broadcaster.queue_notice({"type": "node", "node": view})
+            self.broadcaster.queue_droppable_notice({"type": "node", "node": view})
 
     def _update_retention(self, link: NodeLink) -> None:
         """Notify a node if its retention request has changed."""
@@ -338,13 +340,13 @@ class Server:
     def _notify_session_changed(self, session: Session) -> None:
         if self.broadcaster.subscriber_count:
             view = SessionView.from_session(session, self.recorder).model_dump(mode="json")
-            self.broadcaster.queue_notice({"type": "session", "session": view})
+            self.broadcaster.queue_droppable_notice({"type": "session", "session": view})
 
     def _send_heartbeat(self) -> None:
         if not self.broadcaster.subscriber_count:
             return
         last = [node.last_seq for node in self.nodes if node.last_seq is not None]
-        self.broadcaster.queue_notice(
+        self.broadcaster.queue_droppable_notice(
             {
                 "type": "heartbeat",
                 "t_ns": server_utc_ns(),
@@ -354,7 +356,7 @@ class Server:
                         "last_seq": node.last_seq,
                         "rate_hz": node.rate_hz,
                         "lost_frames": sum(node.present_stream_lost_by_reason.values()),
-                        "backlog_frames": node.backlog_frames,
+                        "backlog_frames": node.present_stream_backlog_frames,
                         "missed_slots": node.present_stream.missed_slots,
                         "connected": node.is_connected,
                     }

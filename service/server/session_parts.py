@@ -19,8 +19,8 @@ from service.server_clock import server_utc_ns
 from service.sessions.inputs import SessionInputs, make_inputs
 from service.sessions.parts import (
     SessionStream,
-    close_at_stop,
-    close_at_stream_end,
+    close_at_stop_if_passed,
+    close_at_stream_end_or_newest_frame,
     close_part,
     close_unfinished,
     continue_session,
@@ -31,7 +31,7 @@ from storage.sessions.folder import Ledger, Part, Session
 from storage.sessions.ledger import (
     compute_ledger,
     group_numbers_by_stream,
-    settle_losses,
+    mark_damaged_and_abandoned_lost,
 )
 
 _UNSENT_NS = 1_000_000_000
@@ -66,7 +66,7 @@ def make_initial_part(node: ServerNode, last_seq: int, last_t_ns: int, pre_roll_
         reached_t_ns = journal.find_batch_t_ns_near(seq_first, at_or_before=False)
         if reached_t_ns is not None and reached_t_ns > since_t_ns:
             back = round((reached_t_ns - since_t_ns) * 1e-9 * node.last_info.nominal_rate_hz)
-            coming = node.present_stream_missing & node.present_stream.obtainable
+            coming = node.present_stream_lost_or_pending & node.present_stream.obtainable
             coming = coming.restricted_to(max(0, seq_first - back), seq_first - 1)
             seq_first = min((first for first, _ in coming), default=seq_first)
     return Part(stream_id=node.stream_id, seq_first=seq_first)
@@ -93,13 +93,15 @@ def mark_stopped(session: Session, node: ServerNode | None) -> Session:
     return close_part(session, session.parts[-1], node.last_seq)
 
 
-def extend_or_continue_session(session: Session, node: ServerNode) -> list[Session]:
+def extend_session_or_continue_with_other_tiles(
+    session: Session, node: ServerNode
+) -> list[Session]:
     """Extend the session's parts to the present end of its node's streams; nothing is saved.
 
     Returns:
         The session, and further ones that continue it where the node came back with other tiles.
     """
-    found = [reopen_earlier_part(session, node)]
+    found = [_reopen_earlier_part(session, node)]
     while found[-1].parts[-1].seq_last is None:
         extended = _extend_once(found[-1], node)
         if not extended:
@@ -108,7 +110,7 @@ def extend_or_continue_session(session: Session, node: ServerNode) -> list[Sessi
     return found
 
 
-def reopen_earlier_part(session: Session, node: ServerNode) -> Session:
+def _reopen_earlier_part(session: Session, node: ServerNode) -> Session:
     """Return the session with its open end in an earlier stream that was resumed.
 
     A part is closed when its node announces another stream. If that stream is gone and the earlier
@@ -118,7 +120,7 @@ def reopen_earlier_part(session: Session, node: ServerNode) -> Session:
     last_part = session.parts[-1]
     stream = node.streams.get(last_part.stream_id)
     may_go_on = stream is not None and (
-        last_part.stream_id in node.stream_order or bool(stream.obtainable)
+        last_part.stream_id in node.announced_stream_order or bool(stream.obtainable)
     )
     if (
         last_part.seq_last is not None
@@ -127,7 +129,7 @@ def reopen_earlier_part(session: Session, node: ServerNode) -> Session:
         or last_part.stream_id in node.unreadable_streams
     ):
         return session
-    for stream_id in node.stream_order:
+    for stream_id in node.announced_stream_order:
         own_parts = [part for part in session.parts if part.stream_id == stream_id]
         stream = node.streams[stream_id]
         ends = [part.seq_last for part in own_parts if part.seq_last is not None]
@@ -139,7 +141,7 @@ def reopen_earlier_part(session: Session, node: ServerNode) -> Session:
 
 def _switch_stream(session: Session, node: ServerNode, part: Part) -> Session:
     """Return the session with its open part closed and another one open."""
-    *before, last_part = close_at_stream_end(
+    *before, last_part = close_at_stream_end_or_newest_frame(
         session, collect_stream_facts(session, node), server_utc_ns()
     ).parts
     tails = {name: n for name, n in session.max_lost_tail_frames.items() if name != part.stream_id}
@@ -156,12 +158,14 @@ def _switch_stream(session: Session, node: ServerNode, part: Part) -> Session:
 def abandon_missing(session: Session, node: ServerNode | None) -> Session:
     """Return the session without its missing frames: its open end is closed."""
     if node is not None:
-        session = reopen_earlier_part(session, node)
+        session = _reopen_earlier_part(session, node)
     closed = close_unfinished(session, collect_stream_facts(session, node), server_utc_ns())
     return closed.model_copy(update={"is_abandoned": True})
 
 
-def iterate_needed_parts(session: Session, node: ServerNode | None) -> Iterator[Part]:
+def iterate_own_and_possible_later_parts(
+    session: Session, node: ServerNode | None
+) -> Iterator[Part]:
     """Yield the parts that an unsealed session needs in the journals."""
     yield from session.parts
     if session.parts[-1].seq_last is None and node is not None:
@@ -191,7 +195,7 @@ def _extend_once(session: Session, node: ServerNode) -> list[Session]:
     if stream_id in node.unreadable_streams and not session.is_abandoned:
         return []
     streams = collect_stream_facts(session, node)
-    closed = close_at_stop(session, streams, leave_open_while_missing=True)
+    closed = close_at_stop_if_passed(session, streams, leave_open_while_missing=True)
     if closed.parts[-1].seq_last is not None:
         return [closed]
     if stream_id == node.stream_id or not node.has_connected:
@@ -202,7 +206,10 @@ def _extend_once(session: Session, node: ServerNode) -> list[Session]:
     began = session.stopped_t_ns is None or _began_before_stop(session, node, following)
     if began is None:
         return []
-    closed, stream = close_at_stream_end(session, streams, server_utc_ns()), streams[stream_id]
+    closed, stream = (
+        close_at_stream_end_or_newest_frame(session, streams, server_utc_ns()),
+        streams[stream_id],
+    )
     if not began:
         wanted = group_numbers_by_stream(closed.parts).get(stream_id, Intervals())
         return [] if (stream.obtainable - stream.stored) & wanted else [closed]
@@ -226,7 +233,7 @@ def _extend_once(session: Session, node: ServerNode) -> list[Session]:
 
 def _later_streams(session: Session, node: ServerNode) -> Iterable[str]:
     """Return streams that began after the one of the session's open part, oldest first."""
-    stream_id, order = session.parts[-1].stream_id, node.stream_order
+    stream_id, order = session.parts[-1].stream_id, node.announced_stream_order
     if stream_id in order:
         return order[order.index(stream_id) + 1 :]
     # Hello no longer lists it: streams that began after its last frame are later.
@@ -309,10 +316,14 @@ def current_ledger(session: Session, node: ServerNode | None) -> Ledger:
         return session.ledger
     finished = session.stopped_t_ns is not None and session.parts[-1].seq_last is not None
     likely, streams = _with_likely_end(session, node)
-    return compute_ledger(likely.parts, settle_losses(likely, streams), is_finished=finished)
+    return compute_ledger(
+        likely.parts, mark_damaged_and_abandoned_lost(likely, streams), has_all_parts=finished
+    )
 
 
-def current_inputs(session: Session, node: ServerNode, *, exact: bool = False) -> SessionInputs:
+def current_inputs(
+    session: Session, node: ServerNode, *, unquantized: bool = False
+) -> SessionInputs:
     """Return the inputs from which a session can be sealed or exported now."""
     session, streams = _with_likely_end(session, node)
     return make_inputs(
@@ -321,7 +332,7 @@ def current_inputs(session: Session, node: ServerNode, *, exact: bool = False) -
         load_tares=lambda: node.estimator.tare_history,
         emulated=node.hello.emulated,
         default_array=node.last_info,
-        exact=exact,
+        unquantized=unquantized,
     )
 
 
@@ -349,5 +360,5 @@ def _with_likely_end(
     """Return a session with its likely end, and its streams."""
     streams = collect_stream_facts(session, node)
     with suppress(FootTileError):  # the frames at the stop are damaged
-        session = close_at_stop(session, streams)
+        session = close_at_stop_if_passed(session, streams)
     return session, streams

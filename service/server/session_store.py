@@ -19,7 +19,7 @@ from devices.errors import (
 )
 from service.server.data_folder import SessionIndex, StartKey
 from service.server_clock import server_utc_ns
-from service.sessions.sealing import rebuild_session
+from service.sessions.sealing import rebuild_damaged_session_json
 from storage.durable_files import translate_storage_errors
 from storage.sessions.folder import (
     DELETED_PREFIX,
@@ -45,7 +45,7 @@ def load_or_rebuild_sessions(folder: SessionsFolder) -> LoadedSessions:
         if not any(folder.get_path(session_id).glob("[!.]*")):
             continue  # never saved
         try:
-            session = rebuild_session(folder, session_id)
+            session = rebuild_damaged_session_json(folder, session_id)
         except StorageError as refused:
             log.warning("session %s cannot be rebuilt: %s", session_id, refused)
             session = None
@@ -81,7 +81,7 @@ class Trash:
         found = load_or_rebuild_sessions(self.folder)
         self.has_unreadable = bool(found.errors)
         """True if a session cannot be read: the frames that it needs are unknown."""
-        unreadable = found.error_texts | log_strays(self.folder.find_strays())
+        unreadable = found.error_texts | log_strays(self.folder.find_renamed_or_copied_sessions())
         self.problems = [f"in the trash, {text}" for text in _format_unreadable(unreadable)]
         """Sessions that cannot be read, and the reasons, as text."""
         self._sessions = SessionIndex(found.sessions)
@@ -166,7 +166,7 @@ class SessionStore:
         found = load_or_rebuild_sessions(folder)
         self.unreadable = found.error_texts
         """Errors of the sessions that cannot be read, by id; their files are unchanged."""
-        strays = folder.find_strays()
+        strays = folder.find_renamed_or_copied_sessions()
         self.has_unreadable = bool(self.unreadable) or any(each.may_need_frames for each in strays)
         """True if a session cannot be read: the frames that it needs are unknown."""
         self.has_unreadable |= trash.has_unreadable
@@ -250,7 +250,7 @@ class SessionStore:
         Raises:
             StorageError: it cannot be saved; the session in memory is unchanged.
         """
-        self.folder.save(session)
+        self.folder.save_session_json(session)
         self.cache(session)
         self.on_change(session)
         return session

@@ -22,10 +22,10 @@ from pathlib import Path
 from devices.errors import FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from service.protocol import ClockSample, EarlierStream, Hello, SeqIntervalsByReason
-from service.sessions.parts import SeqsAround, SessionStream, find_seqs_around
+from service.sessions.parts import SeqsAround, SessionStream, find_seqs_around_once_passed
 from storage.clock.bounds import DISCIPLINE_RATE_LIMIT
 from storage.clock.log import ClockLog, ClockOffset
-from storage.frame_rules import describe_first_broken_rule
+from storage.frame_rules import describe_first_impossible_value
 from storage.intervals import CORRUPT, NO_END, REFUSED, Intervals, Losses
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
@@ -241,12 +241,12 @@ class ServerStream:
             missed_slots=self.missed_slots,
             info=self.info,
             journal=self.journal,
-            find_seqs_around=self.find_seqs_around,
+            find_seqs_around=self.find_seqs_around_once_passed,
             offset_ns=offset_ns,
             last_seen_t_ns=self.last_seen_t_ns,
         )
 
-    def find_seqs_around(
+    def find_seqs_around_once_passed(
         self, t_ns: int, *, min_seq: int, may_be_stale: bool = False
     ) -> SeqsAround | None:
         """Return the stored frames next to a time.
@@ -254,8 +254,8 @@ class ServerStream:
         The result is cached: callers repeat the query while frames are missing. The journal's index
         is read again only when frames between the two have come.
 
-        Args, result and errors as for the function `find_seqs_around`; one that `may_be_stale`
-        is the cached one until all frames between have come or are lost.
+        Args, result and errors as for the function `find_seqs_around_once_passed`; one that
+        `may_be_stale` is the cached one until all frames between have come or are lost.
         """
         if self.journal is None:
             return None
@@ -269,7 +269,7 @@ class ServerStream:
             none_came = missing.number_count == after - last - 1
             if ends and (none_came or (may_be_stale and missing & self.obtainable)):
                 return found
-        found = find_seqs_around(self.journal, t_ns, min_seq=min_seq)
+        found = find_seqs_around_once_passed(self.journal, t_ns, min_seq=min_seq)
         if found is None:
             return None
         if len(self._seqs_around_cache) >= _CACHED_INSTANTS_MAX:
@@ -277,7 +277,7 @@ class ServerStream:
         self._seqs_around_cache[t_ns, min_seq] = found
         return found
 
-    def missing_up_to(self, newest_seq: int) -> Intervals:
+    def lost_or_pending_up_to(self, newest_seq: int) -> Intervals:
         """Return the frames that are not stored, from the first known one to `newest_seq`."""
         if self._first_seq is None or newest_seq < self._first_seq:
             return Intervals()
@@ -319,7 +319,7 @@ class ServerStream:
             report.lost, next_seq=report.next_seq + beyond, max_lost_tail_frames=tail
         )
 
-    def retire_stream(self) -> None:
+    def expect_no_more_frames(self) -> None:
         """Retire the stream, which hello lacks: nothing more will come; the next sync closes it."""
         self.node_ranges = Intervals()
         if self.journal is not None:
@@ -332,7 +332,7 @@ class ServerStream:
             lost, next_seq=notes.next_seq, max_lost_tail_frames=notes.max_lost_tail_frames
         )
 
-    def check_or_refuse_frames(self, frames: FrameBatch, now_t_ns: int) -> str:
+    def check_frames_and_describe_ahead(self, frames: FrameBatch, now_t_ns: int) -> str:
         """Check received frames; frames that break a rule are lost and never requested again.
 
         Args:
@@ -349,7 +349,7 @@ class ServerStream:
         """
         first, last = int(frames.seq[0]), int(frames.seq[-1])
         end = self.notes.next_seq
-        wrong = describe_first_broken_rule(frames, self.info)
+        wrong = describe_first_impossible_value(frames, self.info)
         if not wrong and self.limit is not None:
             ahead = self.limit.describe_frames_ahead(frames, now_t_ns)
             if ahead:
@@ -357,7 +357,7 @@ class ServerStream:
         if not wrong and end is not None and last >= end:
             wrong = f"the stream has ended with frame {end - 1}"
         if not wrong and self.journal is not None:
-            wrong = self.journal.describe_time_conflict(frames)
+            wrong = self.journal.describe_time_reversal(frames)
         if wrong:
             refused = Intervals([(first, last)]) - self.stored
             self._refused = self._refused | refused
@@ -417,7 +417,7 @@ class ServerStream:
         """Remove frames from the stored ones: the disk may not have them."""
         if self.journal is None:
             return
-        self.journal.invalidate_whole_batches(frames)
+        self.journal.invalidate_batches_wholly_within(frames)
         if are_corrupt:
             self.journal.lost.add_if_new(frames - self.stored, CORRUPT)
 

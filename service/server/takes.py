@@ -51,7 +51,7 @@ class TakeRecorder:
         self._errors_by_take: OrderedDict[str, dict[str, str]] = OrderedDict()
         """Errors of the nodes that could not be recorded, by take, the newest last."""
 
-    def start_take(
+    def start_take_where_possible(
         self,
         name: str,
         nodes: Sequence[str] | None = None,
@@ -87,7 +87,7 @@ class TakeRecorder:
         take = Take(secrets.token_hex(6))
         for node in dict.fromkeys(nodes):
             try:
-                session = self._recorder.start_session(
+                session = self._recorder.start_another_session(
                     node,
                     name,
                     pre_roll_s=pre_roll_s,
@@ -95,7 +95,7 @@ class TakeRecorder:
                     notes=notes,
                     tags=tags,
                     take=take.id,
-                    request=request,
+                    request_to_store=request,
                 )
             except FootTileError as error:
                 take.errors_by_node[node] = str(error)
@@ -146,7 +146,7 @@ class TakeRecorder:
                 take.errors_by_node[session.node] = str(error)
         return self._require_success(take, take.sessions)
 
-    def add_marker(
+    def add_marker_while_recording(
         self, take_id: str, label: str, t_ns: int | None, marker_id: str | None = None
     ) -> Take:
         """Add a marker at one time to all of its sessions that are being recorded.

@@ -60,7 +60,7 @@ class Withdraw:
     reason: str
 
 
-Action = Begin | End | Withdraw
+MarkerChange = Begin | End | Withdraw
 
 
 @dataclass(frozen=True)
@@ -141,14 +141,14 @@ class Weighing:
 
     def feed_tile_pressures(
         self, t_ns: npt.NDArray[np.int64], tile_absolute_kpa: Floats
-    ) -> list[Action]:
+    ) -> list[MarkerChange]:
         """Feed readings of the tile; return the changes of markers, in order.
 
         Args:
             t_ns: (n,), instants, rising from call to call.
             tile_absolute_kpa: (n,), of this tile; NaN without a reading.
         """
-        actions: list[Action] = []
+        actions: list[MarkerChange] = []
         for at_ns, reading_kpa in zip(t_ns.tolist(), tile_absolute_kpa.tolist(), strict=True):
             if not np.isfinite(reading_kpa):
                 continue
@@ -164,14 +164,14 @@ class Weighing:
             self._sum, self._count = self._sum + reading_kpa, self._count + 1
         return actions
 
-    def repeat_last_weight(self) -> list[Action]:
+    def repeat_held_or_last_weight(self) -> list[MarkerChange]:
         """Go back to the weight that is held, or else to the last one, and rest before it.
 
         Returns:
             Withdrawals of markers.
         """
         reason = "repeated by hand"
-        actions: list[Action] = []
+        actions: list[MarkerChange] = []
         if self.step in ("resting", "put on", "holding"):
             actions.append(Withdraw(reason))
         if self.step == "holding":
@@ -190,7 +190,7 @@ class Weighing:
     def _newest_kpa(self) -> float:
         return self.recent_kpa[-1] if self.recent_kpa else np.nan
 
-    def _advance(self, kpa: float, t_ns: int) -> list[Action]:
+    def _advance(self, kpa: float, t_ns: int) -> list[MarkerChange]:
         """Go on by a quarter of a second, which ends at this instant."""
         self._bins = [*self._bins[1 - _WINDOW_BINS :], kpa]
         self.recent_kpa.append(kpa)
@@ -208,11 +208,11 @@ class Weighing:
             case _:
                 return []
 
-    def _begin(self, step: StepName, label: str, t_ns: int) -> list[Action]:
+    def _begin(self, step: StepName, label: str, t_ns: int) -> list[MarkerChange]:
         self.step, self._in_step = step, []
         return [Begin(f"{self.serial} {label}", t_ns)]
 
-    def _watch(self, kpa: float, t_ns: int) -> list[Action]:
+    def _watch(self, kpa: float, t_ns: int) -> list[MarkerChange]:
         is_weight = self.step == "holding"
         zero_kpa = self.rest_kpa if is_weight else 0.0
         self._in_step.append(kpa - zero_kpa)
@@ -237,7 +237,7 @@ class Weighing:
             self.step = "put on"
         return [End(t_ns)]
 
-    def _interrupt(self, reason: str) -> list[Action]:
+    def _interrupt(self, reason: str) -> list[MarkerChange]:
         """Wait for a steady pressure again; withdraw the step under way."""
         self._bins = []
         if self.step not in ("resting", "holding"):

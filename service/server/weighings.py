@@ -30,7 +30,7 @@ from service.server.node import ServerNode
 from service.server.recorder import Recorder
 from service.server.sealer import SessionSealer
 from service.server.session_store import SessionStore, check_revision
-from service.server.weighing import Action, Begin, End, Method, Weighing, Withdraw
+from service.server.weighing import Begin, End, MarkerChange, Method, Weighing, Withdraw
 from storage.sessions.folder import FRAMES_NAME, Session
 
 log = logging.getLogger("foottile.weighings")
@@ -184,7 +184,7 @@ class Weighings:
                 f"the clock of node {node.name!r} was not compared with the server's yet",
                 remedy="Start again in some seconds",
             )
-        session = self._recorder.start_session(
+        session = self._recorder.start_another_session(
             node.name, f"weights on {', '.join(plan.tiles)}"[:200], tags=("calibration",)
         )
         now_s = time.monotonic()
@@ -208,7 +208,9 @@ class Weighings:
                 with self._failing(weighing):
                     self._take(weighing, node, frames)
 
-    def repeat_last_weight(self, node: ServerNode, session_id: str | None = None) -> NodeWeighing:
+    def repeat_held_or_last_weight(
+        self, node: ServerNode, session_id: str | None = None
+    ) -> NodeWeighing:
         """Go back to the weight that is held, or else to the last one on this tile.
 
         Raises:
@@ -221,7 +223,7 @@ class Weighings:
             raise StateError(
                 f"the guided calibration of {node.name!r} has ended", remedy="Start another one"
             )
-        self._mark(weighing, node, weighing.present_pass.repeat_last_weight())
+        self._mark(weighing, node, weighing.present_pass.repeat_held_or_last_weight())
         return weighing
 
     async def cancel_or_remove_weighing(self, node: str, session_id: str | None = None) -> None:
@@ -281,7 +283,9 @@ class Weighings:
             weighing.state = "fitting"
             weighing.task = asyncio.get_running_loop().create_task(self._finish(weighing))
 
-    def _mark(self, weighing: NodeWeighing, node: ServerNode, actions: Sequence[Action]) -> None:
+    def _mark(
+        self, weighing: NodeWeighing, node: ServerNode, actions: Sequence[MarkerChange]
+    ) -> None:
         """Write the steps as markers of the session, and remove those of withdrawn steps."""
         for action in actions:
             match action:
@@ -343,7 +347,7 @@ class Weighings:
 
     def _why_not(self, session: Session) -> str:
         ledger = self._recorder.compute_ledger(session)
-        return self._recorder.find_problem(session) or (
+        return self._recorder.find_problem_to_show(session) or (
             f"the node still has {ledger.pending} frames of it"
         )
 

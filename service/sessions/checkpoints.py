@@ -84,16 +84,18 @@ class Checkpoints:
         newest.begin_ns = min(newest.begin_ns, int(t_ns.min()))
         newest.end_ns = max(newest.end_ns, int(t_ns.max()))
 
-    def try_add_checkpoint(self, checkpoint: Checkpoint, state: Columns | None) -> None:
+    def try_add_checkpoint(
+        self, checkpoint: Checkpoint, state_if_estimated: Columns | None
+    ) -> None:
         """Try to add a checkpoint; without effect if the disk is full.
 
         Args:
             checkpoint: checkpoint behind all present ones.
-            state: state of the estimator; None without estimates.
+            state_if_estimated: state of the estimator; None without estimates.
         """
-        if state is not None:
+        if state_if_estimated is not None:
             content = io.BytesIO()
-            np.savez(content, allow_pickle=False, **state)
+            np.savez(content, allow_pickle=False, **state_if_estimated)
             try:
                 checkpoint.state = self._scratch.append(content.getvalue())
             except StorageError:  # a full disk is left to frames
@@ -143,7 +145,7 @@ def make_preview_stream(inputs: SessionInputs) -> EstimateStream | None:
         inputs.info.models,
         LIVE_LAG_MS,
         tares=inputs.tares,
-        exact=inputs.exact,
+        unquantized=inputs.unquantized,
     )
     try:
         return EstimateStream(inputs.info, options)

@@ -17,7 +17,7 @@ from storage.schema import Array
 from storage.sessions.comparisons import (
     SERIES_NAME,
     read_comparison_series,
-    read_comparison_series_footer,
+    read_comparison_series_footer_unverified,
     read_comparison_series_range,
 )
 from storage.sessions.footer import read_file_stamps_or_empty
@@ -49,7 +49,7 @@ class ComparisonSeries:
     """
 
     def __init__(self, folder: Path, table: pa.Table) -> None:
-        self._folder, self._footer = folder, read_comparison_series_footer(folder)
+        self._folder, self._footer = folder, read_comparison_series_footer_unverified(folder)
         steps = np.diff(table["t_ns"].to_numpy())
         self._gap_ns = GAP_STEPS * float(np.median(steps)) if len(steps) else np.inf
         frames = _make_bins(table, self._gap_ns)

@@ -41,14 +41,14 @@ class SessionFrames:
     def __iter__(self) -> Iterator[tuple[FrameBatch, Columns]]:
         if self._inputs.calibration is None:
             self._note_no_estimates(self._inputs.problem)
-            yield from self.iterate_raw()
+            yield from self.iterate_raw_with_part()
             return
         try:
             pieces = self._iterate_estimated()
             first = next(pieces, None)
         except FootTileError as error:  # no tare, a calibration of other tiles, no estimator
             self._note_no_estimates(error)
-            yield from self.iterate_raw()
+            yield from self.iterate_raw_with_part()
             return
         if first is not None:
             yield first
@@ -68,10 +68,10 @@ class SessionFrames:
             sources.info.models,
             OFFLINE_LAG_MS,
             tares=sources.tares,
-            exact=sources.exact,
+            unquantized=sources.unquantized,
         )
         stream = EstimateStream(sources.info, options)
-        for frames, columns in stream.estimate_batches(self.iterate_raw()):
+        for frames, columns in stream.estimate_batches(self.iterate_raw_with_part()):
             if not self.notes and stream.plan is not None:
                 self.notes = make_estimate_metadata(stream.plan, stream.rounding, sources.tares)
                 if any(tare.is_lost for tare in sources.tares):
@@ -88,12 +88,12 @@ class SessionFrames:
         if tares:
             self.notes["tares"] = [tare.as_dict() for tare in tares]
 
-    def iterate_raw(self) -> Iterator[tuple[FrameBatch, Columns]]:
+    def iterate_raw_with_part(self) -> Iterator[tuple[FrameBatch, Columns]]:
         """Yield frames with the column `part` only."""
-        return iterate_raw_frames(self._inputs)
+        return iterate_raw_frames_with_part(self._inputs)
 
 
-def iterate_raw_frames(
+def iterate_raw_frames_with_part(
     inputs: SessionInputs, first_part: int = 0, first_seq: int = 0
 ) -> Iterator[tuple[FrameBatch, Columns]]:
     """Yield frames from the journals in order, with the column `part` only.

@@ -14,11 +14,11 @@ from service.estimation.calibration import Calibration
 from service.estimation.tare.tare import Tare
 from service.sessions.parts import RATE_MAX_HZ, SessionStream
 from service.sessions.tares import TareHistory
-from storage.clock.table import ClockTable, StreamClockFacts, group_rows_by_stream
+from storage.clock.table import ClockTable, StreamClockFacts, group_unsorted_rows_by_stream
 from storage.intervals import NO_END
 from storage.journal.journal import Journal
 from storage.sessions.folder import Session
-from storage.sessions.ledger import find_lost_numbers, settle_losses
+from storage.sessions.ledger import find_lost_numbers, mark_damaged_and_abandoned_lost
 from storage.sessions.time_axis import NODE_AXIS, PartSpan, TimeAxis, compute_time_axis
 
 
@@ -34,7 +34,7 @@ class SessionInputs:
         problem: reason why there is none.
         tares: tares in force, oldest first; `Tare.make_lost` where one is lost.
         notes: further metadata for the file.
-        exact: True: estimates are not rounded.
+        unquantized: True: estimates are not rounded.
     """
 
     session: Session
@@ -44,7 +44,7 @@ class SessionInputs:
     problem: str | None
     tares: tuple[Tare, ...]
     notes: Mapping[str, object]
-    exact: bool = False
+    unquantized: bool = False
 
     @property
     def stream_facts(self) -> tuple[StreamClockFacts, ...]:
@@ -63,7 +63,7 @@ class SessionInputs:
         """Return the clock table of a session that is not sealed yet."""
         parts = [part.stream_id for part in self.session.parts]
         where = f"session {self.session.id}"
-        rows = group_rows_by_stream(self.session.clock, where=where)
+        rows = group_unsorted_rows_by_stream(self.session.clock, where=where)
         return ClockTable(rows, self.stream_facts, parts, where=where)
 
     def compute_time_axis(self) -> TimeAxis:
@@ -102,7 +102,7 @@ def make_inputs(
     load_tares: Callable[[], TareHistory] | None,
     emulated: bool | None,
     default_array: ArrayInfo | None = None,
-    exact: bool = False,
+    unquantized: bool = False,
 ) -> SessionInputs:
     """Collect the inputs of a session.
 
@@ -112,7 +112,7 @@ def make_inputs(
         load_tares: returns the tares of its node; None: there is no history.
         emulated: True: its frames are emulated; None: unknown.
         default_array: array if no stream describes one.
-        exact: True: estimates are not rounded.
+        unquantized: True: estimates are not rounded.
     """
     infos = [streams[part.stream_id].info for part in session.parts]
     info = next(
@@ -124,7 +124,7 @@ def make_inputs(
         in_force, problem = _tares_during(session, streams, load_tares(), info)
     notes: dict[str, object] = {
         "scene": session.scene_content,
-        "lost": find_lost_numbers(session.parts, settle_losses(session, streams)),
+        "lost": find_lost_numbers(session.parts, mark_damaged_and_abandoned_lost(session, streams)),
     }
     if emulated is not None:
         notes["emulated"] = emulated
@@ -138,7 +138,7 @@ def make_inputs(
         problem=problem,
         tares=in_force,
         notes=notes,
-        exact=exact,
+        unquantized=unquantized,
     )
 
 
@@ -167,7 +167,7 @@ def _tares_during(
     end_t_ns = streams[last.stream_id].find_batch_t_ns_near(seq_last, at_or_before=True)
     if begin_t_ns is None or end_t_ns is None:
         return (), None
-    tares = history.tares_in_force_between(info, begin_t_ns, end_t_ns)
+    tares = history.tares_in_force_or_lost_between(info, begin_t_ns, end_t_ns)
     if not tares and not history.is_empty(info):
         return (), "all tares of the node were taken after this session"
     return tares, None

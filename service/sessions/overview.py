@@ -129,7 +129,7 @@ def bin_from_overview_or_rebuild(
         FileFormatError: the frames are damaged.
     """
     path = session.path.with_name(OVERVIEW_NAME)
-    begin_ns, end_ns = session.read_span_ns()
+    begin_ns, end_ns = session.read_span_on_axis_ns()
     bounds = time_slice.compute_bounds_ns(begin_ns)
     try:
         with open_overview(path) as stored:

@@ -93,7 +93,7 @@ def continue_session(
     update: dict[str, object] = {"problem": problem}
     if session.state == "recording":
         update |= {"state": "pending", "stopped_t_ns": begin_t_ns}
-    name, number = split_number(session.name)
+    name, number = split_number_in_parentheses(session.name)
     continuation = create_session(
         info,
         f"{name} ({number + 1})",
@@ -117,7 +117,7 @@ class NumberedName(NamedTuple):
     number: int
 
 
-def split_number(name: str) -> NumberedName:
+def split_number_in_parentheses(name: str) -> NumberedName:
     """Split a session's name into the given name and its number."""
     match = re.fullmatch(r"(.*) \((\d+)\)", name)
     return NumberedName(match[1], int(match[2])) if match else NumberedName(name, 1)
@@ -138,7 +138,7 @@ class SeqsAroundFinder(Protocol):
     """Lookup of the frames next to a time of a stream."""
 
     def __call__(self, t_ns: int, *, min_seq: int, may_be_stale: bool = False) -> SeqsAround | None:
-        """Return the same as `find_seqs_around`.
+        """Return the same as `find_seqs_around_once_passed`.
 
         Args:
             t_ns: the time, node's UTC.
@@ -175,7 +175,7 @@ class SessionStream(StreamState):
         )
 
 
-def find_seqs_around(journal: Journal, t_ns: int, *, min_seq: int) -> SeqsAround | None:
+def find_seqs_around_once_passed(journal: Journal, t_ns: int, *, min_seq: int) -> SeqsAround | None:
     """Return the stored frames next to a time.
 
     Args:
@@ -203,7 +203,7 @@ RATE_MAX_HZ = 1000.0
 Streams = Mapping[str, SessionStream]
 
 
-def close_at_stop(
+def close_at_stop_if_passed(
     session: Session, streams: Streams, *, leave_open_while_missing: bool = False
 ) -> Session:
     """Return the session with those open parts closed whose stream has passed the stop.
@@ -226,7 +226,9 @@ def close_at_stop(
     return session
 
 
-def close_at_stream_end(session: Session, streams: Streams, now_t_ns: int | None = None) -> Session:
+def close_at_stream_end_or_newest_frame(
+    session: Session, streams: Streams, now_t_ns: int | None = None
+) -> Session:
     """Return the session with every open part closed at the end of its stream.
 
     Args:
@@ -259,12 +261,14 @@ def close_unfinished(session: Session, streams: Streams, now_t_ns: int | None = 
     Args:
         session: the session.
         streams: facts by stream id, for all of its parts.
-        now_t_ns: as for `close_at_stream_end`.
+        now_t_ns: as for `close_at_stream_end_or_newest_frame`.
 
     Raises:
         DamagedFramesError: the frames at the stop are damaged.
     """
-    session = close_at_stream_end(close_at_stop(session, streams), streams, now_t_ns)
+    session = close_at_stream_end_or_newest_frame(
+        close_at_stop_if_passed(session, streams), streams, now_t_ns
+    )
     if session.stopped_t_ns is None:
         stream = streams[session.parts[-1].stream_id]
         newest_t_ns = stream.find_batch_t_ns_near(

@@ -49,7 +49,7 @@ class EstimateOptions:
     tare_s: tuple[float, float] | None = None
     tares: tuple[Tare, ...] = ()
     """Tares of the time of recording, oldest first; they win over a tare found in the frames."""
-    exact: bool = False
+    unquantized: bool = False
     """True: nothing is rounded."""
 
 
@@ -82,17 +82,19 @@ class EstimateRun:
             new._waiting.append((FrameBatch(**waiting), _strip_prefix("with/", state)))
         return new
 
-    def feed_frames(self, frames: FrameBatch, extra: Extra) -> Iterator[tuple[FrameBatch, Columns]]:
+    def feed_frames(
+        self, frames: FrameBatch, carried_columns: Extra
+    ) -> Iterator[tuple[FrameBatch, Columns]]:
         """Add the next frames; yield those whose estimates are due, in order.
 
         One batch per `ROWS_PER_STEP` frames, since each batch has a fixed cost.
         """
         for begin in range(0, len(frames), ROWS_PER_STEP):
             end = min(begin + ROWS_PER_STEP, len(frames))
-            rows, rows_of = frames, extra
+            rows, rows_of = frames, carried_columns
             if end - begin < len(frames):  # do not copy a whole live message
                 rows = frames.slice_rows(begin, end)
-                rows_of = {name: v[begin:end] for name, v in extra.items()}
+                rows_of = {name: v[begin:end] for name, v in carried_columns.items()}
             self._waiting.append((rows, rows_of))
             yield from _pair_with_frames(self._waiting, self._estimator.process_frames(rows))
 
@@ -172,7 +174,7 @@ class EstimateStream:
         self.tare = tares[self._tare_changes]
         self._run = EstimateRun.from_state(self.make_plan(self.tare), state)
 
-    def find_tare(self, batches: Iterable[tuple[FrameBatch, Extra]]) -> Tare:
+    def find_tare_in_first_frames(self, batches: Iterable[tuple[FrameBatch, Extra]]) -> Tare:
         """Find the tare that `estimate_batches` would use; read no more than needed.
 
         Raises:
@@ -216,7 +218,7 @@ class EstimateStream:
 
     def _start_run(self, tare: Tare) -> EstimateRun:
         self.plan = self.make_plan(tare)
-        if not self._options.exact:
+        if not self._options.unquantized:
             later = map(self.make_plan, self._options.tares[1:])
             self.rounding = Quantization.for_plans(chain([self.plan], later))
         self._run, self.tare = EstimateRun(self.plan), tare

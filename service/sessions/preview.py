@@ -17,7 +17,7 @@ from devices.errors import FootTileError, StateError
 from devices.frames import FrameBatch
 from service.estimation.compilation import is_compiling
 from service.sessions.checkpoints import Checkpoint, Checkpoints, make_preview_stream
-from service.sessions.frames import Columns, iterate_raw_frames
+from service.sessions.frames import Columns, iterate_raw_frames_with_part
 from service.sessions.inputs import SessionInputs
 from service.sessions.overview import BinnedSlice
 from storage.formats.slice import Slice
@@ -61,11 +61,11 @@ class SessionPreview:
         """True if the journals have more frames."""
 
     @property
-    def has_estimates(self) -> bool:
+    def has_estimate_stream(self) -> bool:
         """True if there are estimates, not only raw counts."""
         return self._stream is not None
 
-    def can_use(self, inputs: SessionInputs) -> bool:
+    def has_valid_beginning(self, inputs: SessionInputs) -> bool:
         """Return whether part of the preview is valid for these inputs."""
         before = self._inputs
         same = inputs.info == before.info and inputs.calibration == before.calibration
@@ -73,24 +73,24 @@ class SessionPreview:
         return (
             same
             and tares == before.tares
-            and (make_preview_stream(inputs) is None) != self.has_estimates
+            and (make_preview_stream(inputs) is None) != self.has_estimate_stream
         )
 
     def valid_checkpoints(self, inputs: SessionInputs) -> list[Checkpoint]:
         """Return the checkpoints before any change: the beginning, and perhaps more."""
         checkpoints = self.checkpoints.checkpoints
-        if not self.can_use(inputs):
+        if not self.has_valid_beginning(inputs):
             return [Checkpoint()]
         count = bisect_left(checkpoints, True, key=lambda place: not self._is_valid(place, inputs))
         return list(checkpoints[: max(1, count)])
 
-    def advance(self, inputs: SessionInputs) -> None:
-        """Estimate new frames for `UPDATE_BUDGET_S` at most; `can_use` is true of `inputs`.
+    def advance_within_time_limit(self, inputs: SessionInputs) -> None:
+        """Estimate new frames for `UPDATE_BUDGET_S` at most; `inputs` have a valid beginning.
 
         Raises:
             FootTileError: a journal is damaged, or cannot be read.
         """
-        if self.has_estimates and is_compiling():  # else it would compile here
+        if self.has_estimate_stream and is_compiling():  # else it would compile here
             self.is_catching_up = True
             return
         begun_s, is_again = time.monotonic(), self._position.fed_frames < self._fed_before_rewind
@@ -101,7 +101,9 @@ class SessionPreview:
             self._stream = on
         self._inputs = inputs
         self.is_catching_up = True
-        for frames, columns in iterate_raw_frames(inputs, self._position.part, self._position.seq):
+        for frames, columns in iterate_raw_frames_with_part(
+            inputs, self._position.part, self._position.seq
+        ):
             if time.monotonic() - begun_s >= UPDATE_BUDGET_S:
                 break
             self._feed_frames(frames, columns)
@@ -117,7 +119,7 @@ class SessionPreview:
     def rewind_to_valid_checkpoint(self, inputs: SessionInputs) -> None:
         """Drop everything after the last valid checkpoint."""
         all_, true = self.checkpoints.checkpoints, self.valid_checkpoints(inputs)
-        kept_frames = self._bins.truncate_to_full_bins(true[-1].estimated_frames)
+        kept_frames = self._bins.truncate_to_full_bins_and_forget_seq(true[-1].estimated_frames)
         # Repeat one frame at least: its number shows whether the next one follows it.
         index = max(
             0, bisect_left(true, max(kept_frames, 1), key=lambda place: place.estimated_frames) - 1
@@ -125,7 +127,7 @@ class SessionPreview:
         index, self._stream = self.checkpoints.resume_stream_at_or_before(all_, index, inputs)
         self.checkpoints.truncate(index + 1)
         place = all_[index]
-        self.start_repeat_timer(self)
+        self.measure_repeated_work_up_to(self)
         self._position = Checkpoint(
             place.part,
             place.seq,
@@ -137,11 +139,11 @@ class SessionPreview:
         self._repeated_frames = kept_frames - place.estimated_frames
         self._inputs = inputs
 
-    def start_repeat_timer(self, previous: SessionPreview) -> None:
+    def measure_repeated_work_up_to(self, previous: SessionPreview) -> None:
         """Reset the time of repeated work, which is measured up to another preview's position."""
         self._fed_before_rewind, self.repeated_work_s = previous._position.fed_frames, 0.0
 
-    def get_bins(self, time_slice: Slice, points: int) -> BinnedSlice:
+    def get_bins(self, time_slice: Slice, min_bins: int) -> BinnedSlice:
         """Return a slice as bins, at most four times as many as points.
 
         Raises:
@@ -157,7 +159,7 @@ class SessionPreview:
         bins = shift_bins_to_axis(bins, axis)
         begin_ns, end_ns = int(bins["t_first_ns"][0]), int(bins["t_last_ns"].max())
         found, count = select_and_downsample_bins(
-            bins, *time_slice.compute_bounds_ns(begin_ns), 4 * points
+            bins, *time_slice.compute_bounds_ns(begin_ns), 4 * min_bins
         )
         return BinnedSlice(found, count * self._bins.frames_in_bin, begin_ns, end_ns, axis)
 
@@ -169,7 +171,7 @@ class SessionPreview:
             if self._stream is None
             else self._stream.estimate_batches(pieces, is_final=False)
         )
-        names = required_frame_columns(has_estimates=self.has_estimates)
+        names = required_frame_columns(has_estimates=self.has_estimate_stream)
         for estimated, columns in due:
             fields = {name: getattr(estimated, name) for name in names if name not in columns}
             fields |= {name: columns[name] for name in (*names, "part") if name in columns}
@@ -227,7 +229,7 @@ class SessionPreviews:
         self._retry_after_s: dict[str, float] = {}
         self._one_at_a_time = threading.Lock()
 
-    def advance_preview(self, inputs: SessionInputs) -> SessionPreview:
+    def advance_preview_within_time_limit(self, inputs: SessionInputs) -> SessionPreview:
         """Estimate more of a session for a bounded time, and return its preview.
 
         Raises:
@@ -236,7 +238,7 @@ class SessionPreviews:
         with self._one_at_a_time:
             return self._advance_preview(inputs)
 
-    def advance_unless_catching_up(self, inputs: SessionInputs) -> SessionPreview:
+    def advance_unless_behind_journals(self, inputs: SessionInputs) -> SessionPreview:
         """Return a session's preview; it is advanced first unless it is catching up.
 
         Raises:
@@ -245,7 +247,7 @@ class SessionPreviews:
         preview = self._previews.get(inputs.session.id)
         if preview is not None and preview.is_catching_up:
             return preview
-        return self.advance_preview(inputs)
+        return self.advance_preview_within_time_limit(inputs)
 
     def discard(self, session_id: str) -> None:
         """Remove the preview of a session that is sealed or gone."""
@@ -257,20 +259,20 @@ class SessionPreviews:
         preview = self._previews.get(name)
         if preview is None:
             preview = self._previews[name] = SessionPreview(inputs, self._folder)
-        elif not preview.can_use(inputs) or preview.is_outdated(inputs):
+        elif not preview.has_valid_beginning(inputs) or preview.is_outdated(inputs):
             if time.monotonic() < self._retry_after_s.get(name, 0.0):
                 return preview
-            if preview.can_use(inputs):
+            if preview.has_valid_beginning(inputs):
                 preview.rewind_to_valid_checkpoint(inputs)
             else:
                 before, preview = preview, SessionPreview(inputs, self._folder)
-                preview.start_repeat_timer(before)
+                preview.measure_repeated_work_up_to(before)
                 self._previews[name] = preview
         self._previews.move_to_end(name)
         while len(self._previews) > _PREVIEWS_KEPT:
             self.discard(next(iter(self._previews)))
         try:
-            preview.advance(inputs)
+            preview.advance_within_time_limit(inputs)
         except FootTileError:
             self.discard(name)
             raise

@@ -12,7 +12,7 @@ from typing import Any
 
 from devices.errors import UsageError
 from devices.frames import FrameBatch
-from service.sessions.frames import Columns, iterate_raw_frames
+from service.sessions.frames import Columns, iterate_raw_frames_with_part
 from service.sessions.inputs import SessionInputs
 from service.sessions.preview import SessionPreview
 from storage.formats.export import FrameSource, make_one_pass_frame_source
@@ -33,7 +33,7 @@ class PreviewFrames:
         time_slice: time interval.
 
     Attributes:
-        notes: file metadata of the estimates; known after `make_content`.
+        notes: file metadata of the estimates; known after `make_one_pass_source`.
     """
 
     def __init__(self, preview: SessionPreview, inputs: SessionInputs, time_slice: Slice) -> None:
@@ -44,13 +44,13 @@ class PreviewFrames:
         self._time_slice = time_slice
         self._axis = NODE_AXIS
 
-    def make_content(self) -> FrameSource:
+    def make_one_pass_source(self) -> FrameSource:
         """Return the frames, with estimates if there are any; reads the first ones.
 
         Raises:
             UsageError: there are no frames.
         """
-        first = next(iterate_raw_frames(self._inputs), None)
+        first = next(iterate_raw_frames_with_part(self._inputs), None)
         if first is None:
             raise UsageError("the session has no frames")
         self._axis = self._inputs.compute_time_axis()
@@ -91,7 +91,9 @@ class PreviewFrames:
             places[begin].estimated_frames - places[start].estimated_frames,
             end_count - places[start].estimated_frames,
         )
-        pieces: Pieces = iterate_raw_frames(self._inputs, places[start].part, places[start].seq)
+        pieces: Pieces = iterate_raw_frames_with_part(
+            self._inputs, places[start].part, places[start].seq
+        )
         if stream is not None:
             pieces = stream.estimate_batches(pieces)
         for frames, columns in pieces:

@@ -30,12 +30,12 @@ from service.sessions.parts import (
     SeqsAround,
     SessionStream,
     bound_lost_tail_frames,
-    close_at_stop,
+    close_at_stop_if_passed,
     close_unfinished,
     create_session,
-    find_seqs_around,
+    find_seqs_around_once_passed,
 )
-from service.sessions.sealing import rebuild_session, seal_session
+from service.sessions.sealing import rebuild_damaged_session_json, seal_session
 from service.sessions.tares import TareHistory
 from storage.checksummed_json import read_checksummed_json
 from storage.clock.log import ClockLog
@@ -49,9 +49,9 @@ from storage.sessions.folder import Ledger, Part, Session, SessionsFolder, make_
 from storage.sessions.ledger import (
     compute_ledger,
     group_numbers_by_stream,
-    settle_losses,
+    mark_damaged_and_abandoned_lost,
 )
-from storage.sessions.metadata import MARKERS_NAME, read_markers, write_markers
+from storage.sessions.metadata import MARKERS_NAME, read_existing_markers, write_markers
 from storage.verify.session import verify_session
 
 
@@ -103,7 +103,7 @@ class OpenedStream:
         self, t_ns: int, *, min_seq: int, may_be_stale: bool = False
     ) -> SeqsAround | None:
         del may_be_stale  # nothing is cached here
-        return find_seqs_around(self.journal, t_ns, min_seq=min_seq)
+        return find_seqs_around_once_passed(self.journal, t_ns, min_seq=min_seq)
 
     def save_damage(self) -> None:
         """Save the damage found: once cut off, no other record exists.
@@ -140,7 +140,7 @@ class OpenedStream:
                     pass
             except DamagedFramesError as error:
                 damaged = Intervals([(error.seq_first, error.seq_last)])
-                self.journal.invalidate_whole_batches(damaged)
+                self.journal.invalidate_batches_wholly_within(damaged)
                 self.damaged = self.damaged | (damaged - self.journal.stored)
                 seq = error.seq_last + 1
             else:
@@ -242,7 +242,7 @@ class RecoveryReport:
     problems: list[str] = field(default_factory=list)
 
     @property
-    def is_empty(self) -> bool:
+    def is_empty_or_all_waiting(self) -> bool:
         """True if there was nothing to do."""
         done = any(one.outcome != "waiting" for one in self.sessions)
         made = (
@@ -259,7 +259,7 @@ def _ignore(_: str) -> None:
     pass
 
 
-def recover_folder(
+def recover_locked_folder(
     data: Path,
     *,
     make_sessions: bool = False,
@@ -296,11 +296,14 @@ def recover_folder(
     for session_id, error in sorted(unreadable.items()):
         if not any(sessions.get_path(session_id).iterdir()):
             continue
-        if rebuild_session(sessions, session_id) is None:
+        if rebuild_damaged_session_json(sessions, session_id) is None:
             recovery.problems.append(str(error))
         else:
             recovery.rebuilt_sessions.append(session_id)
-    strays = [*sessions.find_strays(), *SessionsFolder(data / "trash").find_strays()]
+    strays = [
+        *sessions.find_renamed_or_copied_sessions(),
+        *SessionsFolder(data / "trash").find_renamed_or_copied_sessions(),
+    ]
     recovery.problems += [str(stray.error) for stray in strays]
     for session in loaded:
         if session.state == "sealed":
@@ -348,14 +351,16 @@ def _seal_if_possible(
             stream.read_and_invalidate_damaged(part.seq_first, part.seq_last)
             stream.save_damage()
     streams = _find_streams(session, own_streams, is_local=is_local)
-    ledger = compute_ledger(session.parts, settle_losses(session, streams), is_finished=True)
+    ledger = compute_ledger(
+        session.parts, mark_damaged_and_abandoned_lost(session, streams), has_all_parts=True
+    )
     if pending := ledger.pending:
         text = f"{pending} frames may still come from node {session.node}"
         return RecoveredSession(session, "waiting", text, ledger)
     folder = sessions.get_path(session.id)
     try:
         session = session.model_copy(update={"state": "sealing"})
-        sessions.save(session)
+        sessions.save_session_json(session)
         sources = make_inputs(
             session,
             streams,
@@ -366,7 +371,7 @@ def _seal_if_possible(
         problems = verify_session(folder, expected_session=sealed).problems
         if problems:
             return RecoveredSession(session, "failed", "; ".join(problems), ledger)
-        sessions.save(sealed)
+        sessions.save_session_json(sealed)
     except FootTileError as error:
         return RecoveredSession(session, "failed", str(error), ledger)
     return RecoveredSession(sealed, "sealed", sealed.problem or "", ledger)
@@ -386,7 +391,7 @@ def _close_parts(
             if is_local or abandon_missing:
                 closed = close_unfinished(session, streams)
                 return closed.model_copy(update={"is_abandoned": not is_local})
-            return close_at_stop(session, streams, leave_open_while_missing=True)
+            return close_at_stop_if_passed(session, streams, leave_open_while_missing=True)
         except DamagedFramesError as error:  # at the stop: retry without these frames
             _invalidate(own.values(), error)
 
@@ -469,7 +474,7 @@ def _find_cut_files(data: Path) -> set[Path]:
 def _rewrite_markers(session: Session, folder: Path) -> bool:
     """Write `markers.parquet` again if it differs from `session.json`, which is written first."""
     try:
-        if read_markers(folder / MARKERS_NAME) == session.markers:
+        if read_existing_markers(folder / MARKERS_NAME) == session.markers:
             return False
     except FileNotFoundError:
         if not session.frames:

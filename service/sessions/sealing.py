@@ -23,7 +23,12 @@ from storage.clock.table import CLOCK_NAME, read_clock_file, write_clock_file
 from storage.durable_files import set_aside_damaged
 from storage.parquet_hash import compute_sha256
 from storage.sessions.folder import FRAMES_NAME, Ledger, Session, SessionsFolder
-from storage.sessions.metadata import MARKERS_NAME, SESSION_NAME, read_markers, write_markers
+from storage.sessions.metadata import (
+    MARKERS_NAME,
+    SESSION_NAME,
+    read_existing_markers,
+    write_markers,
+)
 from storage.sessions.writer import SealedFileWriter
 from storage.verify.sealed_file import SealedFileReport, verify_sealed_file
 
@@ -58,9 +63,9 @@ def seal_session(inputs: SessionInputs, folder: Path, ledger: Ledger) -> Session
     with SealedFileWriter(path, inputs.info, notes) as writer:
         for batch, columns in frames:
             if not count:
-                writer.add_notes(frames.notes)
+                writer.add_notes_before_first_row_group(frames.notes)
             writer.append_frames(batch, columns)
-            stances.add_frames(batch.seq, batch.t_ns, columns)
+            stances.try_add_frames(batch.seq, batch.t_ns, columns)
             overview.try_add_frames(batch, columns)
             count += len(batch)
             part = int(columns["part"][0])
@@ -100,7 +105,7 @@ _FIELDS_IN_FILE = {"id", "name", "node", "started_t_ns", "stopped_t_ns", "parts"
 _T = TypeVar("_T")
 
 
-def rebuild_session(sessions: SessionsFolder, session_id: str) -> Session | None:
+def rebuild_damaged_session_json(sessions: SessionsFolder, session_id: str) -> Session | None:
     """Set a damaged `session.json` aside, and rebuild it.
 
     Args:
@@ -130,7 +135,7 @@ def rebuild_session(sessions: SessionsFolder, session_id: str) -> Session | None
     if session is not None:
         if path.exists() or path.is_symlink():
             set_aside_damaged(path)
-        sessions.save(session)
+        sessions.save_session_json(session)
     return session
 
 
@@ -146,7 +151,7 @@ def _session_from_files(folder: Path, what: str) -> Session | None:
     if file.problems or file.session.get("id") != folder.name:
         return None
     lost = ["subject, notes and tags"]
-    markers = _read_sidecar(read_markers, folder / MARKERS_NAME)
+    markers = _read_sidecar(read_existing_markers, folder / MARKERS_NAME)
     if markers is None:
         lost.append("markers")
     clock = _read_sidecar(read_clock_file, folder / CLOCK_NAME)

@@ -55,7 +55,7 @@ class StancesWriter:
         self._waiting: list[dict[str, npt.NDArray[Any]]] = []
         self._waiting_frames = 0
 
-    def add_frames(
+    def try_add_frames(
         self,
         seq: npt.NDArray[np.uint64],
         t_ns: npt.NDArray[np.int64],
@@ -155,7 +155,7 @@ def compute_stances(session: SealedFileReader) -> pa.Table:
     names = (*STANCE_INPUT_COLUMNS, "part") if session.has_columns("part") else STANCE_INPUT_COLUMNS
     found = StancesWriter()
     for columns in session.read_quantities("seq", "t_ns", *names):
-        found.add_frames(columns["seq"], columns["t_ns"], columns)
+        found.try_add_frames(columns["seq"], columns["t_ns"], columns)
     if found.problem is not None:
         raise FileFormatError(found.problem, where=str(session.path))
     return found.finish_table()

@@ -63,7 +63,7 @@ class RecordedTare:
         return self.serials == info.serials and self.chips == _chip_coefficients(info)
 
     @property
-    def is_automatic(self) -> bool:
+    def is_taken_in_flight(self) -> bool:
         """True if it was taken in flight."""
         return self.tare.source == "flight"
 
@@ -266,7 +266,7 @@ class TareHistory:
         self.problem = f"{self._path}: {problem}; {done}"
 
     @property
-    def all_tares(self) -> list[RecordedTare]:
+    def all_tares_with_undone(self) -> list[RecordedTare]:
         """All intact tares, of any array and undone ones too, oldest first."""
         return [entry for entry in self._entries if isinstance(entry, RecordedTare)]
 
@@ -276,7 +276,7 @@ class TareHistory:
             isinstance(e, LostTares) for e in self._entries
         )
 
-    def tare_in_force(self, info: ArrayInfo) -> RecordedTare | None:
+    def tare_in_force_unless_lost(self, info: ArrayInfo) -> RecordedTare | None:
         """Return the tare in force for an array; None if there is none, or if it is lost.
 
         Tares of other tiles do not count.
@@ -295,25 +295,25 @@ class TareHistory:
 
     def tare_in_force_or_lost(self, info: ArrayInfo) -> Tare | None:
         """Return the tare in force, else `Tare.make_lost` for a lost one, else None."""
-        in_force = self.tare_in_force(info)
+        in_force = self.tare_in_force_unless_lost(info)
         if in_force is not None:
             return in_force.tare
         return Tare.make_lost(tiles=len(info.tiles), t_ns=0) if self.is_tare_lost(info) else None
 
-    def last_non_automatic_or_oldest(self, info: ArrayInfo) -> RecordedTare | None:
+    def last_not_in_flight_or_oldest(self, info: ArrayInfo) -> RecordedTare | None:
         """Return the reference of automatic tares: the last other one, else the oldest.
 
         Tares before a lost one do not count: the lost one may have been the last other tare.
         """
         fitting = self._valid_since_lost(info)
-        return next((t for t in reversed(fitting) if not t.is_automatic), (*fitting, None)[0])
+        return next((t for t in reversed(fitting) if not t.is_taken_in_flight), (*fitting, None)[0])
 
     def is_automatic_paused(self, info: ArrayInfo) -> bool:
         """Return whether a tare was undone, with no tare by hand or from a lead since."""
-        for recorded in reversed(self.all_tares):
+        for recorded in reversed(self.all_tares_with_undone):
             if not recorded.is_of_array(info):
                 continue
-            if recorded.undone or not recorded.is_automatic:
+            if recorded.undone or not recorded.is_taken_in_flight:
                 return recorded.undone
         return False
 
@@ -321,7 +321,7 @@ class TareHistory:
         """Return all tares that were not undone, in their order of time."""
         return tuple(recorded.tare for recorded in self._valid_tares(info))
 
-    def tares_in_force_between(
+    def tares_in_force_or_lost_between(
         self, info: ArrayInfo, begin_t_ns: int, end_t_ns: int
     ) -> tuple[Tare, ...]:
         """Return the tares in force at some time of an interval, oldest first.
@@ -386,7 +386,7 @@ class TareHistory:
             UnknownError: no such tare, or it was undone already.
             StorageError: that cannot be stored; nothing has changed then.
         """
-        if not any(tare.id == tare_id and not tare.undone for tare in self.all_tares):
+        if not any(tare.id == tare_id and not tare.undone for tare in self.all_tares_with_undone):
             raise UnknownError(f"no tare {tare_id!r} that could be undone")
         self._store(
             tuple(
@@ -398,7 +398,7 @@ class TareHistory:
         )
 
     def _valid_tares(self, info: ArrayInfo) -> list[RecordedTare]:
-        return [t for t in self.all_tares if t.is_of_array(info) and not t.undone]
+        return [t for t in self.all_tares_with_undone if t.is_of_array(info) and not t.undone]
 
     def _valid_since_lost(self, info: ArrayInfo) -> list[RecordedTare]:
         """Return the valid tares after the last lost one."""
@@ -421,7 +421,7 @@ _ANY_TIME_NS = (-(2**63), 2**63 - 1)
 
 
 def _thin_out(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
-    automatic = [t for t in entries if isinstance(t, RecordedTare) and t.is_automatic]
+    automatic = [t for t in entries if isinstance(t, RecordedTare) and t.is_taken_in_flight]
     if len(automatic) > AUTOMATIC_KEPT_MAX:
         # Drop the least informative tare: in the older half, the closest to its neighbours. The
         # very first stays: it may be the reference of automatic tares.

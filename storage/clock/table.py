@@ -74,7 +74,7 @@ class ClockTable:
                 _check_rows_in_range(own, stream.stream_id, where)
                 self._maps[stream.stream_id] = ClockOffsets(own)
 
-    def compute_server_time_columns(
+    def compute_server_time_columns_or_unknown(
         self, t_mono_ns: Int64, t_ns: Int64, part: Array | None
     ) -> dict[str, Array]:
         """Compute the server's time of frames and its bound, as two columns.
@@ -147,7 +147,9 @@ class ClockTable:
         )
 
 
-def group_rows_by_stream(rows: Iterable[ClockOffset], *, where: str = "") -> dict[str, OffsetRows]:
+def group_unsorted_rows_by_stream(
+    rows: Iterable[ClockOffset], *, where: str = ""
+) -> dict[str, OffsetRows]:
     """Group the measurements of a session by stream_id, as columns.
 
     Raises:

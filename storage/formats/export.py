@@ -181,7 +181,7 @@ class Export:
     options: FormatOptions = NO_OPTIONS
 
     @property
-    def display_name(self) -> str:
+    def session_and_node_text(self) -> str:
         """Name of the session, for error messages and notes."""
         session = self.provenance.get("session")
         return (
@@ -191,7 +191,7 @@ class Export:
         )
 
     @property
-    def metadata(self) -> dict[str, object]:
+    def provenance_and_slice_metadata(self) -> dict[str, object]:
         """Metadata of the file as JSON: session, slice, clock, completeness and axes.
 
         A format that resamples or fills replaces the facts concerned.
@@ -283,9 +283,11 @@ class Export:
             values = _select_rows(flat, self.selection.compute_row_mask(at_ns, content.begin_t_ns))
             if self.clock is not None:
                 times = (values["t_mono_ns"], values["t_ns"], values.get("part"))
-                values |= self.clock.compute_server_time_columns(*times)
+                values |= self.clock.compute_server_time_columns_or_unknown(*times)
             if self.markers is not None:
-                values["marker"] = self.markers.get_frame_labels(values["seq"], values.get("part"))
+                values["marker"] = self.markers.get_frame_labels_or_none(
+                    values["seq"], values.get("part")
+                )
             values["time_s"] = (self.to_session_axis_ns(values) - content.begin_t_ns) * 1e-9
             values["time_utc"] = values["t_ns"].view("datetime64[ns]")
             piece = {name: values[name] for name in chosen}
@@ -300,7 +302,7 @@ class Export:
             raise UsageError(
                 f"the slice starts at {self.selection.start_s:g} s, and the session ends at "
                 f"{end_s:.3f} s",
-                where=self.display_name,
+                where=self.session_and_node_text,
                 expected="a start before the session's end",
             )
         yield header
@@ -311,7 +313,7 @@ class Export:
         metadata: dict[bytes | str, bytes | str] = {
             ARRAY_INFO_KEY: self.array_info.model_dump_json().encode(),
             NOTES_KEY: json.dumps(notes, sort_keys=True).encode(),
-            EXPORT_KEY: json.dumps(self.metadata).encode(),
+            EXPORT_KEY: json.dumps(self.provenance_and_slice_metadata).encode(),
         }
         tiles = self._tile_numbers(chosen)
         for piece in self.read_chunks():
@@ -343,7 +345,7 @@ class Export:
                 start_s, end_s = self.selection.start_s or 0.0, np.floor(fits_ns * 1e-6) * 1e-3
                 raise UsageError(
                     f"there are more than {frames_max} frames, the limit of this format",
-                    where=self.display_name,
+                    where=self.session_and_node_text,
                     expected=f"a slice: here {start_s:g} s to {end_s:.3f} s fits",
                 )
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}

@@ -30,7 +30,7 @@ from storage.formats.readers.table import (
     STANDARD_UNITS,
     Column,
     ForceTable,
-    spread_repeated_times_evenly,
+    fit_constant_rate_if_times_repeat,
 )
 from storage.formats.reference import ReferenceOptions, table_to_reference
 from storage.schema import read_array_info
@@ -179,7 +179,7 @@ def read_load_trace(path: Path, options: ReferenceOptions | None = None) -> Load
     def numbers(name: str, *, may_be_empty: bool = False) -> Floats:
         return _require_column(columns, names, name, where, may_be_empty=may_be_empty)
 
-    time_s = spread_repeated_times_evenly(numbers("time_s")).time_s
+    time_s = fit_constant_rate_if_times_repeat(numbers("time_s")).time_s
     if len(time_s) < 2:
         raise LoadTraceError(f"{len(time_s)} rows", where=where, expected="at least two")
     steps = np.flatnonzero(np.diff(time_s) <= 0.0)

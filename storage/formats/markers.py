@@ -85,7 +85,7 @@ class PlacedMarkers:
         """Markers that are not in the data."""
         return tuple(marker for marker in self.markers if marker.exclusion_reason)
 
-    def get_frame_labels(self, seq: Array, part: Array | None) -> Array:
+    def get_frame_labels_or_none(self, seq: Array, part: Array | None) -> Array:
         """Return the labels of frames, object[n]: text, or None without a marker.
 
         Args:
@@ -124,7 +124,7 @@ def place_markers(
         if not len(piece["t_ns"]):
             continue
         begin_t_ns = int(piece["t_ns"][0]) if begin_t_ns is None else begin_t_ns
-        times = clock.compute_server_time_columns(
+        times = clock.compute_server_time_columns_or_unknown(
             piece["t_mono_ns"], piece["t_ns"], piece.get("part")
         )
         at_ns = axis.shift_to_axis(piece["t_ns"], piece.get("part"))

@@ -17,12 +17,12 @@ import numpy as np
 from devices.arrays import Floats
 from devices.errors import FileFormatError, UsageError
 from storage.formats.readers.parquet import read_sealed_session_table
-from storage.formats.readers.registry import read_table, refuse_text_options
+from storage.formats.readers.registry import read_table, refuse_any_text_options
 from storage.formats.readers.table import (
     SOLE_UNITS,
     STANDARD_UNITS,
     ForceTable,
-    spread_repeated_times_evenly,
+    fit_constant_rate_if_times_repeat,
 )
 from storage.formats.readers.text_options import TextOptions
 
@@ -125,7 +125,7 @@ def read_reference(path: Path, options: ReferenceOptions) -> ReferenceData:
     named = options.source_columns
     table = read_sealed_session_table(path, named)
     if table is not None:
-        refuse_text_options(path, options.text)
+        refuse_any_text_options(path, options.text)
     else:
         table = read_table(
             path,
@@ -162,7 +162,7 @@ def table_to_reference(table: ForceTable, options: ReferenceOptions) -> Referenc
         time_s, grf_n, cop = time_s[timed], grf_n[timed], [column[timed] for column in cop]
     if len(time_s) < 2:
         raise FileFormatError(f"{len(time_s)} samples", where=where, expected="at least two")
-    time_s, spread_note = spread_repeated_times_evenly(time_s)
+    time_s, spread_note = fit_constant_rate_if_times_repeat(time_s)
     notes += filter(None, [spread_note])
     _check_time(time_s, where)
     if abs(time_s[0]) >= PLAUSIBLE_MAX:

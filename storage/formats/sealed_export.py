@@ -48,7 +48,7 @@ def place_session_markers(
         *names, row_groups=_row_groups_near_markers(reader, clock, markers)
     )
     return place_markers(
-        markers, pieces, clock, selection, reader.read_span_ns()[0], reader.time_axis
+        markers, pieces, clock, selection, reader.read_span_on_axis_ns()[0], reader.time_axis
     )
 
 
@@ -109,7 +109,7 @@ def make_sealed_export(
         name for name in COLUMNS_BY_NAME if name not in FRAME_COLUMNS and reader.has_columns(name)
     ]
     table = load_clock_table(reader) if clock == "server" else None
-    begin_t_ns, end_t_ns = reader.read_span_ns()
+    begin_t_ns, end_t_ns = reader.read_span_on_axis_ns()
     bounds_ns = selection.compute_bounds_ns(begin_t_ns)
     names = [*(column.name for column in MEASURED_COLUMNS), *extra]
     return Export(

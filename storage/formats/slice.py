@@ -47,7 +47,7 @@ class Slice:
             )
 
     @property
-    def is_unrestricted(self) -> bool:
+    def has_all_rows_and_columns(self) -> bool:
         """True for the whole session with all columns."""
         return self == Slice()
 

@@ -26,11 +26,11 @@ from storage.journal.segment import (
     INDEX_SUFFIX,
     SUFFIX,
     Segment,
+    has_nonempty_index_or_two_batches,
     make_free_unread_path,
-    may_have_indexed_batches,
     read_schema_and_first_offset,
-    recover_segment,
-    set_aside_unopenable_segments,
+    recover_or_delete_segment,
+    set_aside_irregular_or_forbidden_files,
 )
 from storage.journal.segment_writer import OpenSegments
 from storage.journal.stream_notes import StreamNotes
@@ -75,11 +75,13 @@ class Journal:
         )
         with translate_storage_errors(folder):
             make_synced_folder(folder)
-            self.problems += set_aside_unopenable_segments(folder)
+            self.problems += set_aside_irregular_or_forbidden_files(folder)
             for path in sorted(folder.glob("*" + SUFFIX)):
                 index = path.with_suffix(INDEX_SUFFIX)
-                is_indexed = index.exists() and may_have_indexed_batches(path, self._schema)
-                segment, damaged = recover_segment(path, self._schema)
+                is_indexed = index.exists() and has_nonempty_index_or_two_batches(
+                    path, self._schema
+                )
+                segment, damaged = recover_or_delete_segment(path, self._schema)
                 self.lost.add_if_new(damaged, CORRUPT)
                 if segment is not None:
                     self._add_segment(segment)
@@ -125,21 +127,21 @@ class Journal:
     @property
     def has_unclosed_segment(self) -> bool:
         """True if a segment accepts batches, or is not closed yet."""
-        return bool(self._open.paths)
+        return bool(self._open.unclosed_paths)
 
     @property
     def has_segment_to_close(self) -> bool:
         """True if the next sync closes a segment."""
         return self._open.has_segment_to_close
 
-    def describe_time_conflict(self, frames: FrameBatch) -> str:
+    def describe_time_reversal(self, frames: FrameBatch) -> str:
         """Return a message if time would run back between `frames` and stored ones; else empty.
 
         Raises:
             StorageError: an index cannot be read.
         """
         with translate_storage_errors(self.folder):
-            return self._instants.describe_time_conflict(frames, self.stored)
+            return self._instants.describe_time_reversal(frames, self.stored)
 
     def append_new_frames(self, batch: FrameBatch, payload: bytes | None = None) -> Intervals:
         """Append the frames of `batch` that are not stored yet; return their numbers.
@@ -184,17 +186,17 @@ class Journal:
         """
         self._open.sync()
 
-    def invalidate_whole_batches(self, doubtful_numbers: Intervals) -> None:
+    def invalidate_batches_wholly_within(self, doubtful_numbers: Intervals) -> None:
         """Remove batches wholly within `doubtful_numbers`; later frames go into new segments.
 
         In a closed segment they are removed from the index on disk, so that a later copy is the
         valid one after a restart.
         """
-        written = self._open.paths
+        written = self._open.unclosed_paths
         for segment in self._segments:
             if not segment.stored & doubtful_numbers:
                 continue
-            segment.invalidate_batches_in_memory(doubtful_numbers)
+            segment.invalidate_batches_wholly_within_in_memory(doubtful_numbers)
             if segment.path in written:
                 segment.has_invalidated_frames = True
             else:
@@ -271,7 +273,7 @@ class Journal:
         Raises:
             StorageError: a file cannot be deleted.
         """
-        written = self._open.paths
+        written = self._open.unclosed_paths
         gone = Intervals()
         for segment in list(self._segments):
             if segment.path in written or segment.t_ns_last >= before_t_ns:
@@ -320,7 +322,7 @@ class Journal:
     def _add_segment(self, segment: Segment) -> None:
         """Add a recovered segment; after an invalidation two segments may have equal numbers."""
         if segment.stored & self.stored:
-            segment.invalidate_batches_in_memory(self.stored)
+            segment.invalidate_batches_wholly_within_in_memory(self.stored)
         if segment.stored:
             self._segments.append(segment)
             self.stored = self.stored | segment.stored

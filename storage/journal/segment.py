@@ -27,7 +27,7 @@ import pyarrow as pa
 
 from devices.errors import DamagedFileError, FileFormatError, StorageError
 from devices.types import SEQ_END
-from storage.durable_files import set_aside_and_describe, write_atomically
+from storage.durable_files import try_set_aside_and_describe, write_atomically
 from storage.intervals import Intervals, union
 from storage.wire import EncodedBatch, MessageBatch, decode_message
 
@@ -78,14 +78,14 @@ def seq_range_of(record: Any) -> tuple[int, int]:
     return first, first + int(record["count"]) - 1
 
 
-def is_record_valid(record: Any) -> bool:
+def is_record_intact(record: Any) -> bool:
     """Return whether the record's checksum is right, and its numbers are possible."""
     is_checked = zlib.crc32(record.tobytes()[:_CHECKED_BYTES]) == int(record["check"])
     return is_checked and int(record["seq_first"]) < SEQ_END and int(record["offset"]) < _OFFSET_END
 
 
-def mask_valid_records(index: Records) -> npt.NDArray[np.bool_]:
-    """Return a mask of the records that `is_record_valid` accepts."""
+def mask_intact_records(index: Records) -> npt.NDArray[np.bool_]:
+    """Return a mask of the records that `is_record_intact` accepts."""
     content = memoryview(np.ascontiguousarray(index).tobytes())
     begins = range(0, len(content), RECORD_DTYPE.itemsize)
     checks = [zlib.crc32(content[at : at + _CHECKED_BYTES]) for at in begins]
@@ -95,12 +95,12 @@ def mask_valid_records(index: Records) -> npt.NDArray[np.bool_]:
 
 def is_index_closed(index: Records) -> bool:
     """Return whether the index marks its segment as closed in order."""
-    return bool(len(index)) and is_record_valid(index[-1]) and not index[-1]["count"]
+    return bool(len(index)) and is_record_intact(index[-1]) and not index[-1]["count"]
 
 
-def select_valid_batch_records(index: Records) -> Records:
+def select_intact_batch_records(index: Records) -> Records:
     """Return the valid records with frames."""
-    return index[(index["count"] > 0) & mask_valid_records(index)]
+    return index[(index["count"] > 0) & mask_intact_records(index)]
 
 
 def find_end_offset(records: Records) -> int:
@@ -108,7 +108,7 @@ def find_end_offset(records: Records) -> int:
     return int((records["offset"] + records["length"]).max(initial=0))
 
 
-def read_index(segment_path: Path) -> Records:
+def read_existing_index(segment_path: Path) -> Records:
     """Read all records of a segment's index, valid or not; a cut one at its end is skipped.
 
     Raises:
@@ -242,7 +242,7 @@ class Segment:
             StorageError: the index cannot be read.
         """
         try:
-            found = select_valid_batch_records(read_index(self.path))
+            found = select_intact_batch_records(read_existing_index(self.path))
         except OSError as error:
             raise StorageError(
                 f"cannot be read: {error}", where=str(self.path), errno=error.errno
@@ -250,7 +250,7 @@ class Segment:
         found = found[self.stored.contains_ranges(found["seq_first"], found["count"])]
         return found[np.argsort(found["seq_first"], kind="stable")]
 
-    def invalidate_batches_in_memory(self, doubtful_numbers: Intervals) -> None:
+    def invalidate_batches_wholly_within_in_memory(self, doubtful_numbers: Intervals) -> None:
         """Remove batches within these numbers from `stored`, also ones not in the index.
 
         The file under its name may be a copy that was made before they were written.
@@ -282,7 +282,7 @@ class Segment:
         self.path.unlink(missing_ok=True)
 
 
-def set_aside_unopenable_segments(folder: Path) -> list[str]:
+def set_aside_irregular_or_forbidden_files(folder: Path) -> list[str]:
     """Set aside segments and indexes that are no regular files or not readable.
 
     Returns:
@@ -293,7 +293,9 @@ def set_aside_unopenable_segments(folder: Path) -> list[str]:
         is_file = stat.S_ISREG(path.lstat().st_mode)
         if not is_file or not os.access(path, os.R_OK):
             what = "it cannot be read" if is_file else "it is not a file"
-            problems.append(set_aside_and_describe(path, DamagedFileError(what, where=str(path))))
+            problems.append(
+                try_set_aside_and_describe(path, DamagedFileError(what, where=str(path)))
+            )
     return problems
 
 
@@ -304,7 +306,7 @@ def make_free_unread_path(path: Path) -> Path:
     return path.with_name(next(name for name in names if name not in existing))
 
 
-def may_have_indexed_batches(path: Path, schema: pa.Schema) -> bool:
+def has_nonempty_index_or_two_batches(path: Path, schema: pa.Schema) -> bool:
     """Return whether the index is not empty, or the segment has two batches or more.
 
     Raises:
@@ -325,7 +327,7 @@ class RecoveredSegment(NamedTuple):
     """Numbers of its damaged frames."""
 
 
-def recover_segment(path: Path, schema: pa.Schema) -> RecoveredSegment:
+def recover_or_delete_segment(path: Path, schema: pa.Schema) -> RecoveredSegment:
     """Open an existing segment; delete it if no batch in it is complete.
 
     Bytes without an index record
@@ -340,11 +342,11 @@ def recover_segment(path: Path, schema: pa.Schema) -> RecoveredSegment:
     damaged, doubtful = Intervals(), Intervals()
     _, end = read_schema_and_first_offset(path)
     try:
-        index = read_index(path)
+        index = read_existing_index(path)
     except FileNotFoundError:
         index = _rebuild_index(path, end, schema)
     else:
-        batches = select_valid_batch_records(index)
+        batches = select_intact_batch_records(index)
         was_closed = is_index_closed(index) and len(batches) == len(index) - 1
         if was_closed and len(batches) and find_end_offset(batches) == size:
             segment = Segment(path)
@@ -354,10 +356,10 @@ def recover_segment(path: Path, schema: pa.Schema) -> RecoveredSegment:
     read: dict[int, EncodedBatch | None] = {}
     with path.open("rb") as file:
         for record in index:
-            if not is_record_valid(record) and end not in read:
+            if not is_record_intact(record) and end not in read:
                 read[end] = next(read_messages_until_damage(path, end, schema), None)
             found = _verify_record(file.fileno(), record, end, read.get(end))
-            if found is None and is_record_valid(record):
+            if found is None and is_record_intact(record):
                 doubtful.add(*seq_range_of(record))
             elif found is not None:
                 # Damage followed by a good batch happened after writing; a damaged end of an
@@ -402,7 +404,7 @@ def _verify_record(
     descriptor: int, record: Any, end: int, message: EncodedBatch | None
 ) -> Any | None:
     """Return the record if the batch's bytes match it, repaired if only the record is damaged."""
-    if is_record_valid(record):
+    if is_record_intact(record):
         is_right = not record["count"] or read_verified_payload(descriptor, record) is not None
         return record if is_right else None
     if message is None or zlib.crc32(message.payload) != record["crc32"]:

@@ -202,7 +202,7 @@ class OpenSegments:
         """Guards the lists; never locked during disk I/O."""
 
     @property
-    def paths(self) -> set[Path]:
+    def unclosed_paths(self) -> set[Path]:
         """Files that are open or not closed yet."""
         with self._lock:
             return {writer.segment.path for writer in (*self._open, *self._closing)}

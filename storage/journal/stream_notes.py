@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from devices.errors import DamagedFileError, FileFormatError
 from devices.frames import ArrayInfo
 from storage.checksummed_json import read_checksummed_json, write_checksummed_json
-from storage.durable_files import set_aside_and_describe
+from storage.durable_files import try_set_aside_and_describe
 from storage.intervals import LossPairs
 
 NOTES_FILE = "stream.json"
@@ -20,14 +20,14 @@ _BATCH_S = 0.033
 """Longest batch of a node."""
 
 
-def compute_max_lost_tail_frames(rate_hz: float, waited_s: float = 0.0) -> int:
+def compute_max_lost_tail_frames(rate_hz: float, sync_max_s: float = 0.0) -> int:
     """Compute how many frames a power cut loses at most: waiting frames and one batch.
 
     Args:
         rate_hz: frame rate of the stream.
-        waited_s: longest time that frames have waited for the disk.
+        sync_max_s: longest time that frames have waited for the disk.
     """
-    return math.ceil(rate_hz * max(MAX_UNSYNCED_S, waited_s)) + math.ceil(rate_hz * _BATCH_S)
+    return math.ceil(rate_hz * max(MAX_UNSYNCED_S, sync_max_s)) + math.ceil(rate_hz * _BATCH_S)
 
 
 class StreamNotes(BaseModel):
@@ -105,5 +105,5 @@ class StreamNotes(BaseModel):
         try:
             return cls.load(folder)
         except DamagedFileError as error:
-            problems.append(set_aside_and_describe(folder / NOTES_FILE, error))
+            problems.append(try_set_aside_and_describe(folder / NOTES_FILE, error))
             return None

@@ -64,7 +64,7 @@ class TimeIndex:
         """Clear the cache: numbers are no longer stored."""
         self._t_ns_by_end.clear()
 
-    def describe_time_conflict(self, frames: FrameBatch, stored: Intervals) -> str:
+    def describe_time_reversal(self, frames: FrameBatch, stored: Intervals) -> str:
         """Return a message if time would run back between `frames` and stored ones; else empty.
 
         Args:
@@ -284,7 +284,9 @@ class BatchReader:
                 content = self._read_bytes(piece)
             except StorageError:  # a bad sector is in one batch: read those before it
                 content = b""
-            frames = self._runs.decode(make_message_batch(piece.records, content))
+            frames = self._runs.decode_or_none_if_damaged(
+                make_message_batch(piece.records, content)
+            )
             if frames is not None:
                 yield frames
                 continue

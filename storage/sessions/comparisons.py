@@ -152,7 +152,7 @@ def read_comparison_series(folder: Path) -> pa.Table | None:
     return table
 
 
-def read_comparison_series_footer(folder: Path) -> pq.FileMetaData:
+def read_comparison_series_footer_unverified(folder: Path) -> pq.FileMetaData:
     """Read the footer of a series that `read_comparison_series` has verified just now.
 
     Raises:

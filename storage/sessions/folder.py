@@ -226,7 +226,7 @@ class SessionsFolder:
             raise UnknownError(f"no session {session_id[:80]!r}")
         return self._folder / session_id
 
-    def save(self, session: Session) -> None:
+    def save_session_json(self, session: Session) -> None:
         """Write `session.json`.
 
         Raises:
@@ -273,7 +273,7 @@ class SessionsFolder:
                 found.errors[session_id] = error
         return found
 
-    def find_strays(self) -> list[StraySession]:
+    def find_renamed_or_copied_sessions(self) -> list[StraySession]:
         """Find sessions in folders without a session's name; they are not moved."""
         found: list[StraySession] = []
         if not self._folder.is_dir():

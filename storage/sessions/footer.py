@@ -53,7 +53,7 @@ class ContentDigest:
         self.order = FrameOrderChecker()
         self._hashes: dict[str, Any] = {}
 
-    def add_table_and_check_order(self, table: pa.Table) -> None:
+    def add_table_and_collect_disorder(self, table: pa.Table) -> None:
         """Hash the next rows and check their order; every table must have the same columns."""
         for name in table.column_names:
             column = column_bytes_for_hash(name, table.column(name))
@@ -78,7 +78,9 @@ class ContentDigest:
             "columns": self.column_hashes,
         }
 
-    def compute_footer_entries(self, array_info: bytes, notes: bytes) -> dict[str, str]:
+    def make_footer_entries_with_placeholders(
+        self, array_info: bytes, notes: bytes
+    ) -> dict[str, str]:
         """Return the footer's entries, with placeholders for the hashes of footer and file."""
         content = json.dumps(self.describe_content())
         return {

@@ -18,14 +18,14 @@ import numpy as np
 
 from devices.errors import FileFormatError
 from devices.frames import FrameBatch
-from storage.frame_rules import mask_impossible_times
+from storage.frame_rules import mask_out_of_range_times
 from storage.intervals import ABANDONED, CORRUPT, NO_END, NODE_RESTARTED, Intervals, Losses
 from storage.schema import Array
 from storage.sessions.folder import Ledger, Part, PartLedger, Session
 
 
 def compute_ledger(
-    parts: tuple[Part, ...], state_by_stream: Mapping[str, StreamState], *, is_finished: bool
+    parts: tuple[Part, ...], state_by_stream: Mapping[str, StreamState], *, has_all_parts: bool
 ) -> Ledger:
     """Count every number of these parts once.
 
@@ -35,7 +35,7 @@ def compute_ledger(
     Args:
         parts: a part without an end reaches to the last stored number.
         state_by_stream: states by stream_id; a missing one counts as empty.
-        is_finished: True: no more parts will be added.
+        has_all_parts: True: no more parts will be added.
     """
     counted = []
     for part in parts:
@@ -57,7 +57,7 @@ def compute_ledger(
                 max_lost_tail_frames=stream.max_lost_tail_frames,
             )
         )
-    has_end = is_finished and all(part.seq_last is not None for part in parts)
+    has_end = has_all_parts and all(part.seq_last is not None for part in parts)
     lossy = any(part.lost or part.max_lost_tail_frames for part in counted)
     return Ledger(
         complete=has_end and not lossy and not any(part.pending for part in counted),
@@ -128,7 +128,9 @@ class StreamState:
 StreamStateT = TypeVar("StreamStateT", bound=StreamState)
 
 
-def settle_losses(session: Session, streams: Mapping[str, StreamStateT]) -> dict[str, StreamStateT]:
+def mark_damaged_and_abandoned_lost(
+    session: Session, streams: Mapping[str, StreamStateT]
+) -> dict[str, StreamStateT]:
     """Return the streams' states with their losses settled, as the ledger counts them.
 
     A damaged number is lost unless it is obtainable, and an obtainable one is lost once the session
@@ -275,7 +277,7 @@ class FrameOrderChecker:
         for at in np.flatnonzero(back & ~falls).tolist():
             late_ns = int(with_before[at]) - int(with_before[at + 1])
             _add_message(part, f"time runs back by {late_ns} ns before frame {seq[at + 1]}")
-        beyond = mask_impossible_times(t_mono_ns, t_ns)
+        beyond = mask_out_of_range_times(t_mono_ns, t_ns)
         shifted = (t_ns - t_mono_ns != part.offset_ns) & ~beyond  # beyond, a difference may wrap
         for wrong, problem in (
             (beyond, "is in no possible year"),

@@ -61,7 +61,7 @@ def parse_session_metadata(
     try:
         body = verify_and_strip_json_checksum(session_json, where=SESSION_NAME)
         try:
-            return make_session_metadata(Session.model_validate_json(body))
+            return wrap_session_as_metadata(Session.model_validate_json(body))
         except ValidationError:
             return _parse_pulled_metadata(folder, json.loads(body), problems)
     except DamagedFileError as error:
@@ -72,7 +72,7 @@ def parse_session_metadata(
         return None
 
 
-def make_session_metadata(session: Session) -> StoredMetadata:
+def wrap_session_as_metadata(session: Session) -> StoredMetadata:
     """Return a session's model as metadata."""
     return StoredMetadata(session.model_dump(mode="json"), session.parts, session.ledger, session)
 
@@ -129,7 +129,7 @@ def write_markers(session: Session, folder: Path) -> None:
     write_hashed_table(folder / MARKERS_NAME, pa.table(columns))
 
 
-def read_markers(path: Path) -> tuple[Marker, ...]:
+def read_existing_markers(path: Path) -> tuple[Marker, ...]:
     """Read `markers.parquet` and verify its hash.
 
     Raises:

@@ -21,7 +21,11 @@ import numpy as np
 import pyarrow as pa
 
 from devices.errors import DamagedFileError, OtherVersionError
-from storage.durable_files import open_for_atomic_write, open_regular_file, translate_read_errors
+from storage.durable_files import (
+    open_for_atomic_write,
+    open_regular_file,
+    translate_read_errors_unless_missing,
+)
 from storage.sessions.pyramid import (
     BINS_PER_COARSER_BIN,
     FRAMES_PER_FINEST_BIN,
@@ -212,7 +216,7 @@ def open_overview(path: Path) -> OverviewReader:
     """
     # Not through Python's file: Arrow reads a footer on a thread of its own, and a process that
     # ends while that one waits for Python is aborted.
-    with open_regular_file(path), translate_read_errors(path):
+    with open_regular_file(path), translate_read_errors_unless_missing(path):
         source = pa.OSFile(str(path), "r")
     return OverviewReader(source, where=str(path))
 

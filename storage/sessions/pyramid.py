@@ -359,7 +359,7 @@ class PreviewBins:
         ):
             self._merge_full_bins()
 
-    def truncate_to_full_bins(self, max_frames: int) -> int:
+    def truncate_to_full_bins_and_forget_seq(self, max_frames: int) -> int:
         """Drop all but the first frames: those of full bins, at most `max_frames`.
 
         Returns:

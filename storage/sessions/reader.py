@@ -25,7 +25,7 @@ from storage.schema import (
     MEASURED_COLUMNS,
     Array,
     map_flat_columns,
-    read_flat_column,
+    read_flat_column_and_fill_nulls,
     read_quantity,
 )
 from storage.sessions.footer import FileStamps, SealedFileFooter, read_file_stamps_or_empty
@@ -181,7 +181,7 @@ class SealedFileReader:
             self.footer.time_axis = self._compute_time_axis()
         return self.footer.time_axis
 
-    def read_span_ns(self) -> tuple[int, int]:
+    def read_span_on_axis_ns(self) -> tuple[int, int]:
         """Return `t_ns` of the first and of the last frame, both on the session's time axis.
 
         Raises:
@@ -198,7 +198,7 @@ class SealedFileReader:
             return self.footer.span_ns
         first, *_ = self._read_pieces(0, ["t_ns"])  # all: their row count shows a skipped page
         with self._translate_damage(0):
-            begin = int(read_flat_column(COLUMNS_BY_NAME["t_ns"], "t_ns", first)[0])
+            begin = int(read_flat_column_and_fill_nulls(COLUMNS_BY_NAME["t_ns"], "t_ns", first)[0])
         latest = self.read_min_max_by_row_group("t_ns")
         unknown_groups = [group for group, min_max in enumerate(latest) if min_max is None]
         ends = [
@@ -210,7 +210,7 @@ class SealedFileReader:
         return begin, end
 
     def read_overlapping_row_groups(
-        self, names: Sequence[str], begin_t_ns: int | None, end_t_ns: int | None
+        self, names: Sequence[str], begin_on_axis_ns: int | None, end_on_axis_ns: int | None
     ) -> Iterator[dict[str, Array]]:
         """Yield flat columns of all rows of the row groups that may have frames of a time range.
 
@@ -218,8 +218,8 @@ class SealedFileReader:
 
         Args:
             names: names of the columns, each n rows.
-            begin_t_ns: first instant on the time axis; None: from the beginning.
-            end_t_ns: instant behind the last; None: to the end.
+            begin_on_axis_ns: first instant on the time axis; None: from the beginning.
+            end_on_axis_ns: instant behind the last; None: to the end.
 
         Yields:
             At least one piece, which may have no rows.
@@ -229,30 +229,37 @@ class SealedFileReader:
         """
         logical = map_flat_columns(len(self.info.tiles))
         is_empty = True
-        for group in self.find_overlapping_row_groups(begin_t_ns, end_t_ns):
+        for group in self.find_overlapping_row_groups(begin_on_axis_ns, end_on_axis_ns):
             for table in self._read_pieces(group, names):
                 with self._translate_damage(group):
-                    values = {name: read_flat_column(logical[name], name, table) for name in names}
+                    values = {
+                        name: read_flat_column_and_fill_nulls(logical[name], name, table)
+                        for name in names
+                    }
                 yield values
                 is_empty = False
         if is_empty:
             table = self.footer.schema.empty_table()
             with self._translate_damage(0):
-                yield {name: read_flat_column(logical[name], name, table) for name in names}
+                yield {
+                    name: read_flat_column_and_fill_nulls(logical[name], name, table)
+                    for name in names
+                }
 
     def find_overlapping_row_groups(
-        self, begin_t_ns: int | None, end_t_ns: int | None
+        self, begin_on_axis_ns: int | None, end_on_axis_ns: int | None
     ) -> list[int]:
         """Return the row groups that may have frames of a time range.
 
         Bounds as for `read_overlapping_row_groups`.
         """
-        if begin_t_ns is None and end_t_ns is None:
+        if begin_on_axis_ns is None and end_on_axis_ns is None:
             return list(range(len(self.footer.rows_by_group)))
         return [
             group
             for group, min_max in enumerate(self.read_min_max_by_row_group("t_ns"))
-            if min_max is None or self.time_axis.may_overlap(*min_max, begin_t_ns, end_t_ns)
+            if min_max is None
+            or self.time_axis.may_overlap(*min_max, begin_on_axis_ns, end_on_axis_ns)
         ]
 
     def read_frames(self) -> FrameBatch:

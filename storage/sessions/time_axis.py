@@ -130,7 +130,7 @@ class TimeAxis:
         except (TypeError, KeyError, ValueError) as error:
             raise FileFormatError("its notes state no time axis", where=where) from error
 
-    def describe_shift(self) -> str:
+    def explain_shift_or_empty(self) -> str:
         """Return a message about a shifted axis; empty: the node's date was right."""
         if not self.is_shifted:
             return ""
@@ -207,7 +207,7 @@ def _measure_clock_change(
     numbers = np.array([before.number, span.number])
     t_ns = np.array([before.t_ns[1], span.t_ns[0]], dtype=np.int64)
     t_mono_ns = np.array([before.t_mono_ns[1], span.t_mono_ns[0]], dtype=np.int64)
-    found = clock.compute_server_time_columns(t_mono_ns, t_ns, numbers)
+    found = clock.compute_server_time_columns_or_unknown(t_mono_ns, t_ns, numbers)
     server_ns, bound_ns = found["t_server_ns"].tolist(), found["t_server_uncertainty_ns"].tolist()
     if UNKNOWN_T_NS in server_ns:
         return None

@@ -81,7 +81,7 @@ class SealedFileWriter:
         self._digest = ContentDigest()
         self._head = b"", b""
 
-    def add_notes(self, notes: Mapping[str, object]) -> None:
+    def add_notes_before_first_row_group(self, notes: Mapping[str, object]) -> None:
         """Add notes; only before the first minute of frames is written.
 
         Raises:
@@ -130,7 +130,9 @@ class SealedFileWriter:
         if self._writer is None:
             raise FileFormatError("no frames to write", where=str(self.path))
         with self._translate_errors():
-            self._writer.add_key_value_metadata(self._digest.compute_footer_entries(*self._head))
+            self._writer.add_key_value_metadata(
+                self._digest.make_footer_entries_with_placeholders(*self._head)
+            )
             self._writer.close()
             self._writer = None
             fill_hash_placeholders_and_sync(self._temporary)
@@ -174,7 +176,7 @@ class SealedFileWriter:
             metadata={FORMAT_KEY: FORMAT, ARRAY_INFO_KEY: info_text, NOTES_KEY: notes_text},
         )
         table = pa.Table.from_arrays(list(arrays), schema=schema)
-        self._digest.add_table_and_check_order(table)
+        self._digest.add_table_and_collect_disorder(table)
         self._group.append(table)
         self._pieces += 1
         if len(self._group) >= min(self._pieces // ROW_GROUP_GROWTH_RATIO, MAX_ROW_GROUP_PIECES):

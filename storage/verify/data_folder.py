@@ -22,10 +22,10 @@ from storage.checksummed_json import read_checksummed_json
 from storage.durable_files import ASIDE_SUFFIX
 from storage.journal.segment import INDEX_SUFFIX, SUFFIX
 from storage.journal.stream_notes import NOTES_FILE
-from storage.server_id import SERVER_ID_NAME, read_server_id
+from storage.server_id import SERVER_ID_NAME, read_existing_server_id
 from storage.sessions.folder import FRAMES_NAME, SESSION_ID, Ledger, SessionsFolder
 from storage.sessions.metadata import SESSION_NAME
-from storage.verify.export import ExportReport, verify_export
+from storage.verify.export import ExportReport, recognise_export_and_check_readable
 from storage.verify.journal import StreamReport, verify_journal
 from storage.verify.segment import SegmentReport, verify_segment
 from storage.verify.session import SessionReport, verify_lone_sealed_file, verify_session
@@ -69,7 +69,7 @@ def _verify_json_and_server_id(data_folder: Path, verified_folders: set[Path]) -
             if ASIDE_SUFFIX in name:
                 found.set_aside.append(_relative_path(path, data_folder))
             elif path == data_folder / SERVER_ID_NAME:
-                _verify_with(path, name, read_server_id, found)
+                _verify_with(path, name, read_existing_server_id, found)
             elif name.endswith(".json") and not name.startswith(".") and not is_verified:
                 _verify_checksummed_json(path, _relative_path(path, data_folder), found)
         # A folder that was set aside, or that has the name of a file, is skipped.
@@ -180,7 +180,7 @@ def verify_path(path: Path, *, data_folder: Path | None = None) -> Report:
             others = OtherFilesReport()
             _verify_checksummed_json(path, path.name, others)
             return DataFolderReport(path, problems=others.problems)
-        return verify_export(path) or verify_lone_sealed_file(path)
+        return recognise_export_and_check_readable(path) or verify_lone_sealed_file(path)
     if not path.exists():
         raise FileFormatError("no such file or folder", where=str(path))
     if (path / "sessions").is_dir() or (path / "journal").is_dir():
@@ -224,7 +224,7 @@ def verify_data_folder(path: Path) -> DataFolderReport:
                     if session.id not in (None, folder.name):
                         session.problems.append(f"it lies in the folder of {folder.name}")
                     report.sessions.append(session)
-        for stray in SessionsFolder(data / place).find_strays():
+        for stray in SessionsFolder(data / place).find_renamed_or_copied_sessions():
             folder = data / place / stray.name
             proven.add(folder)
             with _report_errors(report, folder, data):

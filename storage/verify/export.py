@@ -51,7 +51,7 @@ class ExportReport:
         }
 
 
-def verify_export(path: Path) -> ExportReport | None:
+def recognise_export_and_check_readable(path: Path) -> ExportReport | None:
     """Recognise an export; read Parquet and Arrow to their end, and both ends of CSV.
 
     Returns:

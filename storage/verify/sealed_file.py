@@ -192,7 +192,7 @@ def _verify_content(
     digest = ContentDigest()
     try:
         for table in reader.read_tables():
-            digest.add_table_and_check_order(table)
+            digest.add_table_and_collect_disorder(table)
     except (KeyError, ValueError, TypeError) as error:
         if isinstance(error, FileFormatError):
             raise

@@ -17,7 +17,7 @@ import pyarrow as pa
 
 from devices.errors import DamagedFileError, FileFormatError
 from devices.frames import ArrayInfo
-from storage.frame_rules import describe_first_broken_rule
+from storage.frame_rules import describe_first_impossible_value
 from storage.intervals import Intervals
 from storage.journal.segment import (
     INDEX_SUFFIX,
@@ -25,14 +25,14 @@ from storage.journal.segment import (
     Records,
     find_end_offset,
     is_index_closed,
-    is_record_valid,
+    is_record_intact,
     make_message_batch,
-    mask_valid_records,
-    read_index,
+    mask_intact_records,
+    read_existing_index,
     read_messages_until_damage,
     read_schema_and_first_offset,
     read_verified_payload,
-    select_valid_batch_records,
+    select_intact_batch_records,
     seq_range_of,
 )
 from storage.schema import read_array_info, wire_schema
@@ -108,7 +108,7 @@ def _verify(path: Path, report: SegmentReport) -> None:
         # In this order, since a writer appends to the segment first: at most one batch of this
         # size has no record in the index that is read after it.
         size = path.stat().st_size
-        index: Records | None = read_index(path)
+        index: Records | None = read_existing_index(path)
     except FileNotFoundError:
         if not path.exists():
             raise
@@ -128,7 +128,7 @@ def _verify(path: Path, report: SegmentReport) -> None:
             )
         return
     _BatchVerifier(report, schema, header_bytes).verify(index)
-    end = max(header_bytes, find_end_offset(select_valid_batch_records(index)))
+    end = max(header_bytes, find_end_offset(select_intact_batch_records(index)))
     behind, at = 0, end
     for message in read_messages_until_damage(path, end, schema):
         at += len(message.payload)
@@ -191,17 +191,17 @@ class _BatchVerifier:
         offset, length = records["offset"], records["length"].astype(np.uint64)
         is_joined = bool((offset[1:] == (offset + length)[:-1]).all())
         first, last = seq_range_of(records[0])[0], seq_range_of(records[-1])[1]
-        if not is_joined or offset[0] < self._end or not mask_valid_records(records).all():
+        if not is_joined or offset[0] < self._end or not mask_intact_records(records).all():
             return False
         content = os.pread(descriptor, int(length.sum()), int(offset[0]))
-        frames = self._runs.decode(make_message_batch(records, content))
+        frames = self._runs.decode_or_none_if_damaged(make_message_batch(records, content))
         if frames is None or self._report.stored.restricted_to(first, last):
             return False
         ends = np.cumsum(records["count"], dtype=np.int64)
         t_ns_first, t_ns_last = frames.t_ns[ends - records["count"]], frames.t_ns[ends - 1]
         if (t_ns_first != records["t_ns_first"]).any() or (t_ns_last != records["t_ns_last"]).any():
             return False
-        if describe_first_broken_rule(frames, self._info):
+        if describe_first_impossible_value(frames, self._info):
             return False
         self._report.stored.add_ranges(records["seq_first"], records["count"])
         self._report_pending()
@@ -211,7 +211,7 @@ class _BatchVerifier:
     def _verify_batch(self, descriptor: int, record: np.void, at: int) -> bool:
         """Verify one batch; return whether it is undamaged and its frames belong there."""
         report = self._report
-        if not is_record_valid(record):
+        if not is_record_intact(record):
             self._pending_problems.append(f"record {at} of its index is damaged")
             return False
         if not record["count"]:
@@ -254,13 +254,13 @@ def _find_batch_problem(payload: bytes, record: np.void, schema: pa.Schema, info
         return f"the batch holds {len(batch)} frames from {int(batch.seq[0])} on"
     if (int(batch.t_ns[0]), int(batch.t_ns[-1])) != (record["t_ns_first"], record["t_ns_last"]):
         return "the index has other instants than the batch"
-    return describe_first_broken_rule(batch, info)
+    return describe_first_impossible_value(batch, info)
 
 
 def _has_any_batch(path: Path, index: Records) -> bool:
     """Return whether any batch in the segment matches the index."""
     with path.open("rb") as file:
-        batches = select_valid_batch_records(index)
+        batches = select_intact_batch_records(index)
         return any(read_verified_payload(file.fileno(), record) is not None for record in batches)
 
 

@@ -16,15 +16,15 @@ from storage.clock.table import CLOCK_NAME, read_clock_file
 from storage.intervals import NO_END, Intervals
 from storage.parquet_hash import compute_sha256
 from storage.sessions.folder import FRAMES_NAME, Ledger, Marker, Session
-from storage.sessions.ledger import compute_ledger, settle_losses
+from storage.sessions.ledger import compute_ledger, mark_damaged_and_abandoned_lost
 from storage.sessions.metadata import (
     MARKERS_NAME,
     SESSION_NAME,
     StoredMetadata,
-    make_session_metadata,
     parse_session_metadata,
     read_bytes_or_none,
-    read_markers,
+    read_existing_markers,
+    wrap_session_as_metadata,
 )
 from storage.sessions.overview import OVERVIEW_NAME, open_overview
 from storage.sessions.stances import STANCES_NAME, read_stances
@@ -143,7 +143,7 @@ def _verify_once(
 ) -> SessionReport:
     report = SessionReport(folder, is_in_trash=folder.absolute().parent.name == "trash")
     metadata = (
-        make_session_metadata(session)
+        wrap_session_as_metadata(session)
         if session is not None
         else parse_session_metadata(folder, text, report.problems)
     )
@@ -253,7 +253,7 @@ def _check_events(report: SessionReport, path: Path, events: tuple[Marker, ...] 
         path: the table.
         events: expected markers; None: unknown, and the table may be missing.
     """
-    stored = _read_sidecar(report, path, read_markers, is_optional=events is None)
+    stored = _read_sidecar(report, path, read_existing_markers, is_optional=events is None)
     if stored is not None and events is not None and stored != events:
         report.problems.append(f"{path.name} has other events than {SESSION_NAME}")
 
@@ -335,8 +335,8 @@ def _count_ledger(
         reports.setdefault(part.stream_id, StreamReport(session.node, part.stream_id))
     # For a server's folder a node may still send frames; a node's own folder has all of them.
     may_come = Intervals([(0, NO_END)] if (data / "nodes").is_dir() else ())
-    states = settle_losses(
+    states = mark_damaged_and_abandoned_lost(
         session, {b: found.to_stream_state(may_come) for b, found in reports.items()}
     )
-    ledger = compute_ledger(session.parts, states, is_finished=session.stopped_t_ns is not None)
+    ledger = compute_ledger(session.parts, states, has_all_parts=session.stopped_t_ns is not None)
     report.ledger = ledger.model_copy(update={"complete": False})

@@ -364,7 +364,7 @@ def compute_estimates(
     Raises:
         FootTileError: the recording cannot be estimated with these models.
     """
-    options = EstimateOptions(recording.calibration, models, lag_ms, exact=True)
+    options = EstimateOptions(recording.calibration, models, lag_ms, unquantized=True)
     stream = EstimateStream(recording.info, options)
     judged: list[Mapping[str, npt.NDArray[Any]]] = []
     for frames, columns in stream.estimate_batches([(recording.frames, recording.truth)]):

@@ -14,7 +14,7 @@ from scipy.special import chdtri
 from devices.arrays import Floats
 from devices.scene.scene_file import Scene
 from service.estimation.calibration import Calibration, TileCalibration
-from service.estimation.domes import Dome, SaturationLoad, compute_saturation_load
+from service.estimation.domes import Dome, SlowSaturationLoad, compute_saturation_load
 from service.estimation.fitting.least_squares import (
     compute_curve_n,
     compute_curve_student_t_half_width_95_n,
@@ -61,7 +61,7 @@ class DomeResult:
 
     dome: Dome
     indented_tile: IndentedTile
-    expected_range: SaturationLoad
+    expected_range: SlowSaturationLoad
     end_kpa: float
     full_scale_n: tuple[float, float]
     is_full_scale_reached: bool

@@ -56,7 +56,7 @@ def _started(data: Path) -> tuple[Served, list[str], float]:
         server = Server(data)
         took_s = time.monotonic() - began_s
         try:
-            return served(server), server.problems, took_s
+            return served(server), server.file_problems, took_s
         finally:
             await server.close()
 

@@ -66,7 +66,7 @@ def _estimated(data: Path, hello: Hello) -> tuple[dict[str, Numbers], bool]:
             session = session.model_copy(update={"state": "pending"})
             pieces = [columns for _, columns in SessionFrames(current_inputs(session, node))]
             found[path.name] = _joined(pieces)
-    return found, bool(node.problems)
+    return found, bool(node.file_problems)
 
 
 def _live(node: ServerNode) -> Numbers:
@@ -75,7 +75,7 @@ def _live(node: ServerNode) -> Numbers:
     due = [
         c
         for batch in journal.read_frames(0, 2**61)
-        for _, c in node.estimator.live.feed_frames(batch)
+        for _, c in node.estimator.live.estimate_or_pass_frames(batch)
     ]
     return _joined(due)
 

@@ -14,7 +14,7 @@ from devices.frames import ArrayInfo
 from service.offline.calibration_lookup import read_calibration
 from service.protocol import PROTOCOL, Hello
 from service.sessions.calibration_file import write_calibration
-from service.sessions.recovery import recover_folder
+from service.sessions.recovery import recover_locked_folder
 from service.sessions.tares import TareHistory
 from storage.checksummed_json import write_checksummed_json
 from storage.clock.log import ClockLog, ClockOffset
@@ -22,7 +22,7 @@ from storage.journal.node.retention_requests import RetentionRequest, RetentionR
 from storage.permissions import SECRETS_NAME, write_secrets
 from storage.server_id import SERVER_ID_NAME, write_server_id
 from storage.sessions.folder import FRAMES_NAME, Marker, Part, SessionsFolder
-from storage.sessions.metadata import MARKERS_NAME, load_clock_table, read_markers
+from storage.sessions.metadata import MARKERS_NAME, load_clock_table, read_existing_markers
 from storage.sessions.reader import SealedFileReader
 from tests.builders.arrays import make_array
 from tests.builders.calibrations import make_calibration, make_tare
@@ -71,7 +71,7 @@ def make_server(data: Path) -> None:
             )
         )
     _session(data, SEALED, 5, 60)
-    recover_folder(data, abandon_missing=True)
+    recover_locked_folder(data, abandon_missing=True)
     _session(data, DELETED, 20, 40)
     sessions = SessionsFolder(data / "sessions")
     sessions.move_to(DELETED, SessionsFolder(data / "trash"))
@@ -119,7 +119,7 @@ def session_readings(folder: Path) -> Readings:
             SessionsFolder(folder.parent).load(folder.name).model_dump_json().encode()
         ),
         "frames": lambda: _frames(folder / FRAMES_NAME),
-        "markers": lambda: repr(read_markers(folder / MARKERS_NAME)).encode(),
+        "markers": lambda: repr(read_existing_markers(folder / MARKERS_NAME)).encode(),
         "clock": lambda: _clock(folder / FRAMES_NAME),
     }
     wanted = readers if folder.name == SEALED else {"session"}
@@ -135,7 +135,7 @@ def recovered_readings(data: Path) -> Readings:
     """
 
     def sealed() -> bytes:
-        recover_folder(data, abandon_missing=True)
+        recover_locked_folder(data, abandon_missing=True)
         done = SessionsFolder(data / "sessions").load(PENDING)
         ledger = done.ledger
         if ledger is None or ledger.lossy or done.problem:
@@ -171,7 +171,9 @@ def _clock(path: Path) -> bytes:
     with SealedFileReader(path) as reader:
         table = load_clock_table(reader)
         columns = [
-            table.compute_server_time_columns(frames.t_mono_ns, frames.t_ns, extra["part"])
+            table.compute_server_time_columns_or_unknown(
+                frames.t_mono_ns, frames.t_ns, extra["part"]
+            )
             for frames, extra in reader.read_batches("part")
         ]
     values = [values.tobytes() for each in columns for values in each.values()]

@@ -115,5 +115,5 @@ def put(recording: Path, data: Path, *, marked: bool = True) -> Path:
     )
     facts = StreamClockFacts(info.stream_id, info.utc_offset_ns, info.clock_set)
     write_clock_file(folder / CLOCK_NAME, [clock], [facts])
-    sessions.save(session)
+    sessions.save_session_json(session)
     return folder

@@ -203,7 +203,7 @@ class Running:
         self._loop = asyncio.get_running_loop()
         self._stop = asyncio.Event()
         with open_listening_socket("127.0.0.1", self.port) as listening:
-            self.server = Server(self.data, exact=self._exact)
+            self.server = Server(self.data, unquantized=self._exact)
             if not self.shown or not hasattr(self, "logins"):
                 # Where a test is about something else, its pages stay logged in over a restart.
                 self.logins = Logins(self._token, is_private=self._is_private)

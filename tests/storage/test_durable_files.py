@@ -27,7 +27,7 @@ from storage.durable_files import (
     translate_storage_errors,
     write_atomically,
 )
-from storage.permissions import set_umask_and_restrict_folder
+from storage.permissions import set_umask_and_create_private_folder
 from tests.storage.faulty_disk import IO_ERROR, disk_with_room_for, refusing
 
 
@@ -196,7 +196,7 @@ def test_a_file_system_without_permissions_is_used(
     monkeypatch.setattr(os, "chmod", refusing(OSError, number, os.strerror(number)))
     umask = os.umask(0o022)
     try:
-        set_umask_and_restrict_folder(tmp_path / "data")
+        set_umask_and_create_private_folder(tmp_path / "data")
         assert os.umask(0o022) == 0o077
     finally:
         os.umask(umask)
@@ -208,7 +208,7 @@ def test_a_failed_chmod_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     try:
         (tmp_path / "data").mkdir(mode=0o755)
         with pytest.raises(StorageError, match="closed to other users") as caught:
-            set_umask_and_restrict_folder(tmp_path / "data")
+            set_umask_and_create_private_folder(tmp_path / "data")
     finally:
         os.umask(umask)
     assert caught.value.where == str(tmp_path / "data")

@@ -49,7 +49,9 @@ def cut(batch: FrameBatch, cuts: Sequence[int]) -> list[FrameBatch]:
 
 
 def is_read(batches: Sequence[FrameBatch], payloads: Sequence[bytes] | None = None) -> bool:
-    return MessageBatchDecoder(SCHEMA).decode(run_of(batches, payloads)) is not None
+    return (
+        MessageBatchDecoder(SCHEMA).decode_or_none_if_damaged(run_of(batches, payloads)) is not None
+    )
 
 
 cuts = st.lists(st.integers(0, ROWS), max_size=8)
@@ -66,7 +68,7 @@ def test_messages_read_at_once_are_those_read_one_by_one(
     payloads = [encode_frames(part, schema) for part in parts]
     reader = MessageBatchDecoder(schema)
     for _ in range(2):  # the second time headers are known
-        read = reader.decode(run_of(parts, payloads))
+        read = reader.decode_or_none_if_damaged(run_of(parts, payloads))
         assert read is not None
         one_by_one = [decode_message(payload, schema) for payload in payloads]
         assert_same_bits(read, FrameBatch.concatenate(one_by_one))
@@ -75,7 +77,7 @@ def test_messages_read_at_once_are_those_read_one_by_one(
 def test_more_headers_than_are_remembered_are_read() -> None:
     sizes = list(range(1, 300))
     parts = cut(frames(sum(sizes)), list(accumulate(sizes)))
-    read = MessageBatchDecoder(SCHEMA).decode(run_of(parts))
+    read = MessageBatchDecoder(SCHEMA).decode_or_none_if_damaged(run_of(parts))
     assert read is not None
     assert_same_bits(read, frames(sum(sizes)))
 
@@ -86,30 +88,37 @@ def test_no_flipped_bit_is_read(cuts: list[int], data: st.DataObject) -> None:
     run = run_of(cut(frames(), cuts))
     damaged = bytearray(run.content)
     damaged[data.draw(st.integers(0, len(damaged) - 1))] ^= 1 << data.draw(st.integers(0, 7))
-    assert MessageBatchDecoder(SCHEMA).decode(replace(run, content=bytes(damaged))) is None
+    assert (
+        MessageBatchDecoder(SCHEMA).decode_or_none_if_damaged(replace(run, content=bytes(damaged)))
+        is None
+    )
 
 
 @given(behind=st.integers(-200, 200).filter(bool))
 def test_bytes_that_are_too_few_or_too_many_are_not_read(behind: int) -> None:
     run = run_of(cut(frames(), [20, 40]))
     content = run.content + bytes(behind) if behind > 0 else run.content[:behind]
-    assert MessageBatchDecoder(SCHEMA).decode(replace(run, content=content)) is None
+    assert (
+        MessageBatchDecoder(SCHEMA).decode_or_none_if_damaged(replace(run, content=content)) is None
+    )
 
 
 def test_nothing_is_no_run() -> None:
-    assert MessageBatchDecoder(SCHEMA).decode(run_of([])) is None
+    assert MessageBatchDecoder(SCHEMA).decode_or_none_if_damaged(run_of([])) is None
 
 
 def test_an_index_that_says_other_numbers_than_the_messages_is_not_followed() -> None:
     run = run_of(cut(frames(), [20, 40]))
     reader = MessageBatchDecoder(SCHEMA)
-    assert reader.decode(run) is not None
+    assert reader.decode_or_none_if_damaged(run) is not None
     for wrong in ([0, 20, 41], [0, 19, 40], [1, 20, 40], [2**63, 20, 40]):
-        assert reader.decode(replace(run, seq_first=np.array(wrong, "<u8"))) is None
+        assert (
+            reader.decode_or_none_if_damaged(replace(run, seq_first=np.array(wrong, "<u8"))) is None
+        )
     for count in ([20, 20, 21], [20, 20, 19], [21, 19, 20], [20, 0, 40]):
-        assert reader.decode(replace(run, count=np.array(count, "<u4"))) is None
+        assert reader.decode_or_none_if_damaged(replace(run, count=np.array(count, "<u4"))) is None
     length = run.length + np.array([8, 0, -8])
-    assert reader.decode(replace(run, length=length)) is None
+    assert reader.decode_or_none_if_damaged(replace(run, length=length)) is None
 
 
 def test_messages_that_overlap_or_come_in_another_order_are_not_read() -> None:
@@ -167,7 +176,7 @@ def test_headers_of_strangers_take_no_memory() -> None:
     for number in range(20):
         payload = padded(encode_frames(part, SCHEMA), 100_000 + 8 * number)
         assert_same_bits(decode_message(payload, SCHEMA), part)
-        read = reader.decode(run_of([part], [payload]))
+        read = reader.decode_or_none_if_damaged(run_of([part], [payload]))
         assert read is not None
         assert_same_bits(read, part)
     assert sum(len(head) for head in reader._layouts._cache) < 100_000

@@ -17,7 +17,7 @@ from storage.durable_files import make_synced_folder, write_atomically
 from storage.permissions import (
     SECRETS_NAME,
     read_secrets_or_empty,
-    set_umask_and_restrict_folder,
+    set_umask_and_create_private_folder,
     write_secrets,
 )
 
@@ -41,7 +41,7 @@ def written(folder: Path) -> tuple[int, int]:
 
 
 def test_a_folder_that_is_made_is_its_users(tmp_path: Path) -> None:
-    set_umask_and_restrict_folder(tmp_path / "a" / "data")
+    set_umask_and_create_private_folder(tmp_path / "a" / "data")
     assert mode_of(tmp_path / "a" / "data") == 0o700
     assert written(tmp_path / "a" / "data") == (0o700, 0o600)
 
@@ -61,7 +61,7 @@ def test_an_open_folder_of_ours_is_closed(tmp_path: Path, found: tuple[str, ...]
     for name in found:
         (tmp_path / name).touch()
     tmp_path.chmod(0o755)
-    set_umask_and_restrict_folder(tmp_path)
+    set_umask_and_create_private_folder(tmp_path)
     assert mode_of(tmp_path) == 0o700
 
 
@@ -73,7 +73,7 @@ def test_a_users_folder_stays_open_and_our_files_in_it_are_closed(
     (tmp_path / name).mkdir()
     tmp_path.chmod(0o755)
     for _ in range(2):
-        set_umask_and_restrict_folder(tmp_path)
+        set_umask_and_create_private_folder(tmp_path)
         assert mode_of(tmp_path) == 0o755
         assert written(tmp_path) == (0o700, 0o600)
         for ours in (".lock", "server_id"):  # what a start leaves is there at the second one
@@ -83,7 +83,7 @@ def test_a_users_folder_stays_open_and_our_files_in_it_are_closed(
 @pytest.mark.parametrize("mode", [0o750, 0o770, 0o2750])
 def test_a_group_that_the_owner_let_in_may_read(tmp_path: Path, mode: int) -> None:
     tmp_path.chmod(mode)
-    set_umask_and_restrict_folder(tmp_path)
+    set_umask_and_create_private_folder(tmp_path)
     assert mode_of(tmp_path) == mode
     folder, file = written(tmp_path)
     assert (folder & 0o777, file) == (0o750, 0o640)

@@ -227,7 +227,9 @@ async def upload_calibration(
 @router.get("/calibrations/jobs", operation_id="listCalibrationJobs", summary="Fits")
 async def list_calibration_jobs(server: ServerState) -> Page[FitView]:
     """Return the last jobs since the server was started, newest first."""
-    return Page(items=[FitView.from_job(fit) for fit in server.calibration_jobs.list_jobs()])
+    return Page(
+        items=[FitView.from_job(fit) for fit in server.calibration_jobs.list_jobs_newest_first()]
+    )
 
 
 @router.post(
@@ -304,7 +306,7 @@ async def get_calibration(calibration_id: str, request: Request, server: ServerS
 )
 async def delete_calibration(calibration_id: str, server: ServerState) -> None:
     """Delete a calibration; sessions and nodes that use it have a copy."""
-    server.calibrations.delete(calibration_id)
+    server.calibrations.delete_even_if_in_use(calibration_id)
 
 
 @router.get(

@@ -92,7 +92,7 @@ class Version(View):
 @router.get("/health", operation_id="getHealth", summary="Liveness")
 async def get_health(server: ServerState) -> Health:
     """Return the state of the process, with the damage found at its start."""
-    return Health(status="ok", problems=server.problems)
+    return Health(status="ok", problems=server.file_problems)
 
 
 @router.get(

@@ -108,7 +108,7 @@ InForce = Annotated[
 
 
 def _check_tare_in_force(node: ServerNode, if_match: str | None) -> None:
-    recorded = node.estimator.tare_history.tare_in_force(node.last_info)
+    recorded = node.estimator.tare_history.tare_in_force_unless_lost(node.last_info)
     in_force = "none" if recorded is None else recorded.id
     check_revision(parse_if_match(if_match), in_force, f"the tare of {node.name!r}")
 
@@ -148,7 +148,7 @@ async def get_history(
     came since the server was started; where frames are missing, numbers are missing.
     """
     the_node = server.nodes.get(node)
-    rows = server.broadcaster.get_or_start_force_history(the_node).get_newest_spans(
+    rows = server.broadcaster.get_present_stream_force_history(the_node).get_newest_spans(
         query.seconds, query.before_seq
     )
     age_ms = server.broadcaster.newest_frame_age_ms(the_node)
@@ -170,7 +170,7 @@ async def get_history(
 def _make_tiles_view(
     node: ServerNode, query: RecentQuery, unit: str, server: Server
 ) -> RecentTilesView:
-    recent = server.broadcaster.get_or_start_tile_history(node)
+    recent = server.broadcaster.get_present_stream_tile_history(node)
     spans = recent.get_newest_spans(query.seconds, unit, query.before_seq)
     least, greatest = (
         [_round_four_digits(row) for row in values.tolist()]
@@ -222,7 +222,10 @@ async def tare_node(
 async def list_tares(node: str, server: ServerState) -> TaresPage:
     """Return the tares, newest first; the first valid one of the present tiles is in force."""
     the_node = server.nodes.get(node)
-    items = [TareView.from_recorded(t) for t in reversed(the_node.estimator.tare_history.all_tares)]
+    items = [
+        TareView.from_recorded(t)
+        for t in reversed(the_node.estimator.tare_history.all_tares_with_undone)
+    ]
     return TaresPage(items=items, drift=DriftView.from_node(the_node))
 
 
@@ -245,7 +248,7 @@ async def undo_tare(node: str, tare_id: str, server: ServerState, if_match: InFo
     """
     the_node = server.nodes.get(node)
     _check_tare_in_force(the_node, if_match)
-    the_node.estimator.tare_controller.undo_tare(tare_id)
+    the_node.estimator.tare_controller.undo_any_tare_and_pause_automatic(tare_id)
     server.notify_node_changed(the_node)
 
 

@@ -314,7 +314,7 @@ async def repeat(node: str, server: ServerState, if_match: ThisOne = None) -> We
     """Go back to the weight that is held, or else to the last one on this tile."""
     the_node = server.nodes.get(node)
     return WeighingView.of(
-        server.weighings.repeat_last_weight(the_node, parse_if_match(if_match)), the_node
+        server.weighings.repeat_held_or_last_weight(the_node, parse_if_match(if_match)), the_node
     )
 
 

@@ -94,10 +94,10 @@ async def _run_demo(
         publish_token,
     )
     from service.api.logins import Logins
-    from storage.permissions import set_umask_and_restrict_folder
+    from storage.permissions import set_umask_and_create_private_folder
 
     stop = create_stop_event()
-    set_umask_and_restrict_folder(data)
+    set_umask_and_create_private_folder(data)
     with open_listening_socket(host, port) as listening, ExitStack() as stack:
         given_token = read_token()
         token = load_or_create_token(given_token, data)

@@ -11,11 +11,11 @@ from rich.table import Table
 from devices.errors import UsageError
 from service.cli.options import JsonOption, echo, print_json, stdout
 from service.estimation.domes import (
-    SaturationLoad,
+    SlowSaturationLoad,
     compute_ambient_transmission,
     compute_fast_to_slow_load_ratio,
     list_saturation_loads,
-    select_dome_for_load,
+    select_likely_covering_dome,
 )
 
 
@@ -33,7 +33,7 @@ def domes_command(
     """
     if load_n is not None and not 0.0 < load_n < float("inf"):
         raise UsageError(f"--load-n {load_n} is not a load", expected="newtons above 0")
-    selected = None if load_n is None else select_dome_for_load(load_n)
+    selected = None if load_n is None else select_likely_covering_dome(load_n)
     if as_json:
         print_json(
             {
@@ -96,7 +96,7 @@ A load within milliseconds reaches full scale at about {fast:.0f} % of it.
 Outside: estimated part of a change of air or water pressure that a tile reads."""
 
 
-def _format_choice(selected: SaturationLoad | None, load_n: float) -> str:
+def _format_choice(selected: SlowSaturationLoad | None, load_n: float) -> str:
     if selected is None:
         return "none of them; share the load between tiles."
     if selected.judge_slow_load(load_n) == "covers":

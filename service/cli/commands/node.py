@@ -80,7 +80,7 @@ def node_command(
     from service.node.server_connection import make_ingest_url
     from service.rig.emulated_foot import RigOptions
     from service.user_folders import resolve_user_folder
-    from storage.permissions import set_umask_and_restrict_folder
+    from storage.permissions import set_umask_and_create_private_folder
 
     if end_with_parent:
         from devices import realtime
@@ -108,7 +108,7 @@ def node_command(
     rig = RigOptions(the_scene, _choose_name(name), options.make_foot(the_scene))
     calibration, problem = find_scene_calibration(rig)
     with suppress(StorageError):  # an unwritable card is reported later
-        set_umask_and_restrict_folder(folder)
+        set_umask_and_create_private_folder(folder)
     outcome = asyncio.run(
         _run_node(
             NodeOptions(

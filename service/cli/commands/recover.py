@@ -37,18 +37,18 @@ def recover_command(
     It can be repeated. Exit codes: 0 success, 1 something was not recovered, 2 wrong usage, 3 done,
     but a session is lossy or waits for its node.
     """
-    from service.sessions.recovery import recover_folder
+    from service.sessions.recovery import recover_locked_folder
     from storage.durable_files import lock_folder
-    from storage.permissions import set_umask_and_restrict_folder
+    from storage.permissions import set_umask_and_create_private_folder
 
     if not any((folder / name).is_dir() for name in ("journal", "sessions")):
         raise UsageError(
             f"no data folder {str(folder)!r}",
             expected="a folder with `journal` and `sessions`, of a server or a node",
         )
-    set_umask_and_restrict_folder(folder)
+    set_umask_and_create_private_folder(folder)
     with lock_folder(folder), show_progress("opening journals") as report_step:
-        recovery = recover_folder(
+        recovery = recover_locked_folder(
             folder, make_sessions=streams, abandon_missing=give_up, report_step=report_step
         )
     if as_json:
@@ -97,7 +97,7 @@ def _print_report(recovery: RecoveryReport) -> None:
             echo(f"  {found.problem}")
     for problem in recovery.problems:
         echo(f"not recovered: {problem}")
-    if recovery.is_empty:
+    if recovery.is_empty_or_all_waiting:
         echo("nothing to recover")
     if any(found.outcome == "waiting" for found in recovery.sessions):
         remark("the server completes the waiting sessions; --give-up seals them now")

@@ -119,12 +119,12 @@ async def _run_server(settings: Settings) -> None:
     from service.api.logins import Logins
     from service.api.runner import serve_app
     from service.server.server import Server
-    from storage.permissions import set_umask_and_restrict_folder
+    from storage.permissions import set_umask_and_create_private_folder
 
     stop = create_stop_event()
-    set_umask_and_restrict_folder(settings.data)
+    set_umask_and_create_private_folder(settings.data)
     with open_listening_socket(settings.host, settings.port) as listening:
-        server = Server(settings.data, exact=settings.no_quantize)
+        server = Server(settings.data, unquantized=settings.no_quantize)
         token = load_or_create_token(settings.token, settings.data)
         logins = Logins(token, is_private=settings.private)
         find_urls = partial(list_urls, listening, settings.host, settings.advertise)

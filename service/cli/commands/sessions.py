@@ -218,7 +218,7 @@ def pull_command(
         if session is None:
             pulled = pull_take_export(source, str(take), out, part, writer, options)
         elif (
-            part.is_unrestricted
+            part.has_all_rows_and_columns
             and writer is PARQUET
             and not options.specified_names
             and clock_name == "node"
@@ -411,7 +411,7 @@ def _list_folder_sessions(data: Path, filters: SessionFilter) -> list[Mapping[st
     sessions, unreadable = folder.load_all()
     for session_id, error in unreadable.items():
         remark(f"session {session_id} is left out: {error}")
-    for stray in folder.find_strays():
+    for stray in folder.find_renamed_or_copied_sessions():
         remark(f"session folder {stray.name} is left out: {stray.error}")
 
     def complete(session: Session) -> Completeness:

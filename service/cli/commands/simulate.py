@@ -64,7 +64,7 @@ def simulate_command(
     slow for the scene's frame rate.
     """
     # Imported here: the physics imports numba, which would slow down `--help`.
-    from service.estimation.pipeline.model_set import check_model_selection
+    from service.estimation.pipeline.model_set import check_known_models_with_static
     from service.offline.calibration_lookup import find_calibration, replace_tiles
     from service.offline.simulation import SimulationOptions, run_simulation
     from service.rig.emulated_foot import make_injected_path
@@ -85,7 +85,7 @@ def simulate_command(
     )
     has_estimates = not no_estimates and the_scene.calibration != "none"
     if has_estimates:
-        check_model_selection(the_scene.models)
+        check_known_models_with_static(the_scene.models)
 
     def estimate() -> EstimateOptions:
         calibration = find_calibration(
@@ -95,7 +95,7 @@ def simulate_command(
             family=the_scene.emulation.family,
             on_progress=remark,
         )
-        return EstimateOptions(calibration, the_scene.models, OFFLINE_LAG_MS, exact=exact)
+        return EstimateOptions(calibration, the_scene.models, OFFLINE_LAG_MS, unquantized=exact)
 
     with show_progress(f"simulating {the_scene.name}"):
         result = run_simulation(

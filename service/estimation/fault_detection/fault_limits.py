@@ -17,7 +17,7 @@ from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration
 from service.estimation.fault_detection import baseline_loss
 from service.estimation.fault_detection import stuck as stuck_readings
-from service.estimation.tare.tare import Tare, compute_thermal_shift_kpa
+from service.estimation.tare.tare import Tare, compute_sealed_gas_shift_kpa
 
 UNLOADED_BAND_SIGMAS = 4.0
 """Distance from the baseline within which a tile is unloaded, in sigmas of a reading."""
@@ -74,9 +74,9 @@ def make_fault_limits(
         tare.noise_kpa, count_kpa, out=noise, where=(count_kpa > 0.0) & np.isfinite(tare.noise_kpa)
     )
     unloaded_kpa = UNLOADED_BAND_SIGMAS * np.hypot(tare.noise_kpa, tare.baseline_sigma_kpa)
-    per_count = compute_thermal_shift_kpa(tare, np.ones(len(tiles)) / TADC_PER_KELVIN)[bearing]
+    per_count = compute_sealed_gas_shift_kpa(tare, np.ones(len(tiles)) / TADC_PER_KELVIN)[bearing]
     for at, column in enumerate(bearing):
-        entry = calibration.find_tile(tiles[column].serial)
+        entry = calibration.find_tile_or_preset(tiles[column].serial)
         if entry is not None and entry.effects.temperature is not None:
             per_count[at] = entry.effects.temperature.kpa_per_k.value / TADC_PER_KELVIN
     return FaultLimits(

@@ -24,7 +24,7 @@ from devices.jit import jit_cached
 from service.estimation.effects import FLOW_FRACTION_MAX, FLOW_STRESS_MIN_N
 from service.estimation.fitting.rig.loading import LoadingPoints
 from service.estimation.models.flow import step_branch_stress
-from service.estimation.models.hysteresis import WIDTHS_N, step_play
+from service.estimation.models.hysteresis import WIDTHS_N, step_play_closed_at_zero_load
 from service.estimation.models.rubber import compute_creep_weights
 
 _NEWTON_STEPS = 30  # a bound; it ends when a step is below `_CLOSE`
@@ -204,7 +204,7 @@ def compute_dome_response(
             apparent -= creep_fraction[m] * (force_n[i] - crept[m])
         lag = 0.0
         for m in range(len(play_weights)):
-            plays[m] = step_play(apparent, play_widths_n[m], plays[m])
+            plays[m] = step_play_closed_at_zero_load(apparent, play_widths_n[m], plays[m])
             lag += play_weights[m] * (plays[m] - apparent)
         apparent += lag
         if flow_part > 0.0:

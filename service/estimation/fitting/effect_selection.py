@@ -67,7 +67,7 @@ def fit_significant_effects(
         refused["temperature"] = refused["ambient"] = temperature_effect
     else:
         temperature = temperature_effect
-    wall_per_kpa = Effects(temperature=temperature).wall_compliance_per_kpa
+    wall_per_kpa = Effects(temperature=temperature).wall_compliance_or_default_per_kpa
     static = DomeModel(initial_curve, scale_kpa, baseline_kpa, wall_per_kpa)
     problem = OutputErrorProblem(points, static)
     parts = FittedEffects(
@@ -87,7 +87,7 @@ def fit_significant_effects(
             refused[name] = why
     if parts.terms:
         fit = _select_creep_terms(problem, parts, fit)
-    misfits, model, sigma = problem.compute_misfits(fit), fit.model, fit.sigma
+    misfits, model, sigma = problem.compute_relative_correction_misfits(fit), fit.model, fit.sigma
     gas = rubber = hysteresis = None
     if "gamma" in sigma:
         (gamma,) = _make_parameters([model.gamma], sigma["gamma"])
@@ -155,9 +155,9 @@ def _compute_p_value(problem: OutputErrorProblem, more: DomeFit, less: DomeFit) 
     Twice the logarithm of the ratio is chi squared with the difference of their numbers of unknowns
     (Wilks 1938). Standard uncertainties would not do: time and gamma of a fast gas compensate.
     """
-    better = problem.compute_cost(less.model, more.scatter) - problem.compute_cost(
-        more.model, more.scatter
-    )
+    better = problem.compute_pressure_and_gain_cost(
+        less.model, more.scatter
+    ) - problem.compute_pressure_and_gain_cost(more.model, more.scatter)
     return float(chdtrc(more.n_unknowns - less.n_unknowns, max(better, 0.0)))
 
 

@@ -24,7 +24,7 @@ from service.estimation.fitting.effect_selection import fit_significant_effects
 from service.estimation.fitting.rig.indentation import (
     Indentation,
     ThermalSoak,
-    extract_soak,
+    extract_soak_or_empty,
     measure_initial_unloaded,
     select_loaded,
 )
@@ -58,13 +58,16 @@ def fit_determined_effects(
         np.mean([measure_initial_unloaded(each).noise_kpa for each in select_loaded(recordings)])
     )
     soaked = _select_best_soak(
-        [fit_temperature_effect(extract_soak(recording, noise_kpa)) for recording in recordings]
+        [
+            fit_temperature_effect(extract_soak_or_empty(recording, noise_kpa))
+            for recording in recordings
+        ]
     )
     effects = fit_significant_effects(
         points,
         scale_kpa=tile.range_kpa[1],
         baseline_kpa=baseline_kpa,
-        initial_curve=convert_centred_cubic_to_c1_c2_c3(tile.coefficients),
+        initial_curve=_convert_centred_cubic_to_c1_c2_c3(tile.coefficients),
         temperature_effect=soaked,
         reference_delay=reference_delay,
     )
@@ -87,7 +90,7 @@ def _subtract_recovery(
     recording: Indentation, pressed: Sequence[Indentation], noise_kpa: float, model: DomeModel
 ) -> ThermalSoak:
     """Return a recording's soak less the dome's recovery from the loads before it."""
-    soaking = extract_soak(recording, noise_kpa)
+    soaking = extract_soak_or_empty(recording, noise_kpa)
     if not len(soaking.t_s):
         return soaking
     soak_ns = recording.t_ns[recording.phase == "soak"]
@@ -135,10 +138,12 @@ def _make_dome_model(effects: Effects, tile: TileCalibration, baseline_kpa: floa
         baseline_kpa: absolute pressure unloaded.
     """
     gas, rubber, loop = effects.gas, effects.rubber, effects.hysteresis
-    curve = convert_centred_cubic_to_c1_c2_c3(
+    curve = _convert_centred_cubic_to_c1_c2_c3(
         tile.coefficients if rubber is None else rubber.coefficients
     )
-    model = DomeModel(curve, tile.range_kpa[1], baseline_kpa, effects.wall_compliance_per_kpa)
+    model = DomeModel(
+        curve, tile.range_kpa[1], baseline_kpa, effects.wall_compliance_or_default_per_kpa
+    )
     if gas is not None:
         model = replace(model, gamma=gas.gamma.value, tau_s=gas.tau_s.value)
     if rubber is not None:
@@ -194,7 +199,7 @@ def collect_loadings(recordings: Sequence[Indentation]) -> TileLoadings:
     return TileLoadings(join_loading_points(parts), baseline_kpa)
 
 
-def convert_centred_cubic_to_c1_c2_c3(coefficients: Sequence[float]) -> Floats:
+def _convert_centred_cubic_to_c1_c2_c3(coefficients: Sequence[float]) -> Floats:
     """Convert a cubic in u = 2 x - 1 to c1, c2, c3 in x = gauge / range."""
     return np.asarray(np.linalg.solve(_U_OF_X, np.array(coefficients[1:])))
 
@@ -226,7 +231,7 @@ class ReplaySection:
     modelled_kpa: Floats
 
 
-def replay_release_and_tap(
+def simulate_release_and_tap_pressure(
     recordings: Sequence[Indentation], tile: TileCalibration
 ) -> dict[str, ReplaySection]:
     """Replay a "release" and a "tap" of the tile with its models; empty without any.
@@ -239,10 +244,10 @@ def replay_release_and_tap(
     effects = tile.effects
     # The mean curve of slow strokes contains creep and loop.
     static = DomeModel(
-        convert_centred_cubic_to_c1_c2_c3(tile.coefficients),
+        _convert_centred_cubic_to_c1_c2_c3(tile.coefficients),
         tile.range_kpa[1],
         baseline_kpa,
-        effects.wall_compliance_per_kpa,
+        effects.wall_compliance_or_default_per_kpa,
     )
     model = _make_dome_model(effects, tile, baseline_kpa)
     late_s = effects.reference_late_s

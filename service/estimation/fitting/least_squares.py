@@ -21,7 +21,11 @@ import numpy as np
 from scipy.special import stdtrit
 
 from devices.arrays import Bools, Floats
-from service.estimation.calibration import CUBIC_TERMS, TileCalibration, compute_relative_loop_width
+from service.estimation.calibration import (
+    CUBIC_TERMS,
+    TileCalibration,
+    compute_share_of_final_loop_width,
+)
 
 _STEPS = 60  # a bound; a good start needs ten
 COST_TOLERANCE = 1e-4
@@ -174,7 +178,7 @@ def compute_new_loading_half_width_95_n(tile: TileCalibration, gauge_kpa: Floats
     variance = (
         _compute_mean_variance(tile, gauge_kpa)
         + (tile.relative_misfit * force_n) ** 2
-        + (tile.loop_misfit_n * compute_relative_loop_width(force_n)) ** 2
+        + (tile.loop_misfit_n * compute_share_of_final_loop_width(force_n)) ** 2
     )
     return compute_student_t_95(tile.repeats) * np.sqrt(variance)
 

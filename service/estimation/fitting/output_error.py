@@ -216,7 +216,7 @@ class OutputErrorProblem:
             unsure[name] = float(np.sqrt(variance / square)) if square > 0.0 else 0.0
         return unsure
 
-    def compute_misfits(self, fit: DomeFit) -> CorrectionMisfits:
+    def compute_relative_correction_misfits(self, fit: DomeFit) -> CorrectionMisfits:
         """Compute the fit's residual errors relative to the corrections."""
         rows, points, model = self._usable, self._points, fit.model
         gauge_kpa = fit.response.kpa - model.baseline_kpa
@@ -289,7 +289,7 @@ class OutputErrorProblem:
         )
         return float(np.abs((heated_kpa - settled_kpa) * slope).max())
 
-    def compute_cost(self, model: DomeModel, scatter: float) -> float:
+    def compute_pressure_and_gain_cost(self, model: DomeModel, scatter: float) -> float:
         """Compute the sum of squared residuals."""
         off = self.compute_pressure_and_gain_residuals(model, scatter)
         return float(off @ off)

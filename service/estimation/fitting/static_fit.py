@@ -19,7 +19,7 @@ from service.estimation.calibration import (
     BandPoint,
     RigFacts,
     TileCalibration,
-    compute_relative_loop_width,
+    compute_share_of_final_loop_width,
     is_increasing_cubic,
 )
 from service.estimation.fitting.least_squares import (
@@ -29,7 +29,7 @@ from service.estimation.fitting.least_squares import (
     compute_new_loading_half_width_95_n,
 )
 from service.estimation.fitting.rig.checks import (
-    check_baseline_drift_kpa,
+    check_baseline_drift_between_repeats_kpa,
     reject_contradictions,
     reject_no_load_or_single_repeat,
     reject_poor_fit,
@@ -81,7 +81,7 @@ def fit_static_curve(*recordings: Indentation) -> TileCalibration:
     reject_saturated_reference(recordings, blocks)
     blocks, by_chip = select_before_saturation(recordings, blocks, noise_kpa)
     reject_no_load_or_single_repeat(blocks, where)
-    drift_kpa = check_baseline_drift_kpa(recordings)
+    drift_kpa = check_baseline_drift_between_repeats_kpa(recordings)
     # The mean end of the repeats: beyond it there is little data.
     high_kpa = float(np.mean(_repeat_maxima(blocks, blocks.gauge_kpa)))
     cubic = _Cubic(high_kpa)
@@ -221,7 +221,7 @@ def _fit_misfit(force_n: Floats, residual_n: Floats) -> tuple[float, float]:
     so that small loads count as much as large ones.
     """
     weight = 1.0 / (force_n**2 + LOOP_HALF_WIDTH_FORCE_N**2)
-    parts = np.stack([force_n**2, compute_relative_loop_width(force_n) ** 2], axis=1)
+    parts = np.stack([force_n**2, compute_share_of_final_loop_width(force_n) ** 2], axis=1)
     variances, _ = nnls(parts * weight[:, None], residual_n**2 * weight)
     relative, loop = np.sqrt(variances)
     return float(relative), float(loop)

@@ -51,7 +51,7 @@ def compute_hull_half_planes(positions_m: Floats) -> HalfPlanes:
     return HalfPlanes(normals, (positions_m @ normals.T).max(axis=0, initial=-np.inf))
 
 
-def compute_grid_indices(
+def compute_grid_indices_from_1(
     positions_m: Floats,
 ) -> tuple[Floats, Floats] | None:
     """Return each tile's index along x and y, from 1 (paper eq. 4); None if they fill no grid.
@@ -120,7 +120,7 @@ class ServoReading(KernelRecord):
 
 
 @jit_inlined
-def store_servo_reading(
+def store_servo_reading_and_flag_wraps(
     readings: RecordArray[ServoReading],
     i: int,
     t_ns: int,

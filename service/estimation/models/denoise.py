@@ -73,7 +73,7 @@ def allocate_scratch() -> WindowScratch:
 
 
 @jit_inlined
-def find_window_rows(
+def find_oldest_and_newest_window_rows(
     frame_t_ns: Times,
     i: int,
     first: int,
@@ -120,7 +120,7 @@ def denoise_sample(
         i: row.
         j: column.
         at_ns: instant at which the fitted curve is evaluated.
-        rows: oldest and newest that windows may reach, from `find_window_rows`.
+        rows: oldest and newest that windows may reach, from `find_oldest_and_newest_window_rows`.
         variance_inflation: (`WINDOW_READINGS_MAX` + 1,), variance of a mean of n readings over that
             of white noise.
         within: rows that windows may reach: `ALL_ROWS`, or those of the sum of tiles.

@@ -75,12 +75,12 @@ def compensate_hysteresis(
     found = _solve_force(apparent_n, params.play_weights, state.plays_n)
     force = found if math.isnan(state_override_n) else state_override_n
     for m in range(PLAYS):
-        state.plays_n[m] = step_play(force, WIDTHS_N[m], state.plays_n[m])
+        state.plays_n[m] = step_play_closed_at_zero_load(force, WIDTHS_N[m], state.plays_n[m])
     return found
 
 
 @jit_cached
-def step_play(force_n: float, half_width_n: float, before: float) -> float:
+def step_play_closed_at_zero_load(force_n: float, half_width_n: float, before: float) -> float:
     """Return a play after a force; it lags behind by no more than its width allows."""
     half = min(half_width_n, LOOP_OPENING * max(force_n, 0.0))
     return min(max(before, force_n - half), force_n + half)
@@ -99,7 +99,9 @@ def _solve_force(apparent: float, weights: Floats, plays: Floats) -> float:
     for _ in range(_ITERATIONS):
         value, slope = force, 1.0
         for m in range(PLAYS):
-            value += weights[m] * (step_play(force, WIDTHS_N[m], plays[m]) - force)
+            value += weights[m] * (
+                step_play_closed_at_zero_load(force, WIDTHS_N[m], plays[m]) - force
+            )
             slope += weights[m] * _play_slope(force, WIDTHS_N[m], plays[m])
         if value > apparent:
             high = force

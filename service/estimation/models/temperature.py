@@ -146,7 +146,7 @@ def compute_gas_temperatures(
 
 
 @jit_cached
-def refer_to_tare_temperature(
+def refer_to_tare_temperature_with_sigma(
     params: TemperatureParams,
     state: TemperatureState,
     kpa: float,

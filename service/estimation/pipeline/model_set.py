@@ -83,7 +83,7 @@ class ModelSet:
     rubber_misfit: Floats
 
 
-def make_model_set(
+def make_checked_model_set(
     info: ArrayInfo, calibration: Calibration, tare: Tare, models: Sequence[str]
 ) -> ModelSet:
     """Compute the parameters of the models named.
@@ -92,9 +92,9 @@ def make_model_set(
         UsageError: an unknown model, no `static`, or `ambient` without a bare tile.
         CalibrationError: a bearing tile is not calibrated, or not for one of the models.
     """
-    check_model_selection(models)
+    check_known_models_with_static(models)
     bearing = [tile for tile in info.tiles if not tile.reference]
-    tiles = calibration.get_tiles([tile.serial for tile in bearing])
+    tiles = calibration.get_tiles_or_preset([tile.serial for tile in bearing])
     columns = np.array([i for i, tile in enumerate(info.tiles) if not tile.reference])
     for name in ("temperature", "ambient", "gas", "rubber", "hysteresis"):
         if name in models:
@@ -125,7 +125,7 @@ def make_model_set(
     )
 
 
-def check_model_selection(models: Sequence[str]) -> None:
+def check_known_models_with_static(models: Sequence[str]) -> None:
     """Reject unknown models, and a selection without `static`.
 
     Raises:
@@ -200,7 +200,7 @@ def _make_gas(tiles: Sequence[TileCalibration], baseline_kpa: Floats) -> GasMode
     return GasModel(
         gamma=np.array([gamma if effect is None else effect.gamma.value for effect in found]),
         tau_s=np.array([tau_s if effect is None else effect.tau_s.value for effect in found]),
-        wall_per_kpa=np.array([tile.effects.wall_compliance_per_kpa for tile in tiles]),
+        wall_per_kpa=np.array([tile.effects.wall_compliance_or_default_per_kpa for tile in tiles]),
         baseline_kpa=baseline_kpa,
     )
 
@@ -243,7 +243,9 @@ def _collect_misfits(
 
 
 def _make_ambient(tiles: Sequence[TileCalibration], baseline_kpa: Floats) -> AmbientModel:
-    give = np.array([tile.effects.wall_compliance_per_kpa for tile in tiles]) * baseline_kpa
+    give = (
+        np.array([tile.effects.wall_compliance_or_default_per_kpa for tile in tiles]) * baseline_kpa
+    )
     found = [effect for tile in tiles if (effect := tile.effects.temperature) is not None]
     wall = [e.wall_per_kpa for e in found]
     relative = max((w.sigma / w.value if w.value > 0.0 else 1.0 for w in wall), default=1.0)

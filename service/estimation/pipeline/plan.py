@@ -22,13 +22,13 @@ from service.estimation.fault_detection.fault_limits import FaultLimits, make_fa
 from service.estimation.foot.contact import ContactThresholds
 from service.estimation.foot.geometry import (
     HalfPlanes,
-    compute_grid_indices,
+    compute_grid_indices_from_1,
     compute_hull_half_planes,
     compute_tilt_loss,
     fit_tile_axis_angles_rad,
 )
 from service.estimation.models import denoise
-from service.estimation.pipeline.model_set import MODEL_NAMES, ModelSet, make_model_set
+from service.estimation.pipeline.model_set import MODEL_NAMES, ModelSet, make_checked_model_set
 from service.estimation.pipeline.saturation import SaturationBounds, make_saturation_bounds
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded_windows import compute_variance_inflation
@@ -145,8 +145,8 @@ def make_plan(
     bearing = np.flatnonzero([not tile.reference for tile in info.tiles])
     if not len(bearing):
         raise UsageError("every tile of the array is a reference tile: nothing bears load")
-    model_set = make_model_set(info, calibration, tare, models)
-    entries = calibration.get_tiles([info.tiles[i].serial for i in bearing])
+    model_set = make_checked_model_set(info, calibration, tare, models)
+    entries = calibration.get_tiles_or_preset([info.tiles[i].serial for i in bearing])
     for i, entry in zip(bearing, entries, strict=True):
         tile = info.tiles[i]
         if entry.coefficient_words not in (None, tile.coefficient_words):
@@ -214,7 +214,7 @@ def make_plan(
         tilt_loss=compute_tilt_loss(axis_rad),
         shear=None if calibration.mounted is None else calibration.mounted.shear,
         hull=compute_hull_half_planes(positions_m[bearing, :2]),
-        grid=compute_grid_indices(positions_m[bearing, :2]),
+        grid=compute_grid_indices_from_1(positions_m[bearing, :2]),
         contact=ContactThresholds(
             on_n=CONTACT_ON_SIGMA * unloaded_n,
             off_n=CONTACT_OFF_SIGMA * unloaded_n,

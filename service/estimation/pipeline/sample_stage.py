@@ -31,13 +31,13 @@ from service.estimation.fault_detection.clipping import update_clipping_limit_kp
 from service.estimation.fault_detection.stuck import update_stuck_and_toggles
 from service.estimation.fault_detection.thermal_drift import update_thermal_drift_kpa
 from service.estimation.foot.contact import update_candidate
-from service.estimation.foot.geometry import store_servo_reading
+from service.estimation.foot.geometry import store_servo_reading_and_flag_wraps
 from service.estimation.models import gas
 from service.estimation.models.ambient import low_pass_ambient_kpa
 from service.estimation.models.denoise import WINDOW_READINGS_MAX, is_outlier
 from service.estimation.models.skew import interpolate_to_frame
 from service.estimation.models.static import compute_force_slope_sigma
-from service.estimation.models.temperature import refer_to_tare_temperature
+from service.estimation.models.temperature import refer_to_tare_temperature_with_sigma
 from service.estimation.pipeline.params import FootParams, KernelParams, TileParams
 from service.estimation.pipeline.plan import SUCTION_MAX_KPA, TARE_OLD_NS
 from service.estimation.pipeline.saturation import (
@@ -228,7 +228,7 @@ def _compute_apparent_force(
     if foot_params.has_temperature == 1:
         is_read = sample.temperature_raw != NOT_READ
         counts = float(sample.temperature_raw) if is_read else math.nan
-        kpa, sigma_kpa = refer_to_tare_temperature(
+        kpa, sigma_kpa = refer_to_tare_temperature_with_sigma(
             tile_params.temperature, tile_state.temperature, kpa, counts, t_ns
         )
         variance += sigma_kpa**2
@@ -388,7 +388,7 @@ def append_frames_to_buffer(
         foot_state.run_count += row.after_gap
         buffer.run[i] = foot_state.run_count
         if foot_params.has_servo == 1:
-            store_servo_reading(
+            store_servo_reading_and_flag_wraps(
                 buffer.readings, i, now_ns, int(servo_counts[k]), int(servo_age_us[k]),
                 frame_flags[k], foot_params.counts_per_turn, gap,
             )  # fmt: skip

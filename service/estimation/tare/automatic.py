@@ -17,14 +17,14 @@ import numpy as np
 from devices.arrays import Bools, Times
 from devices.errors import TareError
 from devices.frames import NOT_READ, FrameBatch
-from service.estimation.tare.tare import Tare, compute_thermal_shift_kpa, compute_warming_k
+from service.estimation.tare.tare import Tare, compute_sealed_gas_shift_kpa, compute_warming_k
 from service.estimation.tare.unloaded_windows import (
     FRAMES_MIN,
     LOADED_KPA,
     NEAR_BASELINE_KPA,
     TareFrames,
     compute_nonempty_window_starts,
-    select_lowest_windows,
+    select_windows_lowest_in_every_tile,
 )
 
 HISTORY_NS = 10_000_000_000  # a foot that walks is in the air within that time
@@ -65,7 +65,9 @@ def compute_newest_unloaded_tare(
     usual_kpa = recent.rig_noise_kpa
     if present is not None:
         usual_kpa = np.where(np.isnan(usual_kpa), present.noise_kpa, usual_kpa)
-    floor_kpa = recent.compute_rounding_sigma_kpa(np.nanmedian(frames.temperature_raw, axis=0))
+    floor_kpa = recent.compute_reading_rounding_sigma_kpa(
+        np.nanmedian(frames.temperature_raw, axis=0)
+    )
     steps_kpa = np.maximum(recent.step_noise_kpa, floor_kpa)
     usual_kpa = np.where(np.isnan(usual_kpa), steps_kpa, usual_kpa)
     window_ns = _compute_window_ns(since_ns)
@@ -81,7 +83,7 @@ def compute_newest_unloaded_tare(
             expected=f"{WINDOW_NS / 1e9:g} s at rest in the air",
             remedy="Lift the foot, hold it still for a second, and tare again",
         )
-    low = select_lowest_windows(windows)
+    low = select_windows_lowest_in_every_tile(windows)
     if not low:
         raise TareError(
             "no tile was unloaded while all others were, in the last seconds",
@@ -293,7 +295,7 @@ def _explain_excess_shift(
 ) -> str | None:
     """Return the reason why a baseline is too far from another one; None if it is near."""
     warming_k = compute_warming_k(other, tare.temperature_raw_counts)
-    explained_kpa = compute_thermal_shift_kpa(other, warming_k)
+    explained_kpa = compute_sealed_gas_shift_kpa(other, warming_k)
     shift_kpa = tare.baseline_kpa - other.baseline_kpa
     excess_kpa = np.abs(shift_kpa - explained_kpa) - THERMAL_SHIFT_UNCERTAINTY * np.abs(
         explained_kpa

@@ -129,7 +129,7 @@ def compute_warming_k(tare: Tare, temperature_counts: Floats) -> Floats:
     return np.asarray((temperature_counts - tare.temperature_raw_counts) / TADC_PER_KELVIN)
 
 
-def compute_thermal_shift_kpa(tare: Tare, warming_k: Floats) -> Floats:
+def compute_sealed_gas_shift_kpa(tare: Tare, warming_k: Floats) -> Floats:
     """Return the shift of a sealed bubble's baseline for a rise of temperature in kelvin."""
     return np.asarray(tare.baseline_kpa / SEAL_TEMPERATURE_K * warming_k)
 

@@ -165,7 +165,7 @@ class TareFrames:
         self.serials = serials
         self.kpa = compensation.compute_usable_kpa(self.frames)
         self.since_ns = frames.t_ns - frames.t_ns[:1]
-        entries = [calibration.find_tile(serial) for serial in serials]
+        entries = [calibration.find_tile_or_preset(serial) for serial in serials]
         self.rig_baseline_kpa = np.array(
             [e.baseline_kpa if e else None for e in entries], dtype=float
         )
@@ -240,7 +240,8 @@ class TareFrames:
         )
         # A perfectly quiet reading is still rounded to a count.
         noise_kpa = np.maximum(
-            np.nanstd(kpa, axis=0, ddof=1), self.compute_rounding_sigma_kpa(temperature_raw_counts)
+            np.nanstd(kpa, axis=0, ddof=1),
+            self.compute_reading_rounding_sigma_kpa(temperature_raw_counts),
         )
         t_s = self.since_ns[rows] * 1e-9
         noise = fit_correlated_noise(kpa)
@@ -259,7 +260,7 @@ class TareFrames:
             noise_lasting_s=noise.decay_readings * float(np.median(np.diff(t_s))),
         )
 
-    def compute_rounding_sigma_kpa(self, temperature_counts: Floats) -> Floats:
+    def compute_reading_rounding_sigma_kpa(self, temperature_counts: Floats) -> Floats:
         """Return the standard uncertainty of rounding to a count, (tiles,)."""
         return self._compensation.compute_quantization_sigma_kpa(temperature_counts)
 
@@ -289,7 +290,9 @@ class TareFrames:
         Raises:
             TareError: a tile repeated one count, as a stuck chip does.
         """
-        count_kpa = np.sqrt(12.0) * self.compute_rounding_sigma_kpa(tare.temperature_raw_counts)
+        count_kpa = np.sqrt(12.0) * self.compute_reading_rounding_sigma_kpa(
+            tare.temperature_raw_counts
+        )
         readable = np.isfinite(self.kpa[rows])
         for i in np.flatnonzero(~(self.rig_noise_kpa <= STUCK_SCATTER_MAX_COUNTS * count_kpa)):
             pressure_raw = self.frames.pressure_raw[rows][readable[:, i], i]
@@ -326,7 +329,7 @@ def compute_nonempty_window_starts(
     return np.asarray(begins_ns[(begins_ns >= 0) & (begins_ns <= since_ns[-1])], dtype=np.int64)
 
 
-def select_lowest_windows(windows: list[QuietWindow]) -> list[QuietWindow]:
+def select_windows_lowest_in_every_tile(windows: list[QuietWindow]) -> list[QuietWindow]:
     """Return the windows in which no tile exceeds the lowest window by more than chance."""
     lowest_kpa = np.min([window.mean_kpa for window in windows], axis=0, initial=np.inf)
     return [
@@ -411,7 +414,7 @@ def _find_unloaded_rows(seen: TareFrames, calibration: Calibration) -> slice:
         for window in windows
         if not (np.abs(window.mean_kpa - seen.rig_baseline_kpa) >= NEAR_BASELINE_KPA).any()
     ]
-    low = select_lowest_windows(near)
+    low = select_windows_lowest_in_every_tile(near)
     if not low:
         raise TareError(
             "no interval can be recognised as unloaded",

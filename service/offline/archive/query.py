@@ -51,7 +51,7 @@ from storage.sessions.metadata import (
     StoredMetadata,
     parse_session_metadata,
     read_bytes_or_none,
-    read_markers,
+    read_existing_markers,
 )
 from storage.sessions.stances import STANCE_SCHEMA, STANCES_NAME
 
@@ -257,7 +257,7 @@ def _read_markers(session: SealedSession) -> list[dict[str, Any]]:
     if whole is not None:
         return [event.model_dump() for event in whole.markers]
     try:  # one that was pulled
-        stored = read_markers(session.folder / MARKERS_NAME)
+        stored = read_existing_markers(session.folder / MARKERS_NAME)
     except FileNotFoundError:
         return []
     return [event.model_dump() for event in stored]

@@ -162,7 +162,7 @@ class EstimateTask(EstimateRequest):
     def _complete_result(
         self, source: Path, work: Path, made: EstimateResult, remarks: list[str]
     ) -> dict[str, Any]:
-        if source.is_dir() and self.part.is_unrestricted:
+        if source.is_dir() and self.part.has_all_rows_and_columns:
             _copy_session_files(source, work)
         return {
             "frames": made.frame_count,

@@ -126,7 +126,7 @@ def compute_estimation_range(
         UsageError: the part begins after the session's end.
         FileFormatError: the file is damaged.
     """
-    first_ns, last_ns = session.read_span_ns()
+    first_ns, last_ns = session.read_span_on_axis_ns()
     begin_ns, end_ns = part.compute_bounds_ns(first_ns)
     if begin_ns is not None and begin_ns > last_ns:
         raise UsageError(
@@ -179,7 +179,7 @@ def prepare_estimate(
         lag_ms=request.lag_ms,
         tare_s=request.tare_s,
         tares=_read_tares(session) if request.tare_s is None else (),
-        exact=request.exact,
+        unquantized=request.exact,
     )
     kept = tuple(
         c.name
@@ -236,7 +236,7 @@ def _find_calibration(
     where = str(session.path)
     serials = [tile.serial for tile in session.info.tiles if not tile.reference]
     if isinstance(wanted, Calibration):
-        wanted.get_tiles(serials)
+        wanted.get_tiles_or_preset(serials)
         return wanted
     inside = None
     if "calibration" in notes:

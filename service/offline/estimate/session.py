@@ -100,18 +100,18 @@ def estimate_session(
             frame; `out` is unchanged.
     """
     part = request.part
-    if not part.is_unrestricted and out.exists() and out.samefile(source):
+    if not part.has_all_rows_and_columns and out.exists() and out.samefile(source):
         raise UsageError(
             f"--out {str(out)!r} is the session itself, of which a part would be left",
             expected="another file",
         )
-    with SealedFileReader(source, only_slices=not part.is_unrestricted) as session:
+    with SealedFileReader(source, only_slices=not part.has_all_rows_and_columns) as session:
         what = prepare_estimate(session, request, on_remark)
-        begin_t_ns = session.read_span_ns()[0] if session.footer.rows_by_group else 0
+        begin_t_ns = session.read_span_on_axis_ns()[0] if session.footer.rows_by_group else 0
         notes, stretch = dict(session.notes), EstimationRange()
         if session.time_axis.is_shifted:  # the output may have no clock table beside it
             notes[TIME_AXIS_NOTE] = session.time_axis.to_json_list()
-        if not part.is_unrestricted:
+        if not part.has_all_rows_and_columns:
             options, stretch = _restrict_to_part(session, what.info, what.options, part)
             notes, what = (
                 _make_part_notes(session, notes, part, stretch),
@@ -127,7 +127,9 @@ def estimate_session(
         watched = given if judged is None else judged.observe(given, stream)
         frames = _write_estimates(out, what, notes, stream, watched, on_remark)
     if not frames or stream.plan is None:
-        problem = "the session has no frames" + ("" if part.is_unrestricted else " in that time")
+        problem = "the session has no frames" + (
+            "" if part.has_all_rows_and_columns else " in that time"
+        )
         raise FileFormatError(problem, where=str(source))
     found = () if judged is None else judged.finish(stream.plan)
     return EstimateResult(frames, stream.plan, begin_t_ns, *found)
@@ -171,7 +173,7 @@ def _write_estimates(
         for batch, extra in chain((first,), left):
             writer.append_frames(batch, extra)
             frames += len(batch)
-            stances.add_frames(batch.seq, batch.t_ns, extra)
+            stances.try_add_frames(batch.seq, batch.t_ns, extra)
     if out.name == FRAMES_NAME:  # in a session's folder
         stances.try_write_or_delete_file(out.parent, compute_sha256(out))
         if stances.problem is not None:
@@ -198,7 +200,9 @@ class _FindingsObserver:
             yield batch, extra
 
     def finish(self, plan: EstimationPlan) -> tuple[EstimateSummary, Mapping[str, float]]:
-        return self._found.finish_summary(plan), self._asking.compute_notable_mean_effects_n()
+        return self._found.finish_summary(
+            plan
+        ), self._asking.compute_notable_mean_grf_effects_by_model_n()
 
 
 def _restrict_to_part(
@@ -208,7 +212,7 @@ def _restrict_to_part(
     stream, tares = EstimateStream(info, options), options.tares
     if not tares:
         ordered = iterate_checking_order(session.read_batches(), where=str(session.path))
-        tares = (stream.find_tare(ordered),)
+        tares = (stream.find_tare_in_first_frames(ordered),)
     stretch = compute_estimation_range(session, part, stream.make_plan(tares[0]))
     if not stretch.axis.is_shifted:  # tares are on the node's time axis
         tares = select_tares_in_force(tares, stretch.run_from_ns)
@@ -251,7 +255,7 @@ def needs_chunks(source: Path, request: EstimateRequest, chunk_frames: int) -> b
     Raises:
         FileFormatError: the file is no session.
     """
-    if not request.part.is_unrestricted:
+    if not request.part.has_all_rows_and_columns:
         return False
     with SealedFileReader(source, only_slices=True) as session:
         return session.frame_count > chunk_frames and len(session.footer.rows_by_group) > 1
@@ -346,7 +350,7 @@ def join_chunks(
             _read_chunks(what, chunks_folder, pieces), where=str(source)
         )
         frames = _write_estimates(out, what, session.notes, stream, ordered, on_remark)
-        begin_t_ns = session.read_span_ns()[0]
+        begin_t_ns = session.read_span_on_axis_ns()[0]
     assert stream.plan is not None  # noqa: S101  # it goes on with one
     return EstimateResult(frames, stream.plan, begin_t_ns)
 

@@ -177,10 +177,10 @@ class RateGroup:
     """Subscribers of the same nodes at the same rate."""
 
     def __init__(
-        self, node_filter: str | None, rate_hz: float, nodes: Mapping[str, ServerNode]
+        self, frames_of_node: str | None, rate_hz: float, nodes: Mapping[str, ServerNode]
     ) -> None:
         self.subscribers: set[Subscriber] = set()
-        self._pending = PendingUpdate(node_filter)
+        self._pending = PendingUpdate(frames_of_node)
         self._has_pending = asyncio.Event()
         self._rate_hz = rate_hz
         self._nodes = nodes
@@ -234,16 +234,16 @@ class Broadcaster:
         return sum(len(feed.subscribers) for feed, _ in self._groups.values())
 
     def subscribe(
-        self, socket: SubscriberSocket, max_rate_hz: float, node_filter: str | None = None
+        self, socket: SubscriberSocket, max_rate_hz: float, frames_of_node: str | None = None
     ) -> Subscriber:
         """Add a subscriber to events from now on, of all nodes or one.
 
         Args:
             socket: websocket of the subscriber.
             max_rate_hz: greatest update rate, 1 to 60.
-            node_filter: node of interest; None: all.
+            frames_of_node: node of interest; None: all.
         """
-        key = node_filter, max(rate for rate in RATES_HZ if rate <= max_rate_hz)
+        key = frames_of_node, max(rate for rate in RATES_HZ if rate <= max_rate_hz)
         if key not in self._groups:
             feed = RateGroup(*key, self._nodes)
             self._groups[key] = feed, asyncio.create_task(feed.run())
@@ -259,7 +259,7 @@ class Broadcaster:
                 task.cancel()
                 del self._groups[key]
 
-    def queue_notice(self, message: Mapping[str, Any]) -> None:
+    def queue_droppable_notice(self, message: Mapping[str, Any]) -> None:
         """Queue a message to all subscribers for the next update."""
         if self._groups:
             text = encode_json(message)
@@ -279,21 +279,21 @@ class Broadcaster:
         for frames, columns in batches:
             node.published_t_ns = int(frames.t_ns[-1])
             span = summarize_force(frames, columns)
-            self.get_or_start_force_history(node).add_span(span)
+            self.get_present_stream_force_history(node).add_span(span)
             self._get_tile_history(node, frames.tile_count).add_frames(span, columns)
             if self._groups:
                 piece = summarize_frames(node.stream_id, span, frames, columns)
                 for summary in self._pending_updates():
-                    summary.add_summary(node.name, piece)
+                    summary.join_summary_or_drop_older(node.name, piece)
 
-    def get_or_start_force_history(self, node: ServerNode) -> ForceHistory:
+    def get_present_stream_force_history(self, node: ServerNode) -> ForceHistory:
         """Return the force history of a node's present stream, in place of another stream's."""
         recent = self._force_histories.get(node.name)
         if recent is None or recent.stream_id != node.stream_id:
             recent = self._force_histories[node.name] = ForceHistory(node.stream_id)
         return recent
 
-    def get_or_start_tile_history(self, node: ServerNode) -> TileHistory:
+    def get_present_stream_tile_history(self, node: ServerNode) -> TileHistory:
         """Return the tile history of a node's present stream, in place of another stream's."""
         return self._get_tile_history(node, len(node.last_info.tiles))
 

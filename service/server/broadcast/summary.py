@@ -58,7 +58,7 @@ class FrameSummary:
     force_min_n: Floats
     force_max_n: Floats
 
-    def join(self, later: FrameSummary) -> FrameSummary:
+    def join_extremes(self, later: FrameSummary) -> FrameSummary:
         """Return this summary and a later one as one."""
         return FrameSummary(
             stream_id=self.stream_id,
@@ -108,8 +108,8 @@ class PendingUpdate:
         node_filter: node of interest; None: all.
     """
 
-    def __init__(self, node_filter: str | None = None) -> None:
-        self._node_filter = node_filter
+    def __init__(self, frames_of_node: str | None = None) -> None:
+        self._node_filter = frames_of_node
         self._summaries: dict[str, FrameSummary] = {}
         self._last_seq: dict[str, tuple[str, int]] = {}
         self._dropped: dict[str, Intervals] = {}
@@ -124,7 +124,7 @@ class PendingUpdate:
         """Add a message for all; the oldest are dropped if they are not sent."""
         self._notices.append(message)
 
-    def add_summary(self, node: str, summary: FrameSummary) -> None:
+    def join_summary_or_drop_older(self, node: str, summary: FrameSummary) -> None:
         """Merge the summary of newer frames of a node, unless it is filtered out."""
         if self._node_filter not in (None, node):
             return
@@ -137,7 +137,7 @@ class PendingUpdate:
         if before is not None:
             short = 0 <= span.t_ns - before.span.t_ns_first < SUMMARY_NS
             if short and before.stream_id == summary.stream_id:
-                summary = before.join(summary)
+                summary = before.join_extremes(summary)
             else:
                 self._add_dropped(node, before.span.seq_first, before.span.seq)
         self._summaries[node] = summary
@@ -164,7 +164,7 @@ class PendingUpdate:
             for first, last in dropped:
                 self._add_dropped(node, first, last)
         for node, piece in update.summaries.items():
-            self.add_summary(node, piece)
+            self.join_summary_or_drop_older(node, piece)
 
     def _add_dropped(self, node: str, seq_first: int, seq_last: int) -> None:
         # Frames missed for hours are one interval, not a growing list.

@@ -14,12 +14,12 @@ from service.estimation.calibration import Calibration
 from service.estimation.compilation import is_compiling
 from service.estimation.tare.tare import (
     IntervalSource,
-    compute_thermal_shift_kpa,
+    compute_sealed_gas_shift_kpa,
     compute_warming_k,
     fit_recent_baseline_trend,
 )
 from service.server.estimates.live_estimator import TileRanges
-from service.server.estimates.tare_controller import AutoTare
+from service.server.estimates.tare_controller import AutoTareState
 from service.server.identities import RefusedMachine
 from service.server.node import ServerNode
 from service.server.recorder import Recorder
@@ -144,11 +144,13 @@ class DriftView(View):
         slope = unknown if live.ranges is None else live.ranges.slope_n_per_kpa
         warmer_by_k = (
             unknown
-            if live.tare is None
-            else compute_warming_k(live.tare, live.mean_recent_temperature_raw())
+            if live.usable_tare is None
+            else compute_warming_k(live.usable_tare, live.mean_recent_temperature_raw())
         )
         since_kpa = (
-            unknown if live.tare is None else compute_thermal_shift_kpa(live.tare, warmer_by_k)
+            unknown
+            if live.usable_tare is None
+            else compute_sealed_gas_shift_kpa(live.usable_tare, warmer_by_k)
         )
         # A bare tile has no sealed gas.
         since_kpa = np.where([tile.reference for tile in node.last_info.tiles], np.nan, since_kpa)
@@ -223,7 +225,7 @@ class NodeView(View):
         description="Reasons why the tare in force may no longer fit, as text: age, temperature, "
         "or a baseline that does not fit the foot in the air."
     )
-    auto_tare: AutoTare = Field(
+    auto_tare: AutoTareState = Field(
         description="State of automatic tares in flight. paused: a tare was undone, with no tare "
         "by hand since; off: the scene has `auto_tare = false`."
     )
@@ -262,7 +264,10 @@ class NodeView(View):
         info, estimates = node.last_info, node.estimator
         live, keeper = estimates.live, estimates.tare_controller
         calibration = live.calibration
-        tare, lost = estimates.tare_history.tare_in_force(info), node.present_stream_lost_by_reason
+        tare, lost = (
+            estimates.tare_history.tare_in_force_unless_lost(info),
+            node.present_stream_lost_by_reason,
+        )
         return cls(
             node=node.name,
             connected=node.is_connected,
@@ -281,9 +286,9 @@ class NodeView(View):
             calibration_source=estimates.calibration_source,
             calibration_problem=estimates.calibration_problem,
             tare=TareView.from_recorded(tare) if tare is not None else None,
-            tare_problem=keeper.problem,
+            tare_problem=keeper.missing_tare_reason,
             tare_warnings=keeper.list_warnings(),
-            auto_tare=keeper.auto_tare,
+            auto_tare=keeper.auto_tare_state,
             drift=DriftView.from_node(node),
             storage_problem=node.storage_problem,
             clock=None
@@ -296,9 +301,9 @@ class NodeView(View):
             rate_hz=node.rate_hz if node.is_connected else None,
             lost_frames=sum(lost.values()),
             lost=lost,
-            backlog_frames=node.backlog_frames,
+            backlog_frames=node.present_stream_backlog_frames,
             missed_slots=node.present_stream.missed_slots,
-            warnings=[*node.warnings, *node.refusal_warnings],
+            warnings=[*node.warnings, *node.frames_ahead_warnings],
             compiling=is_compiling(),
             fault_counts=node.fault_counts,
             last_seq=node.last_seq,
@@ -379,7 +384,7 @@ class SessionView(View):
             marker_count=len(session.markers),
             revision=user_fields_revision(session),
             max_lost_tail_frames=ledger.max_lost_tail_frames,
-            problem=recorder.find_problem(session),
+            problem=recorder.find_problem_to_show(session),
             duration_s=recorder.compute_duration_s(session, ledger.recorded),
         )
 

@@ -28,8 +28,8 @@ from storage.checksummed_json import read_checksummed_json, write_checksummed_js
 from storage.durable_files import (
     ASIDE_SUFFIX,
     make_synced_folder,
-    set_aside_and_describe,
     translate_storage_errors,
+    try_set_aside_and_describe,
 )
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
@@ -64,10 +64,8 @@ class CalibrationAssignment:
             if any(path.parent.glob(path.name + ASIDE_SUFFIX + "*")):
                 self.problem = f"the calibration that was assigned is lost: {_LOST}"
         except DamagedFileError as error:
-            self.problem = (
-                f"the calibration that was assigned is lost ({set_aside_and_describe(path, error)})"
-            )
-            self.problem += f": {_LOST}"
+            aside = try_set_aside_and_describe(path, error)
+            self.problem = f"the calibration that was assigned is lost ({aside}): {_LOST}"
         except StorageError as error:
             self.problem = f"the calibration that was assigned cannot be read: {error}"
 
@@ -110,7 +108,7 @@ def _read_assignment(path: Path) -> AssignedCalibration | None:
         if document["calibration"] is None:
             return None
         content = json.dumps(document["calibration"])
-        calibration = Calibration.from_json(content, where=str(path))
+        calibration = Calibration.from_json_marking_unproven(content, where=str(path))
         return AssignedCalibration(calibration, int(document["t_ns"]))
     except (CalibrationError, ValueError, KeyError, TypeError, RecursionError) as error:
         what = " ".join(str(error).split())[:200]
@@ -150,7 +148,7 @@ class NodeEstimator:
         return self._hello.array_info
 
     @property
-    def problems(self) -> list[str]:
+    def file_problems(self) -> list[str]:
         """Damage found in the files, and the consequence, as text."""
         texts = (self.tare_history.problem, self.assignment.problem)
         return [problem for problem in texts if problem is not None]
@@ -180,7 +178,7 @@ class NodeEstimator:
         )
         return self.assignment.problem or self.live.calibration_problem or node_problem
 
-    def epochs_of(self, stream_id: str) -> tuple[EstimateEpoch, ...]:
+    def epochs_since_server_start(self, stream_id: str) -> tuple[EstimateEpoch, ...]:
         """Return the epochs of a stream since the server was started, in order."""
         if stream_id == self.live.info.stream_id:
             return tuple(self.live.epochs)
@@ -223,10 +221,10 @@ class NodeEstimator:
         if not is_same or self._has_failed:
             self._restart()
 
-    def feed_frames(self, frames: FrameBatch) -> list[EstimatedBatch]:
+    def estimate_or_pass_frames(self, frames: FrameBatch) -> list[EstimatedBatch]:
         """Add the next frames of the present stream; return those whose estimates are due."""
         try:
-            return list(self.live.feed_frames(frames))
+            return list(self.live.estimate_or_pass_frames(frames))
         except Exception as error:
             self._disable(error)
             return [(frames, {})]

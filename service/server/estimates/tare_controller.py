@@ -23,7 +23,7 @@ from service.estimation.tare.automatic import (
 )
 from service.estimation.tare.tare import (
     Tare,
-    compute_thermal_shift_kpa,
+    compute_sealed_gas_shift_kpa,
     compute_warming_k,
     has_temperature_changed,
 )
@@ -38,7 +38,7 @@ LEAD_TIMEOUT_NS = 10_000_000_000
 """Timeout for missing frames of a lead after its end."""
 _BY_HAND = "lift the foot, hold it still, and tare"
 
-AutoTare = Literal["on", "paused", "off"]
+AutoTareState = Literal["on", "paused", "off"]
 
 
 class TareController:
@@ -67,24 +67,28 @@ class TareController:
         self._next_check_t_ns = 0
 
     @property
-    def auto_tare(self) -> AutoTare:
+    def auto_tare_state(self) -> AutoTareState:
         """State of automatic tares: off by the scene, or paused by an undo."""
         if not self._automatic:
             return "off"
         return "paused" if self._history.is_automatic_paused(self._info) else "on"
 
     @property
-    def problem(self) -> str | None:
+    def missing_tare_reason(self) -> str | None:
         """Reason why there is no tare, or why it is not of this stream."""
         if self._lead_problem is not None:
             return f"the lead gave no tare ({self._lead_problem}): {_BY_HAND}"
         if self._history.is_tare_lost(self._info):
             return f"the tare in force is damaged and lost, so no force is known: {_BY_HAND}"
-        return f"not tared: {_BY_HAND}" if self._history.tare_in_force(self._info) is None else None
+        return (
+            f"not tared: {_BY_HAND}"
+            if self._history.tare_in_force_unless_lost(self._info) is None
+            else None
+        )
 
     def list_warnings(self) -> list[str]:
         """Return the reasons why the tare in force may no longer fit, as text."""
-        tare, newest_t_ns = self._live.tare, self._live.newest_t_ns
+        tare, newest_t_ns = self._live.usable_tare, self._live.newest_t_ns
         if tare is None or newest_t_ns is None:
             return []
         texts = []
@@ -109,7 +113,7 @@ class TareController:
         warmer = compute_warming_k(tare, temperature_raw)
         mean_k = float(warmer[tiles].mean())
         who = f"tile {self._info.serials[tiles[0]]} is" if len(tiles) == 1 else "the tiles are"
-        shift_n = self._live.grf_shift_n(compute_thermal_shift_kpa(tare, warmer))
+        shift_n = self._live.grf_shift_n(compute_sealed_gas_shift_kpa(tare, warmer))
         effect = "" if shift_n is None else f", about {shift_n:+.1f} N on the foot"
         return (
             f"{who} {abs(mean_k):.1f} K {'warmer' if mean_k > 0 else 'colder'} than when tared"
@@ -129,11 +133,11 @@ class TareController:
         self._put_in_force(recorded)
         return recorded
 
-    def undo_tare(self, tare_id: str) -> None:
+    def undo_any_tare_and_pause_automatic(self, tare_id: str) -> None:
         """Undo a tare; the one before is in force again.
 
         Raises:
-            UnknownError, StorageError: as for `TareHistory.undo_tare`.
+            UnknownError, StorageError: as for `TareHistory.undo_any_tare_and_pause_automatic`.
         """
         self._history.undo_tare(tare_id)
         self._flight_warning = None
@@ -153,7 +157,7 @@ class TareController:
             return
         if not self._is_lead_done and journal is not None:
             self._tare_from_lead(journal, get_obtainable)
-        if self._is_flight_check_due() and self.auto_tare == "on":
+        if self._is_flight_check_due() and self.auto_tare_state == "on":
             self._tare_in_flight()
 
     def _tare_from_lead(self, journal: Journal, get_obtainable: Callable[[], Intervals]) -> None:
@@ -185,7 +189,7 @@ class TareController:
         except TareError as error:
             self._is_lead_done, self._lead_problem = True, error.what
             return
-        keys = {(t.tare.source, t.tare.t_ns) for t in self._history.all_tares}
+        keys = {(t.tare.source, t.tare.t_ns) for t in self._history.all_tares_with_undone}
         # In the history, or lost: the server was restarted, and another tare may have followed.
         is_older = not self._has_seen_lead and self._history.may_have_lost_tare(tare.t_ns)
         if ("lead", tare.t_ns) not in keys and not is_older:
@@ -197,9 +201,9 @@ class TareController:
         t_ns = live.newest_t_ns
         if t_ns is None or t_ns < self._next_check_t_ns:
             return False
-        if live.tare is not None:
+        if live.usable_tare is not None:
             free_t_ns = live.airborne_since_t_ns
-            if t_ns - live.tare.t_ns < TARE_INTERVAL_MIN_NS or free_t_ns is None:
+            if t_ns - live.usable_tare.t_ns < TARE_INTERVAL_MIN_NS or free_t_ns is None:
                 return False
             if t_ns - free_t_ns < RECOVERY_NS + WINDOW_NS:
                 return False
@@ -207,7 +211,7 @@ class TareController:
         return True
 
     def _tare_in_flight(self) -> None:
-        anchor = self._history.last_non_automatic_or_oldest(self._info)
+        anchor = self._history.last_not_in_flight_or_oldest(self._info)
         found: FlightTareResult = self._live.find_flight_tare(
             anchor.tare if anchor is not None else None
         )

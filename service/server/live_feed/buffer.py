@@ -113,7 +113,7 @@ class FeedBuffer:
             (p for p in self._batches_of(stream_id) if p.first_seq <= seq <= p.last_seq), None
         )
 
-    def first_batch_after(self, stream_id: str, seq: int) -> FeedBatch | None:
+    def find_first_batch_beginning_after(self, stream_id: str, seq: int) -> FeedBatch | None:
         """Return the oldest batch of a stream that begins after this frame; None without one."""
         found = None
         for piece in self._batches_of(stream_id):
@@ -229,7 +229,7 @@ class ServerStreamView:
         """Return the view of a stream, empty without stored frames; None: not known, or not now."""
         stream = node.streams.get(stream_id)
         # After a restart of the server a stream without stored frames has no folder.
-        if stream is None and (node.has_connected or stream_id not in node.stream_order):
+        if stream is None and (node.has_connected or stream_id not in node.announced_stream_order):
             return None
         return cls(node, stream_id, stream, needed_frames)
 
@@ -258,7 +258,7 @@ class ServerStreamView:
     @property
     def next_stream_id(self) -> str | None:
         """See `StreamView.next_stream_id`."""
-        node, order = self._node, self._node.stream_order
+        node, order = self._node, self._node.announced_stream_order
         if self._stream_id in order:
             return (*order, None)[order.index(self._stream_id) + 1]
         # Hello no longer lists it: the next one is the first that began later, by the node's clock.

@@ -93,7 +93,7 @@ class LosslessCursor:
             raise CloseConnection(
                 LinkCloseCode.NO_STREAM, f"no longer stored: stream {position.stream_id}"
             )
-        ahead = memory.first_batch_after(position.stream_id, position.seq)
+        ahead = memory.find_first_batch_beginning_after(position.stream_id, position.seq)
         stored = stream.stored
         if stored.restricted_to(position.seq, position.seq):
             # The live estimator still holds these frames for their look-ahead.
@@ -192,7 +192,7 @@ class LossyCursor:
         """Number of the next batch to send."""
         if position is not None:
             key = position.stream_id, position.seq
-            found = buffer.find_batch(*key) or buffer.first_batch_after(*key)
+            found = buffer.find_batch(*key) or buffer.find_first_batch_beginning_after(*key)
             self._next_number = self._next_number if found is None else found.number
 
     def next_event(self) -> FeedEvent | None:

@@ -217,7 +217,7 @@ def _list_changes(
     """Return the changes of calibration and tare within these frames, in order."""
     recorded = [
         EstimateInputsChange(each.calibration, each.tare, seq=each.seq)
-        for each in node.estimator.epochs_of(stream.stream_id)
+        for each in node.estimator.epochs_since_server_start(stream.stream_id)
     ]
     before = [change for change in recorded if change.seq is not None and change.seq <= begin]
     if before:  # this server has estimated all of these frames
@@ -230,7 +230,7 @@ def _list_changes(
     until_ns = journal.find_batch_t_ns_near(until, at_or_before=True)
     if t_ns is None or until_ns is None:
         return recorded
-    tares = node.estimator.tare_history.tares_in_force_between(stream.info, t_ns, until_ns)
+    tares = node.estimator.tare_history.tares_in_force_or_lost_between(stream.info, t_ns, until_ns)
     return [*(EstimateInputsChange(calibration, tare, t_ns=tare.t_ns) for tare in tares), *recorded]
 
 
@@ -240,7 +240,7 @@ Policy = Literal["lossless", "drop_oldest", "latest"]
 POLICIES: tuple[Policy, ...] = get_args(Policy)
 
 
-def start_position(
+def find_requested_position(
     node: ServerNode, stream_id: str | None, from_seq: int | None
 ) -> Position | None:
     """Return the first frame for a reader; None: the next one that comes.
@@ -254,7 +254,7 @@ def start_position(
     if stream_id in node.unreadable_streams:
         node.retry_unreadable_journals()
     if stream_id not in node.streams and stream_id not in (
-        *node.stream_order,
+        *node.announced_stream_order,
         *node.unreadable_streams,
     ):
         raise CloseConnection(
@@ -304,7 +304,7 @@ class FeedReader:
         self._request_without_rows: Recompute | None = None
         """Last request for which no frame was due."""
 
-    async def iterate_events_forever(self) -> AsyncGenerator[FeedEvent, None]:
+    async def iterate_events_until_closed(self) -> AsyncGenerator[FeedEvent, None]:
         """Yield events without end.
 
         Raises:

@@ -12,11 +12,11 @@ from devices.errors import FileFormatError
 from storage.formats.readers.device_columns import (
     DeviceColumn,
     get_vertical_force_and_cop_columns,
-    group_columns_by_plate,
-    make_plate_signals,
+    group_lower_case_columns_by_plate,
+    make_plate_signals_in_file_units,
     parse_device_columns,
 )
-from storage.formats.readers.plate_signals import make_plate_table
+from storage.formats.readers.plate_signals import make_table_of_separate_plates
 from storage.formats.readers.table import ForceTable
 from storage.formats.readers.text import is_number, split_trimmed_cells_without_empty_end
 
@@ -67,18 +67,18 @@ def parse_bioware_force_and_cop(text: str, where: str, values_max: int) -> Force
             for name, device, unit in zip(names, devices, units[1:], strict=False)
         ),
     ]
-    plates = group_columns_by_plate(columns, where)
+    plates = group_lower_case_columns_by_plate(columns, where)
     indices = [0, *(i for plate in plates for i in get_vertical_force_and_cop_columns(plate))]
     numbers = parse_device_columns(rows, delimiter, columns, indices, values_max, where)
     notes = []
     stated = next(iter(facts.get("samples (#)", [])), "")
     if stated.isdecimal() and int(stated) > len(numbers[0]):
         notes = [f"it holds {len(numbers[0])} of the {stated} samples that its head states"]
-    return make_plate_table(
+    return make_table_of_separate_plates(
         where,
         numbers[0] * second,
         [
-            make_plate_signals(
+            make_plate_signals_in_file_units(
                 f"plate{i + 1}", plate, columns, numbers, is_positive_under_load=True
             )
             for i, plate in enumerate(plates)

@@ -39,7 +39,9 @@ class DeviceColumn:
     unit: str
 
 
-def group_columns_by_plate(columns: Sequence[DeviceColumn], where: str) -> list[dict[str, int]]:
+def group_lower_case_columns_by_plate(
+    columns: Sequence[DeviceColumn], where: str
+) -> list[dict[str, int]]:
     """Return the columns of each device with a vertical force: indices by lower-case name.
 
     Devices may share a name: a repeated quantity then begins the next device.
@@ -117,7 +119,7 @@ def get_vertical_force_and_cop_columns(plate_columns: dict[str, int]) -> list[in
     return [plate_columns["fz"], *_get_cop_columns(plate_columns)]
 
 
-def make_plate_signals(
+def make_plate_signals_in_file_units(
     name: str,
     plate_columns: dict[str, int],
     columns: Sequence[DeviceColumn],

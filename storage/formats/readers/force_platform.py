@@ -28,7 +28,7 @@ from storage.formats.readers.plate_signals import (
     compute_loaded_eccentricity,
     compute_plate_pose,
     correct_cop_for_bending,
-    make_plate_table,
+    make_table_of_separate_plates,
     transform_cop_to_laboratory,
 )
 from storage.formats.readers.table import ForceTable, check_table_size
@@ -87,7 +87,9 @@ def read_c3d_force_platforms(path: Path, values_max: int) -> ForceTable:
     if refusal is not None and not plates:
         raise refusal
     time_s = np.arange(len(plates[0].fz)) / file.rate_hz
-    return make_plate_table(file.where, time_s, plates, [*notes, *_zero_notes(file, plates)])
+    return make_table_of_separate_plates(
+        file.where, time_s, plates, [*notes, *_zero_notes(file, plates)]
+    )
 
 
 def _zero_notes(file: C3dFile, plates: list[PlateSignals]) -> list[str]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.errors import FileFormatError
-from storage.formats.readers.plate_signals import PlateSignals, make_plate_table
+from storage.formats.readers.plate_signals import PlateSignals, make_table_of_separate_plates
 from storage.formats.readers.table import SOLE_FRACTION, Column, ForceTable
 from storage.formats.readers.text import TextLayout, parse_columns
 
@@ -75,7 +75,7 @@ def parse_moticon_force_and_cop(text: str, where: str, values_max: int) -> Force
             notes = ("its centre of pressure is in units that are not read",)
         fz = np.asarray(columns[name], dtype=np.float64)
         plates.append(PlateSignals(side, fz, cop, match[2], SOLE_FRACTION, True, notes))
-    return make_plate_table(where, _to_seconds(columns[names[0]], text, where), plates)
+    return make_table_of_separate_plates(where, _to_seconds(columns[names[0]], text, where), plates)
 
 
 def _to_seconds(time: Column, text: str, where: str) -> Floats:

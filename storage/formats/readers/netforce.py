@@ -13,7 +13,7 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.errors import FileFormatError
-from storage.formats.readers.plate_signals import PlateSignals, make_plate_table
+from storage.formats.readers.plate_signals import PlateSignals, make_table_of_separate_plates
 from storage.formats.readers.table import ForceTable
 from storage.formats.readers.text import (
     FORM,
@@ -45,7 +45,7 @@ def is_netforce(head: str) -> bool:
     return not all(a < b for a, b in pairwise(first))
 
 
-def parse_netforce_force_and_cop(text: str, where: str, values_max: int) -> ForceTable:
+def parse_netforce_force_and_cop_without_time(text: str, where: str, values_max: int) -> ForceTable:
     """Parse the vertical force and centre of pressure of each plate, beside the numbered columns.
 
     Raises:
@@ -63,7 +63,9 @@ def parse_netforce_force_and_cop(text: str, where: str, values_max: int) -> Forc
         f"{_CHANNELS} columns without names are taken for Fx, Fy, Fz, Mx, My and Mz of a plate, as "
         "AMTI's NetForce saves them",
     )
-    table = make_plate_table(where, np.arange(len(channels[0]), dtype=np.float64), plates, notes)
+    table = make_table_of_separate_plates(
+        where, np.arange(len(channels[0]), dtype=np.float64), plates, notes
+    )
     found = {name: column for name, column in table.columns.items() if name != "time_s"}
     return replace(
         table,

@@ -18,11 +18,11 @@ from storage.formats.readers.device_columns import (
     FORCE_UNITS,
     DeviceColumn,
     get_vertical_force_and_cop_columns,
-    group_columns_by_plate,
-    make_plate_signals,
+    group_lower_case_columns_by_plate,
+    make_plate_signals_in_file_units,
     parse_device_columns,
 )
-from storage.formats.readers.plate_signals import PlateSignals, make_plate_table
+from storage.formats.readers.plate_signals import PlateSignals, make_table_of_separate_plates
 from storage.formats.readers.table import ForceTable
 from storage.formats.readers.text import split_trimmed_cells_without_empty_end
 
@@ -62,7 +62,7 @@ def parse_nexus_force_and_cop(text: str, where: str, values_max: int) -> ForceTa
             ],
         )
         try:
-            groups = group_columns_by_plate(columns, where)
+            groups = group_lower_case_columns_by_plate(columns, where)
         except FileFormatError as error:
             refusal = refusal or error
             continue
@@ -88,7 +88,7 @@ def parse_nexus_force_and_cop(text: str, where: str, values_max: int) -> ForceTa
         plates = [
             _make_plate(i + 1, group, columns, numbers, where) for i, group in enumerate(groups)
         ]
-        return make_plate_table(where, time_s, plates)
+        return make_table_of_separate_plates(where, time_s, plates)
     raise refusal or FileFormatError("it has no section", where=where, expected=FORM)
 
 
@@ -148,7 +148,7 @@ def _make_plate(
     Raises:
         FileFormatError: z is not the vertical axis.
     """
-    plate = make_plate_signals(f"plate{number}", group, columns, numbers)
+    plate = make_plate_signals_in_file_units(f"plate{number}", group, columns, numbers)
     peak = np.max(np.abs(plate.fz), initial=0.0, where=np.isfinite(plate.fz))
     for i in _shear_columns(group):
         shear = numbers[i]

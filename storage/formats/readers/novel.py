@@ -18,7 +18,7 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.errors import FileFormatError
-from storage.formats.readers.plate_signals import PlateSignals, make_plate_table
+from storage.formats.readers.plate_signals import PlateSignals, make_table_of_separate_plates
 from storage.formats.readers.table import ColumnFilter, ForceTable
 from storage.formats.readers.text import TextLayout, parse_columns
 
@@ -40,7 +40,7 @@ def is_loadsol(head: str) -> bool:
 
 
 def parse_loadsol_forces(
-    text: str, where: str, is_needed: ColumnFilter, values_max: int
+    text: str, where: str, is_time_source: ColumnFilter, values_max: int
 ) -> ForceTable:
     """Parse the force of each sole as `left_fz`, `right_fz`, at the times of the needed soles.
 
@@ -97,8 +97,8 @@ def parse_loadsol_forces(
         times_s.append(np.asarray(columns[names[stamp]] * scale, dtype=np.float64))
     if len({plate.name for plate in plates}) < len(plates):
         raise FileFormatError("two soles are of one side", where=where, expected="one of each")
-    time_s = _needed_times(plates, times_s, is_needed, where)
-    return make_plate_table(where, time_s, plates)
+    time_s = _needed_times(plates, times_s, is_time_source, where)
+    return make_table_of_separate_plates(where, time_s, plates)
 
 
 def _needed_times(

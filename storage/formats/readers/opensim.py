@@ -16,8 +16,8 @@ from devices.errors import FileFormatError
 from storage.formats.readers.table import (
     ColumnFilter,
     ForceTable,
-    make_table_with_standard_names,
-    select_needed_names,
+    make_table_with_lowercase_standard_names,
+    select_needed_names_or_empty,
 )
 from storage.formats.readers.text import (
     BLANKS,
@@ -66,7 +66,7 @@ def read_opensim_table(path: Path, is_needed: ColumnFilter, values_max: int) -> 
     times = {name for name in names if name.lower() == "time"}
     alone = _single_force_columns(names)
     wanted = set(alone.values()) if is_needed("grf_n") and "grf_n" not in names else set()
-    needed = select_needed_names(
+    needed = select_needed_names_or_empty(
         names, lambda name: name in wanted | times or is_needed(name), where
     )
     width = line.count("\t") + 1 if delimiter == "\t" else 0
@@ -78,7 +78,7 @@ def read_opensim_table(path: Path, is_needed: ColumnFilter, values_max: int) -> 
     for name in times:
         columns["time_s"] = columns[name]
     units = {name: unit for name in names for ending, unit in _UNITS if ending.search(name)}
-    table = make_table_with_standard_names(
+    table = make_table_with_lowercase_standard_names(
         where, names, columns, units=units | dict.fromkeys(times, "s"), expected_form=FORM
     )
     forces = {name for name, unit in units.items() if unit == "N"}

@@ -19,8 +19,8 @@ from storage.formats.readers.table import (
     ColumnFilter,
     ForceTable,
     check_table_size,
-    make_table_with_standard_names,
-    select_needed_names,
+    make_table_with_lowercase_standard_names,
+    select_needed_names_or_empty,
 )
 from storage.formats.readers.text import arrow_to_floats
 from storage.parquet_hash import FORMAT_KEY, check_file_hash, read_stated_and_actual_hash
@@ -44,7 +44,7 @@ def read_parquet_table(path: Path, is_needed: ColumnFilter, values_max: int) -> 
             hashes = read_stated_and_actual_hash(path)
             if hashes is not None or FORMAT_KEY in (schema.metadata or {}):
                 check_file_hash(hashes, where=where)
-            needed = select_needed_names(schema.names, is_needed, where)
+            needed = select_needed_names_or_empty(schema.names, is_needed, where)
             check_table_size(file.metadata.num_rows, len(needed), values_max, where)
             table = file.read(columns=needed)
     except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
@@ -52,7 +52,7 @@ def read_parquet_table(path: Path, is_needed: ColumnFilter, values_max: int) -> 
             f"cannot be read: {error}", where=where, expected="a Parquet file"
         ) from error
     columns = {name: _to_numbers(table[name], name, where) for name in needed}
-    return make_table_with_standard_names(where, schema.names, columns, schema=schema)
+    return make_table_with_lowercase_standard_names(where, schema.names, columns, schema=schema)
 
 
 def _to_numbers(cells: pa.ChunkedArray[Any], name: str, where: str) -> Column:

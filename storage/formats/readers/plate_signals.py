@@ -41,7 +41,7 @@ class PlateSignals:
     notes: tuple[str, ...] = ()
 
 
-def make_plate_table(
+def make_table_of_separate_plates(
     where: str, time_s: Floats, plates: Sequence[PlateSignals], notes: Sequence[str] = ()
 ) -> ForceTable:
     """Return a table of plates; a single plate with units gets the standard names as well."""

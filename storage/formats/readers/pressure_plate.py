@@ -22,11 +22,11 @@ import numpy as np
 from devices.arrays import Floats
 from devices.errors import FileFormatError
 from devices.input_files import check_regular_file
-from storage.formats.readers.plate_signals import PlateSignals, make_plate_table
+from storage.formats.readers.plate_signals import PlateSignals, make_table_of_separate_plates
 from storage.formats.readers.table import (
     ForceTable,
     check_table_size,
-    make_table_with_standard_names,
+    make_table_with_lowercase_standard_names,
 )
 
 _CELL_FACTORS = {"force_n": 1.0, "pressure_kpa": 1e3}
@@ -72,7 +72,7 @@ def read_npz_pressure_plate(path: Path, values_max: int) -> ForceTable:
     grf_n, (cop_x_m, cop_y_m) = _compute_total_force_and_cop(force_n, x_m, y_m)
     columns = {"time_s": time_s, "grf_n": grf_n, "cop_x_m": cop_x_m, "cop_y_m": cop_y_m}
     notes = (f"a plate of {cells.shape[1]} by {cells.shape[2]} cells, added up",)
-    return make_table_with_standard_names(where, columns, columns, notes=notes)
+    return make_table_with_lowercase_standard_names(where, columns, columns, notes=notes)
 
 
 class TotalForce(NamedTuple):
@@ -182,7 +182,7 @@ def parse_tekscan_force_and_cop(text: str, where: str, values_max: int) -> Force
     plate = PlateSignals(
         "sensor", force_n, None if is_mirrored else cop_m, "N", "m", is_positive_under_load=True
     )
-    return make_plate_table(where, step_s * (numbers - numbers[0]), [plate], notes)
+    return make_table_of_separate_plates(where, step_s * (numbers - numbers[0]), [plate], notes)
 
 
 def _parse_frames(

@@ -10,7 +10,7 @@ from devices.errors import FileFormatError, UsageError
 from storage.formats.readers.bioware import is_bioware, parse_bioware_force_and_cop
 from storage.formats.readers.force_platform import read_c3d_force_platforms
 from storage.formats.readers.moticon import is_moticon, parse_moticon_force_and_cop
-from storage.formats.readers.netforce import is_netforce, parse_netforce_force_and_cop
+from storage.formats.readers.netforce import is_netforce, parse_netforce_force_and_cop_without_time
 from storage.formats.readers.nexus import is_nexus, parse_nexus_force_and_cop
 from storage.formats.readers.novel import is_loadsol, is_pedar, parse_loadsol_forces, refuse_pedar
 from storage.formats.readers.opensim import read_opensim_table
@@ -45,7 +45,9 @@ TEXT_FORMATS: tuple[TextFormat, ...] = (
     TextFormat(is_moticon, parse_moticon_force_and_cop),
     TextFormat(is_tekscan, parse_tekscan_force_and_cop),
     TextFormat(is_pedar, refuse_pedar),
-    TextFormat(is_netforce, parse_netforce_force_and_cop),  # last: the format has no head
+    TextFormat(
+        is_netforce, parse_netforce_force_and_cop_without_time
+    ),  # last: the format has no head
 )
 
 
@@ -111,7 +113,7 @@ def read_table(
         if chosen is TEXT:
             table = _read_text(path, is_needed, values_max, text_options)
         else:
-            refuse_text_options(path, text_options)
+            refuse_any_text_options(path, text_options)
             table = chosen.read(path, is_needed, values_max)
     except MemoryError as error:
         raise FileFormatError(
@@ -123,7 +125,7 @@ def read_table(
     return replace(table, columns=columns)
 
 
-def refuse_text_options(path: Path, text_options: TextOptions | None) -> None:
+def refuse_any_text_options(path: Path, text_options: TextOptions | None) -> None:
     """Refuse text options for a file that is no text.
 
     Raises:

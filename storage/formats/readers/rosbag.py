@@ -19,7 +19,7 @@ import numpy as np
 from devices.arrays import Floats
 from devices.errors import FileFormatError, FootTileError, require_extra
 from devices.input_files import check_regular_file
-from storage.formats.readers.plate_signals import PlateSignals, make_plate_table
+from storage.formats.readers.plate_signals import PlateSignals, make_table_of_separate_plates
 from storage.formats.readers.table import (
     ColumnFilter,
     ForceTable,
@@ -111,7 +111,7 @@ def _make_table(bag: _Bag, where: str, is_needed: ColumnFilter, values_max: int)
         forces |= {f"{name}_fx": force[0], f"{name}_fy": force[1]}
     if len(names) > 1:
         notes.append(f"topics of wrenches are {', '.join(names)}: --map says which one")
-    table = make_plate_table(where, time_s, plates, notes)
+    table = make_table_of_separate_plates(where, time_s, plates, notes)
     columns = {
         name: column
         for name, column in {**table.columns, **forces}.items()

@@ -66,7 +66,7 @@ class ForceTable:
     schema: pa.Schema | None = None
 
 
-def make_table_with_standard_names(
+def make_table_with_lowercase_standard_names(
     where: str,
     names: Iterable[str],
     columns: Mapping[str, Column],
@@ -108,7 +108,7 @@ def make_table_with_standard_names(
     )
 
 
-def select_needed_names(
+def select_needed_names_or_empty(
     column_names: Collection[str], is_needed: ColumnFilter, where: str
 ) -> list[str]:
     """Return the names of the columns to read.
@@ -158,7 +158,7 @@ class SpacedTimes(NamedTuple):
     note: str
 
 
-def spread_repeated_times_evenly(time_s: Floats) -> SpacedTimes:
+def fit_constant_rate_if_times_repeat(time_s: Floats) -> SpacedTimes:
     """Replace all times by times at a constant rate if rounding made some of them equal.
 
     Times are returned unchanged unless the rate is clear: no time falls, and all deviate from a

@@ -32,8 +32,8 @@ from storage.formats.readers.table import (
     ColumnFilter,
     ForceTable,
     check_table_size,
-    make_table_with_standard_names,
-    select_needed_names,
+    make_table_with_lowercase_standard_names,
+    select_needed_names_or_empty,
 )
 from storage.formats.readers.text_options import DECIMAL_PATTERNS, TextOptions
 
@@ -112,14 +112,14 @@ def parse_text_table(
     text = text[_line_offset(text, skip) :]
     if skip and not text.strip():
         raise FileFormatError(f"there is no text below {options.skip_rows} lines", where=where)
-    layout = detect_layout(text, where, options)
+    layout = _detect_layout(text, where, options)
     if units is not None:
         cells = split_trimmed_cells_without_empty_end(units, layout.delimiter)
         layout = replace(layout, units={**layout.units, **_units_by_name(layout.names, cells)})
-    needed = select_needed_names(layout.names, is_needed, where)
+    needed = select_needed_names_or_empty(layout.names, is_needed, where)
     columns = parse_columns(text, layout, needed, values_max, where, options.decimal)
     notes = () if layout.is_named else ("no line names its columns: they are numbered from 1 on",)
-    return make_table_with_standard_names(
+    return make_table_with_lowercase_standard_names(
         where, layout.names, columns, units=layout.units, notes=notes, expected_form=FORM
     )
 
@@ -153,7 +153,7 @@ def read_decoded_text(path: Path, encoding: str | None = None) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def detect_layout(text: str, where: str, options: TextOptions | None = None) -> TextLayout:
+def _detect_layout(text: str, where: str, options: TextOptions | None = None) -> TextLayout:
     """Detect the line of names, if any, and the delimiter of columns.
 
     Raises:

@@ -80,7 +80,7 @@ class ExportFormat:
         with self._extra_context():
             yield from self.encoder(export)
 
-    def encode_together(self, exports: Sequence[Export]) -> Iterator[bytes]:
+    def encode_together_on_server_clock(self, exports: Sequence[Export]) -> Iterator[bytes]:
         """Yield one file of several sessions on one time axis, in chunks.
 
         Raises:
@@ -126,7 +126,7 @@ class ExportFormat:
             raise UsageError(
                 f"{self.name} holds forces, and this session has none"
                 + (f": {why}" if isinstance(why, str) else ""),
-                where=export.display_name,
+                where=export.session_and_node_text,
                 remedy="Add them with `foottile estimate`, or ask for its counts as Parquet, "
                 "Arrow or CSV",
             )
@@ -161,7 +161,7 @@ def get_instants_on_export_clock_ns(export: Export, columns: Mapping[str, Array]
     if unknown:
         raise UsageError(
             f"the server's time is not known for {unknown} frames",
-            where=export.display_name,
+            where=export.session_and_node_text,
             remedy="Ask for the node's clock, or a slice of a part whose clock was compared",
         )
     return t_ns

@@ -233,7 +233,7 @@ def _to_number_type(column: Column, values: Array) -> Array:
 def _make_about_struct(export: Export) -> dict[str, Any]:
     """Return the file's metadata; values that are no text are JSON."""
     facts = {
-        **export.metadata,
+        **export.provenance_and_slice_metadata,
         "array_info": export.array_info.model_dump(mode="json"),
         "notes": export.notes_with_clock_and_markers,
         "begin_t_ns": np.int64(export.frame_source.begin_t_ns),

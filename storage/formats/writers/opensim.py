@@ -141,7 +141,7 @@ def _compute_gapless_foot_loads(
     if not stated.any():
         raise UsageError(
             "no centre of pressure is stated in it, and a force without a point is no load",
-            where=export.display_name,
+            where=export.session_and_node_text,
             remedy="Ask for C3D, Parquet, Arrow or CSV",
         )
     contact = reaction.resample_column("contact")
@@ -235,7 +235,7 @@ def _encode(export: Export) -> Iterator[bytes]:
 
 def _encode_together(exports: Sequence[Export]) -> Iterator[bytes]:
     feet = _make_feet(exports)
-    named = to_ascii_line(str(exports[0].metadata.get("session") or "session"))
+    named = to_ascii_line(str(exports[0].provenance_and_slice_metadata.get("session") or "session"))
     stem = _INVALID_IN_NAMES.sub(
         "_", named if len(feet) == 1 else f"{named}-and-{len(feet) - 1}-more"
     )
@@ -277,7 +277,7 @@ def _make_feet(exports: Sequence[Export]) -> list[ExportedFoot]:
             raise UsageError(
                 f"{len(bodies)} bodies for {len(exports)} sessions",
                 expected="one for each, in their order, with commas between: "
-                + ", ".join(each.display_name for each in exports),
+                + ", ".join(each.session_and_node_text for each in exports),
             )
     found = read_reactions_on_common_axis(exports, [GROUND_X], FRAMES_MAX // len(exports))
     loads = [

@@ -318,14 +318,14 @@ def _read_frames(
     if not len(t_ns):
         raise UsageError(
             "no frame is in this slice",
-            where=export.display_name,
+            where=export.session_and_node_text,
             expected="a slice with frames, as this format needs them",
         )
     if not np.isfinite(columns["grf_n"]).any():
         raise UsageError(
             f"none of its {len(t_ns)} frames has a force "
             f"(estimate_flags {_combined_flags(columns)})",
-            where=export.display_name,
+            where=export.session_and_node_text,
             remedy="Ask for Parquet, Arrow or CSV: they have counts and bounds",
         )
     return t_ns, fill_cop_across_tile_row(columns, export.array_info)

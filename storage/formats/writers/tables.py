@@ -140,7 +140,7 @@ def _encode_csv(export: Export) -> Iterator[bytes]:
     opened = _CommaWriter if export.options.decimal == "comma" else _EscapingWriter
     tables, has_about = export.read_tables(), export.options.about
     if has_about or (has_about is None and not export.selection.columns):
-        tables = _append_about_column(tables, json.dumps(export.metadata))
+        tables = _append_about_column(tables, json.dumps(export.provenance_and_slice_metadata))
     return encode_tables(tables, opened)
 
 

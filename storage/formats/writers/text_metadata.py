@@ -23,7 +23,7 @@ def format_metadata(export: Export, begin_ns: int) -> dict[str, str]:
         export: the export.
         begin_ns: instant of its first sample, on the requested clock.
     """
-    about, notes = export.metadata, export.notes
+    about, notes = export.provenance_and_slice_metadata, export.notes
     seconds, rest = divmod(begin_ns, 1_000_000_000)
     begin = datetime.fromtimestamp(seconds, tz=UTC).strftime("%Y-%m-%dT%H:%M:%S")
     clock = "the node's" if export.clock is None else "the server's"

@@ -106,7 +106,9 @@ def _encode_file_header(exports: Sequence[Export]) -> bytes:
     several = SubElement(info, "sessions") if len(exports) > 1 else None
     for export in exports:
         into = info if several is None else SubElement(several, "session")
-        _add_text_elements(into, {k: str(v) for k, v in export.metadata.items()})
+        _add_text_elements(
+            into, {k: str(v) for k, v in export.provenance_and_slice_metadata.items()}
+        )
     return _encode_chunk(_FILE_HEADER, tostring(info, xml_declaration=True))
 
 
@@ -164,7 +166,7 @@ class _SessionEncoder:
         if not len(t_ns):
             raise UsageError(
                 "no frame is in this slice",
-                where=export.display_name,
+                where=export.session_and_node_text,
                 expected="a slice with frames, of which a rate can be told",
             )
         axis = make_sample_axis([(t_ns, export.array_info.nominal_rate_hz)], _SAMPLES_MAX)
@@ -302,7 +304,7 @@ class _SessionEncoder:
         texts = {"name": f"{self._name} {name}", "type": kind, "channel_count": str(len(columns))}
         rate = repr(self._rate_hz) if self._rate_hz and format_ != "string" else "0"
         texts |= {"nominal_srate": rate, "channel_format": format_}
-        source = f"{node} {self._export.metadata.get('session') or ''} {name}"
+        source = f"{node} {self._export.provenance_and_slice_metadata.get('session') or ''} {name}"
         _add_text_elements(info, {**texts, "source_id": source, "version": "1.1", "hostname": node})
         desc = SubElement(info, "desc")
         _add_text_elements(desc, {"nominal_rate_hz": repr(self._export.array_info.nominal_rate_hz)})

@@ -22,8 +22,8 @@ from devices.frames import ArrayInfo
 from storage.durable_files import (
     lock_folder,
     make_synced_folder,
-    set_aside_and_describe,
     translate_storage_errors,
+    try_set_aside_and_describe,
 )
 from storage.intervals import DISK_FULL, DISK_SLOW, READ_ONLY, Intervals
 from storage.journal.journal import Journal
@@ -55,7 +55,7 @@ def _recover_ended_stream(folder: Path, problems: list[str]) -> NodeStream | Non
         left = read_in_flight_of_this_boot(folder)
     except DamagedFileError as error:
         left = None
-        problems.append(set_aside_and_describe(folder / IN_FLIGHT_FILE, error))
+        problems.append(try_set_aside_and_describe(folder / IN_FLIGHT_FILE, error))
     stream = _open_stream(folder, problems)
     if stream is None:
         if left is None:
@@ -184,7 +184,7 @@ class NodeJournal:
         self._locks.close()
 
     @property
-    def disk_warnings(self) -> tuple[str, ...]:
+    def disk_refusal_warnings(self) -> tuple[str, ...]:
         """Warning that the disk refuses frames, as a message; empty while it accepts them."""
         problem = self._disk_problem
         if problem is None:
@@ -212,7 +212,7 @@ class NodeJournal:
         """Queue the newest frames for the writer; drop the oldest beyond 32 MiB."""
         stream.queue_batch_and_record_gap(batch, total_missed_slots)
         # The writer is not woken: it writes all batches at its next sync.
-        while sum(each.waiting_bytes for each in self.streams) > MAX_WAITING_BYTES:
+        while sum(each.unwritten_bytes for each in self.streams) > MAX_WAITING_BYTES:
             if not self._drop_oldest():  # the writer has written them meanwhile
                 break
 
@@ -241,7 +241,7 @@ class NodeJournal:
             time.sleep(0.01)
         return True
 
-    def finish_recovered_streams(self) -> None:
+    def write_in_flight_frames_and_stream_ends(self) -> None:
         """Write frames in flight and the ends of all streams in the caller's thread.
 
         Raises:
@@ -250,7 +250,7 @@ class NodeJournal:
         self._write_and_clean_up(is_forced=True)
         if not all(stream.is_complete_on_disk for stream in self.streams):
             raise StorageError(
-                "the frames in flight cannot be written: " + "; ".join(self.disk_warnings),
+                "the frames in flight cannot be written: " + "; ".join(self.disk_refusal_warnings),
                 where=str(self.folder),
                 remedy="Free space on the disk, and run it again",
             )
@@ -293,8 +293,8 @@ class NodeJournal:
         if now_s - self._synced_s >= SYNC_INTERVAL_S or is_forced:
             self._synced_s = now_s
             for stream in self.streams:
-                stream.sync_or_requeue()
-                stream.try_finish_on_disk(self.retention_requests, self.problems)
+                stream.try_sync_or_requeue()
+                stream.try_record_end_once_synced(self.retention_requests, self.problems)
         if now_s - self._tidied_s >= _CLEANUP_INTERVAL_S or (
             self._are_requests_changed and not self._disk_problem
         ):
@@ -318,7 +318,7 @@ class NodeJournal:
 
     def _write_stream(self, stream: NodeStream) -> None:
         stream.ensure_journal_and_notes()
-        while stream.waiting_bytes and stream.journal is not None:
+        while stream.unwritten_bytes and stream.journal is not None:
             try:
                 self._retention.enforce_budget_or_raise_full(
                     self.streams, ignore_check_interval=self._disk_problem is not None
@@ -341,7 +341,7 @@ class NodeJournal:
                 self.retention_requests.save()
             except StorageError:
                 self._are_requests_changed = True
-        dropped = self._retention.evict_expired_and_save_losses(self.streams)
+        dropped = self._retention.evict_expired_and_list_deleted_streams(self.streams)
         with self._streams_lock:
             self.streams = [stream for stream in self.streams if stream not in dropped]
 
@@ -407,15 +407,15 @@ def _first_t_ns_of(stream: NodeStream) -> float:
     return math.inf if begin_t_ns is None else begin_t_ns
 
 
-def recover_node_journals(root: Path) -> None:
+def recover_node_journals(locked_root: Path) -> None:
     """Write frames that killed nodes left in flight to their journals; record the streams' ends.
 
     Args:
-        root: the nodes' folder, whose lock the caller holds.
+        locked_root: the nodes' folder, whose lock the caller holds.
 
     Raises:
         StorageError: it cannot be read, or not written completely.
     """
-    for folder in sorted(path for path in (root / "journal").glob("*") if path.is_dir()):
-        journal = NodeJournal(root, folder.name, is_recovery=True)
-        journal.finish_recovered_streams()
+    for folder in sorted(path for path in (locked_root / "journal").glob("*") if path.is_dir()):
+        journal = NodeJournal(locked_root, folder.name, is_recovery=True)
+        journal.write_in_flight_frames_and_stream_ends()

@@ -78,7 +78,9 @@ class RetentionPolicy:
             stream.evict_oldest_unneeded_segment(self._wanted) for stream in streams
         )
 
-    def evict_expired_and_save_losses(self, streams: Sequence[NodeStream]) -> list[NodeStream]:
+    def evict_expired_and_list_deleted_streams(
+        self, streams: Sequence[NodeStream]
+    ) -> list[NodeStream]:
         """Delete expired frames and save the losses; return streams that are deleted whole."""
         return [stream for stream in streams if self._may_drop and self._delete_expired_of(stream)]
 
@@ -98,7 +100,11 @@ class RetentionPolicy:
             elif stream.has_ended and past_ring:
                 stream.evict_old_segments(_END_OF_TIME_NS, self._wanted)
         is_empty = stream.is_complete_on_disk and not journal.stored
-        if is_empty and past_ring and not self._wanted.required_numbers_of(stream.stream_id):
+        if (
+            is_empty
+            and past_ring
+            and not self._wanted.node_session_or_server_numbers_of(stream.stream_id)
+        ):
             journal.close_and_delete()
             return True
         stream.try_save_new_losses()

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from devices.errors import DamagedFileError, StorageError
 from storage.checksummed_json import read_checksummed_json, write_checksummed_json
-from storage.durable_files import ASIDE_SUFFIX, set_aside_and_describe
+from storage.durable_files import ASIDE_SUFFIX, try_set_aside_and_describe
 from storage.intervals import NO_END, Intervals, OpenPairs, intervals_from_open_pairs, union
 
 
@@ -33,7 +33,7 @@ class RetentionRequest(BaseModel):
     recording: bool = False
     known: tuple[str, ...] = ()
 
-    def required_numbers_of(self, stream_id: str) -> Intervals:
+    def required_numbers_of_known_or_new_stream(self, stream_id: str) -> Intervals:
         """Return the requested numbers of a stream."""
         if stream_id in self.streams:
             return intervals_from_open_pairs(self.streams[stream_id])
@@ -93,14 +93,14 @@ class RetentionRequests:
         except (DamagedFileError, ValidationError) as error:
             what = f"retention requests cannot be read: {error}"
             damage = DamagedFileError(what, where=str(path))
-            self.problems.append(set_aside_and_describe(path, damage))
+            self.problems.append(try_set_aside_and_describe(path, damage))
         return {}
 
-    def required_numbers_of(self, stream_id: str) -> Intervals:
+    def node_session_or_server_numbers_of(self, stream_id: str) -> Intervals:
         """Return the numbers of a stream that servers or the node's own session need."""
         servers = list(self._servers.values())
         return self.node_session_numbers_of(stream_id) | union(
-            server.required_numbers_of(stream_id) for server in servers
+            server.required_numbers_of_known_or_new_stream(stream_id) for server in servers
         )
 
     def node_session_or_undelivered_numbers(
@@ -123,7 +123,8 @@ class RetentionRequests:
     ) -> Intervals:
         """Return the numbers that servers need and have not acknowledged."""
         return union(
-            server.required_numbers_of(stream_id) - acked_by.get(server_id, Intervals())
+            server.required_numbers_of_known_or_new_stream(stream_id)
+            - acked_by.get(server_id, Intervals())
             for server_id, server in list(self._servers.items())
         )
 

@@ -17,7 +17,7 @@ from itertools import takewhile
 from pathlib import Path
 
 from devices.errors import DamagedFileError, StorageError
-from storage.durable_files import set_aside_and_describe
+from storage.durable_files import try_set_aside_and_describe
 from storage.intervals import CORRUPT, EVICTED, NODE_BUSY, Intervals, Losses, union
 from storage.journal.journal import Journal
 from storage.journal.node.in_flight import (
@@ -120,7 +120,7 @@ class NodeStream:
             return not self._waiting.batches and not self._unsynced
 
     @property
-    def waiting_bytes(self) -> int:
+    def unwritten_bytes(self) -> int:
         """Bytes that wait in memory to be written."""
         return self._waiting.size_bytes
 
@@ -220,10 +220,10 @@ class NodeStream:
             if len(self._waiting.batches) <= min_batches_left:
                 return False
             oldest = self._waiting.popleft()
-        self.record_loss_unless_delivered(oldest.numbers, reason, requests)
+        self.record_unacked_or_node_session_loss(oldest.numbers, reason, requests)
         return True
 
-    def record_loss_unless_delivered(
+    def record_unacked_or_node_session_loss(
         self, numbers: Intervals, reason: str, requests: RetentionRequests
     ) -> None:
         """Record the loss of frames in memory, except frames that a server has.
@@ -329,7 +329,7 @@ class NodeStream:
             with self._lock:
                 self.journal = journal
 
-    def sync_or_requeue(self) -> None:
+    def try_sync_or_requeue(self) -> None:
         """Sync written batches; batches that the disk refuses go back to the memory queue."""
         journal = self.journal
         if journal is None or not self._unsynced:
@@ -346,7 +346,7 @@ class NodeStream:
                 self._waiting.prepend(self._unsynced)
                 self._unsynced = []
                 self._waiting_since_s = since_s
-            journal.invalidate_whole_batches(
+            journal.invalidate_batches_wholly_within(
                 refused
             )  # after the queue has them again, so no frame is missing
             return
@@ -357,7 +357,7 @@ class NodeStream:
             with suppress(StorageError):
                 self.update_and_save_notes(sync_max_s=took_s)
 
-    def try_finish_on_disk(self, requests: RetentionRequests, problems: list[str]) -> None:
+    def try_record_end_once_synced(self, requests: RetentionRequests, problems: list[str]) -> None:
         """Record the stream's end once all of it is on disk; the next call retries after an error.
 
         Args:
@@ -372,7 +372,7 @@ class NodeStream:
             if self.journal is not None:
                 self.journal.close()
             # A stream that ended before its first frame is kept if a server requests it.
-            if self.next_seq or requests.required_numbers_of(self.stream_id):
+            if self.next_seq or requests.node_session_or_server_numbers_of(self.stream_id):
                 self.update_and_save_notes(next_seq=self.next_seq)
             elif self.folder.is_dir():
                 shutil.rmtree(self.folder, ignore_errors=True)
@@ -389,8 +389,8 @@ class NodeStream:
     ) -> None:
         """Remove frames that turned out to be damaged on disk, and record their loss."""
         if self.journal is not None:
-            self.journal.invalidate_whole_batches(damaged_numbers)
-            self.record_loss_unless_delivered(damaged_numbers, CORRUPT, requests)
+            self.journal.invalidate_batches_wholly_within(damaged_numbers)
+            self.record_unacked_or_node_session_loss(damaged_numbers, CORRUPT, requests)
 
     def evict_old_segments(self, before_t_ns: int, requests: RetentionRequests) -> None:
         """Delete segments that end before an instant, without needed frames; record losses.
@@ -400,7 +400,7 @@ class NodeStream:
         """
         if self.journal is not None:
             gone = self.journal.delete_old_segments(before_t_ns, self.numbers_to_retain(requests))
-            self.record_loss_unless_delivered(gone, EVICTED, requests)
+            self.record_unacked_or_node_session_loss(gone, EVICTED, requests)
 
     def evict_oldest_unneeded_segment(self, requests: RetentionRequests) -> bool:
         """Delete the oldest segment without needed frames, record losses; False if none.
@@ -411,7 +411,7 @@ class NodeStream:
         gone = Intervals()
         if self.journal is not None:
             gone = self.journal.delete_oldest_unneeded_segment(self.numbers_to_retain(requests))
-            self.record_loss_unless_delivered(gone, EVICTED, requests)
+            self.record_unacked_or_node_session_loss(gone, EVICTED, requests)
         return bool(gone)
 
     def _queue_in_flight(self, problems: list[str]) -> bool:
@@ -423,7 +423,7 @@ class NodeStream:
         try:
             new = read_newest_in_flight_run(self.folder, self.next_seq)
         except DamagedFileError as error:
-            problems.append(set_aside_and_describe(self.folder / IN_FLIGHT_FILE, error))
+            problems.append(try_set_aside_and_describe(self.folder / IN_FLIGHT_FILE, error))
             self.set_max_lost_tail_in_memory()
             return False
         if new is None:

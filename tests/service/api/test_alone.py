@@ -92,12 +92,12 @@ def test_a_node_that_could_not_be_taken_in_is_not_known_and_its_name_is_free(
         raise kind("as a bug would")
 
     with monkeypatch.context() as patch:
-        patch.setattr(ServerNode, "apply_hello", failing)
+        patch.setattr(ServerNode, "apply_checked_hello", failing)
         node.open_with_hello()
         assert closed(node.socket)[0] == 1011
     assert running.http.get("/nodes/bench").status_code == 404
     with monkeypatch.context() as patch:
-        patch.setattr(ServerNode, "frames_to_request", failing)
+        patch.setattr(ServerNode, "needed_and_present_frames_to_request", failing)
         node.open_with_hello()
         assert closed(node.socket)[0] == 1011
     until(lambda: not running.node()["connected"])
@@ -114,7 +114,7 @@ def test_a_bug_in_one_nodes_estimates_costs_it_its_estimates_and_no_more(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    feed = LiveEstimator.feed_frames
+    feed = LiveEstimator.estimate_or_pass_frames
 
     def failing(self: LiveEstimator, frames: FrameBatch) -> Any:
         if self._info.node == "bench" and self._calibration is not None:
@@ -124,7 +124,7 @@ def test_a_bug_in_one_nodes_estimates_costs_it_its_estimates_and_no_more(
     node.connect()
     node.deliver(20)
     with monkeypatch.context() as patch, caplog.at_level(logging.ERROR):
-        patch.setattr(LiveEstimator, "feed_frames", failing)
+        patch.setattr(LiveEstimator, "estimate_or_pass_frames", failing)
         node.deliver(100)
         assert_goes_on(screen, other)
     assert len([r for r in caplog.records if "this is a bug" in r.getMessage()]) == 1

@@ -13,7 +13,7 @@ import pytest
 from service.estimation.calibration import UNPROVEN_SUFFIX, Calibration
 from service.server import calibrations as book
 from service.sessions.calibration_file import encode_calibration, parse_calibration
-from service.sessions.sealing import rebuild_session
+from service.sessions.sealing import rebuild_damaged_session_json
 from storage.sessions.folder import SessionsFolder
 from tests.builders.calibrations import make_calibration
 from tests.service import benches
@@ -177,7 +177,7 @@ def test_what_is_assigned_counts_from_then_on_and_what_is_being_recorded_keeps_i
 def restore_of(running: Running, session: Recording) -> dict[str, Any]:
     """What is made again of it from its sealed file alone."""
     (session.folder / "session.json").unlink()
-    made = rebuild_session(SessionsFolder(running.data / "sessions"), session.id)
+    made = rebuild_damaged_session_json(SessionsFolder(running.data / "sessions"), session.id)
     assert made is not None
     return made.model_dump()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from storage.sessions.metadata import read_markers
+from storage.sessions.metadata import read_existing_markers
 from storage.verify.session import verify_session
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
@@ -44,7 +44,7 @@ def test_a_mark_is_renamed_and_moved_also_in_the_table_beside_and_in_downloads(
         "a boulder": t_ns,
         "mud": before["mud"]["t_ns"],
     }
-    stored = read_markers(session.folder / "markers.parquet")
+    stored = read_existing_markers(session.folder / "markers.parquet")
     assert {(event.label, event.t_ns) for event in stored} >= {("a boulder", t_ns)}
     assert verify_session(session.folder).problems == []
     content = session.data(format="csv").content

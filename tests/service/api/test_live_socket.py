@@ -231,7 +231,7 @@ def test_a_screen_that_never_reads_is_let_go_and_delays_nobody(
         told_s = []
         while running.server.broadcaster.subscriber_count == 2:
             assert time.monotonic() < end_s, "it is never let go"
-            running.call(lambda: running.server.broadcaster.queue_notice(notice))
+            running.call(lambda: running.server.broadcaster.queue_droppable_notice(notice))
             next_of(live, "frame")
             told_s.append(time.monotonic())
         # Who waited for it would have told nothing while it was waited for. One long gap says

@@ -16,7 +16,7 @@ import foottile
 from devices.errors import StorageError
 from service.pull import pull_session
 from storage.sessions.folder import Session
-from storage.sessions.metadata import read_markers, write_markers
+from storage.sessions.metadata import read_existing_markers, write_markers
 from tests.service.command import command
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
@@ -198,7 +198,7 @@ def test_a_mark_that_is_sent_again_after_a_full_disk_is_in_the_table_too(
     assert session.running.http.post(f"{session.url}/markers", json=body).status_code == 507
     full[0] = False
     assert session.running.http.post(f"{session.url}/markers", json=body).status_code == 201
-    stored = read_markers(session.folder / "markers.parquet")
+    stored = read_existing_markers(session.folder / "markers.parquet")
     assert [event.label for event in stored] == ["a stone"]
 
 

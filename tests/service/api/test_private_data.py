@@ -10,7 +10,7 @@ import pytest
 
 from service.api.address import load_or_create_token
 from storage.durable_files import set_aside_damaged
-from storage.permissions import set_umask_and_restrict_folder
+from storage.permissions import set_umask_and_create_private_folder
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running
 
@@ -35,5 +35,5 @@ def test_a_folder_that_a_server_has_used_is_closed_to_others(
     set_aside_damaged(running.data / "server_id")
     running.start()
     running.data.chmod(0o755)
-    set_umask_and_restrict_folder(running.data)
+    set_umask_and_create_private_folder(running.data)
     assert stat.S_IMODE(running.data.stat().st_mode) == 0o700, os.listdir(running.data)

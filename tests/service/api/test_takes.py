@@ -11,7 +11,7 @@ import pytest
 import service.api.routes.recordings.sessions
 import service.server.recorder
 from devices.errors import StorageError
-from service.sessions.sealing import rebuild_session
+from service.sessions.sealing import rebuild_damaged_session_json
 from storage.sessions.folder import SessionsFolder
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import Running, assert_refused
@@ -226,6 +226,6 @@ def test_a_session_that_is_made_again_from_its_file_is_still_of_its_take(
     recording = running.session(made["sessions"][0]["id"])
     recording.sealed()
     (recording.folder / "session.json").unlink()
-    again = rebuild_session(SessionsFolder(recording.folder.parent), recording.id)
+    again = rebuild_damaged_session_json(SessionsFolder(recording.folder.parent), recording.id)
     assert again is not None
     assert again.take == made["id"]

@@ -39,7 +39,7 @@ def asked(models: tuple[str, ...], *batches: FrameBatch, **effects: Any) -> dict
     asking = OmittedModelEffect(INFO, calibration(**effects), models)
     for frames in batches:
         asking.add_frames(TARE, frames, frames.pressure_raw[:, 0] < 498)
-    return asking.compute_notable_mean_effects_n()
+    return asking.compute_notable_mean_grf_effects_by_model_n()
 
 
 def test_it_expects_what_the_model_would_change_under_load() -> None:
@@ -112,7 +112,7 @@ def test_another_tare_begins_anew_without_the_warmth_of_before() -> None:
         make_tare(2, temperature_raw_counts=469.0),
     ):
         asking.add_frames(tare, frames, frames.pressure_raw[:, 0] < 498)
-    assert asking.compute_notable_mean_effects_n() == {}
+    assert asking.compute_notable_mean_grf_effects_by_model_n() == {}
 
 
 def test_a_node_that_was_switched_on_again_begins_anew() -> None:

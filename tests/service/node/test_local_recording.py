@@ -92,7 +92,7 @@ def test_a_session_whose_calibration_cannot_be_read_is_sealed_and_says_so(
     first.add_stream(journal.switch_to_new_stream(stream(1)))
     (begun,) = sessions(tmp_path).values()
     spoilt = begun.model_copy(update={"calibration": {"this": "is none"}})
-    SessionsFolder(tmp_path / "sessions").save(spoilt)
+    SessionsFolder(tmp_path / "sessions").save_session_json(spoilt)
     recording(None).seal_earlier_sessions()
     assert sessions(tmp_path)["mud"].state == "sealed"
 

@@ -221,7 +221,7 @@ async def test_what_a_server_wants_is_told_with_the_streams_it_had_heard_of(node
 async def test_losses_are_said_whenever_they_change(node: FakeNode) -> None:
     async with played() as script, Publishing(node, script.url) as publishing:
         await publishing.until(lambda: script.said)
-        publishing.stream.record_loss_unless_delivered(
+        publishing.stream.record_unacked_or_node_session_loss(
             Intervals([(3, 9)]), "disk_full", NodeWanted(Path("nowhere"))
         )
         await publishing.until(lambda: any(isinstance(m, LossReport) for m in script.said))

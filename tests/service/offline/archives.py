@@ -61,7 +61,7 @@ def sealed(
     event = Marker(id=f"e{number}", label="=off", t_ns=UTC_NS)
     begun = session_of(number, scene, parts=(part,), markers=(event,))
     folder = SessionsFolder(data / "sessions")
-    folder.save(begun)
+    folder.save_session_json(begun)
     sources = SessionInputs(
         session=begun,
         info=info,
@@ -73,16 +73,16 @@ def sealed(
     )
     held = {info.stream_id: StreamState(stored=journal.stored)}
     done = seal_session(
-        sources, folder.get_path(begun.id), compute_ledger(begun.parts, held, is_finished=True)
+        sources, folder.get_path(begun.id), compute_ledger(begun.parts, held, has_all_parts=True)
     )
-    folder.save(done)
+    folder.save_session_json(done)
     return folder.get_path(begun.id)
 
 
 def recording(data: Path, number: int) -> Path:
     """A session that is being recorded."""
     folder = SessionsFolder(data / "sessions")
-    folder.save(session_of(number, "mud", "recording"))
+    folder.save_session_json(session_of(number, "mud", "recording"))
     return folder.get_path(IDS[number])
 
 

@@ -11,7 +11,10 @@ import pytest
 
 from devices.scene.scene_file import load_scene, validate_scene
 from service.estimation.calibration import Calibration
-from service.estimation.fitting.effects_fit import fit_determined_effects, replay_release_and_tap
+from service.estimation.fitting.effects_fit import (
+    fit_determined_effects,
+    simulate_release_and_tap_pressure,
+)
 from service.estimation.fitting.rig.indentation import Indentation
 from service.offline.calibration_fit import fit_calibration, read_indentations
 from service.offline.calibration_lookup import replace_tiles
@@ -36,7 +39,9 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
 
 def test_a_release_and_a_tap_are_replayed_better_with_effects_than_without(bench: Bench) -> None:
     calibration, recordings = bench
-    found = replay_release_and_tap(recordings["T01"], calibration.get_tile("T01"))
+    found = simulate_release_and_tap_pressure(
+        recordings["T01"], calibration.get_tile_or_preset("T01")
+    )
     assert set(found) == {"release", "tap"}
     for replay in found.values():
         known = np.isfinite(replay.measured_kpa)
@@ -57,7 +62,9 @@ def test_a_recording_without_fast_loads_has_nothing_to_replay(bench: Bench) -> N
         n: v[:last] for n, v in vars(recording).items() if isinstance(v, np.ndarray)
     }
     only_slow = replace(recording, **columns)
-    assert replay_release_and_tap([only_slow], calibration.get_tile("T01")) == {}
+    assert (
+        simulate_release_and_tap_pressure([only_slow], calibration.get_tile_or_preset("T01")) == {}
+    )
 
 
 def test_a_soak_in_a_file_of_its_own_tells_the_same_of_warmth(bench: Bench) -> None:
@@ -72,7 +79,7 @@ def test_a_soak_in_a_file_of_its_own_tells_the_same_of_warmth(bench: Bench) -> N
             }
         )
 
-    tile = calibration.get_tile("T01")
+    tile = calibration.get_tile_or_preset("T01")
     without = fit_determined_effects([part(~soaks)], tile)
     assert without.temperature is None
     apart = fit_determined_effects([part(~soaks), part(soaks)], tile)
@@ -89,7 +96,7 @@ def test_a_picture_holds_any_number_of_tiles(bench: Bench, tiles: int) -> None:
     from service.offline.calibration_plot import plot_calibration
 
     calibration, recordings = bench
-    entry = calibration.get_tile("T01")
+    entry = calibration.get_tile_or_preset("T01")
     serials = [f"T{i:02}" for i in range(tiles)]
     many = calibration.model_copy(
         update={"tiles": tuple(entry.model_copy(update={"serial": s}) for s in serials)}

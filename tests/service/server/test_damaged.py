@@ -121,7 +121,7 @@ def test_a_session_has_forces_if_a_proven_tare_was_taken_between_it_and_a_lost_o
     tared.next_t_mono_ns = later_ns
     running.stop()
     path = running.data / "nodes" / "bench" / "tares.json"
-    info, by_lead = tared.info, TareHistory(path).all_tares[0].tare
+    info, by_lead = tared.info, TareHistory(path).all_tares_with_undone[0].tare
     for later_s in (100, 200) if is_one_between else (200,):
         t_ns = by_lead.t_ns + later_s * 10**9
         TareHistory(path).store_and_apply_tare(replace(by_lead, t_ns=t_ns, source="unloaded"), info)

@@ -9,7 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.server.session_parts import abandon_missing, extend_or_continue_session
+from service.server.session_parts import (
+    abandon_missing,
+    extend_session_or_continue_with_other_tiles,
+)
 from service.sessions.parts import create_session
 from storage.intervals import Intervals
 from storage.sessions.folder import Part, Session
@@ -54,7 +57,7 @@ class Recorded:
         self.follow()
 
     def follow(self) -> None:
-        self.session = extend_or_continue_session(self.session, self.told.node)[0]
+        self.session = extend_session_or_continue_with_other_tiles(self.session, self.told.node)[0]
 
 
 @settings(max_examples=60, deadline=None)

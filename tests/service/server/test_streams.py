@@ -70,7 +70,7 @@ class Told:
         return EarlierStream(**(content | changes))
 
     def connect(self, **changes: Any) -> None:
-        self.node.apply_hello(self.hello(**changes), UTC_NS)
+        self.node.apply_checked_hello(self.hello(**changes), UTC_NS)
 
     def take(self, first: int, last: int, boot: str = NEW) -> list[int]:
         """Numbers whose estimates are due then."""
@@ -88,7 +88,10 @@ class Told:
 
     def lacks(self, **needed: list[tuple[int, int]]) -> dict[str, list[tuple[int, int | None]]]:
         named = {{"old": OLD, "new": NEW}[name]: Intervals(n) for name, n in needed.items()}
-        return {each.stream_id: [*each.numbers] for each in self.node.frames_to_request(named)}
+        return {
+            each.stream_id: [*each.numbers]
+            for each in self.node.needed_and_present_frames_to_request(named)
+        }
 
     def close(self) -> None:
         for journal in self.node.journals.values():
@@ -169,17 +172,17 @@ def test_frames_of_two_streams_in_any_order_and_any_number_of_times_are_each_hel
                     getattr(found, name), getattr(frames(0, total - 1, boot), name)
                 )
         assert told.node.present_stream_lost_by_reason == {}
-        assert told.node.backlog_frames == 0
+        assert told.node.present_stream_backlog_frames == 0
         told.close()
 
 
 def test_what_is_missing_and_still_with_the_node_is_backlog_and_not_lost(told: Told) -> None:
     told.connect(stored=((0, 99),), next_seq=100)
     told.take(100, 104)
-    assert told.node.backlog_frames == 100
+    assert told.node.present_stream_backlog_frames == 100
     assert told.node.present_stream_lost_by_reason == {}
     told.take(50, 54)
-    assert told.node.backlog_frames == 95
+    assert told.node.present_stream_backlog_frames == 95
 
 
 def test_what_the_node_has_lost_is_counted_by_its_reason_and_no_backlog(told: Told) -> None:
@@ -187,7 +190,7 @@ def test_what_the_node_has_lost_is_counted_by_its_reason_and_no_backlog(told: To
     told.take(100, 104)
     told.node.present_stream.set_node_losses({"evicted": ((0, 9),), "disk_full": ((20, 24),)})
     assert told.node.present_stream_lost_by_reason == {"evicted": 10, "disk_full": 5}
-    assert told.node.backlog_frames == 85
+    assert told.node.present_stream_backlog_frames == 85
 
 
 def test_a_loss_that_came_all_the_same_is_none(told: Told) -> None:
@@ -213,7 +216,7 @@ def test_what_was_deleted_because_nobody_needs_it_is_not_lost_even_after_a_resta
     for n in range(0, 100, 5):
         told.take(n, n + 4)
     told.synced()
-    told.node.delete_unneeded_step({NEW: Intervals([(10, 12)])})
+    told.node.delete_old_frames_or_one_ended_journal({NEW: Intervals([(10, 12)])})
     held = told.node.present_stream.stored
     assert held.missing_in(10, 12).number_count == 0
     assert held.missing_in(0, 99).number_count > 50
@@ -231,12 +234,12 @@ def test_what_was_deleted_because_nobody_needs_it_is_not_lost_even_after_a_resta
 def test_frames_that_no_session_needs_are_acknowledged_before_they_are_deleted(told: Told) -> None:
     told.connect(earlier=(told.earlier(stored=((0, 4),), next_seq=5),))
     told.take(0, 4, OLD)
-    assert not told.node.delete_unneeded_step({})
+    assert not told.node.delete_old_frames_or_one_ended_journal({})
     assert told.synced()[OLD] == Intervals([(0, 4)])
-    assert told.node.delete_unneeded_step({})
+    assert told.node.delete_old_frames_or_one_ended_journal({})
     told.take(0, 4, OLD)
     told.node.storage_problem = "the disk is full"
-    assert told.node.delete_unneeded_step({})  # it makes room
+    assert told.node.delete_old_frames_or_one_ended_journal({})  # it makes room
 
 
 def test_of_the_present_stream_all_is_asked_for_and_what_sessions_need_first(told: Told) -> None:
@@ -359,13 +362,13 @@ def test_what_is_held_next_to_an_instant_is_the_same_whether_it_was_asked_before
             told.take(n * PER_MESSAGE, (n + 1) * PER_MESSAGE - 1)
             sent.add(n * PER_MESSAGE, (n + 1) * PER_MESSAGE - 1)
             stream = told.node.present_stream
-            found = stream.find_seqs_around(t_ns, min_seq=at_least)
+            found = stream.find_seqs_around_once_passed(t_ns, min_seq=at_least)
             held = [seq for a, b in sent for seq in range(a, b + 1) if seq >= at_least]
             until = max((seq for seq in held if seq <= at), default=at_least - 1)
             after = min((seq for seq in held if seq > at), default=None)
             assert found == (None if after is None else (until, after))
             # While frames in between may come, it may answer as before, but says that they lack.
-            lazy = stream.find_seqs_around(t_ns, min_seq=at_least, may_be_stale=True)
+            lazy = stream.find_seqs_around_once_passed(t_ns, min_seq=at_least, may_be_stale=True)
             assert (lazy is None) == (found is None)
             if lazy is not None and lazy != found:
                 assert stream.obtainable.restricted_to(lazy[0] + 1, lazy[1] - 1)

@@ -55,7 +55,7 @@ class Foot:
         if hasattr(self, "node"):
             self.close()
         self.node = ServerNode(self._folder / "node", self._folder / "journal", self.hello)
-        self.node.apply_hello(self.hello, UTC_NS)
+        self.node.apply_checked_hello(self.hello, UTC_NS)
         self.node.is_connected = True
 
     def close(self) -> None:
@@ -113,15 +113,18 @@ class Foot:
 
     @property
     def auto_tare(self) -> str:
-        return self.node.estimator.tare_controller.auto_tare
+        return self.node.estimator.tare_controller.auto_tare_state
 
     @property
     def history(self) -> list[tuple[str, bool]]:
-        return [(t.tare.source, t.undone) for t in self.node.estimator.tare_history.all_tares]
+        return [
+            (t.tare.source, t.undone)
+            for t in self.node.estimator.tare_history.all_tares_with_undone
+        ]
 
     @property
     def offset_counts(self) -> list[float]:
-        tare = self.node.estimator.live.tare
+        tare = self.node.estimator.live.usable_tare
         assert tare is not None
         return list((tare.baseline_kpa - UNLOADED_KPA) / COUNT_KPA)
 
@@ -211,18 +214,20 @@ def test_a_lead_that_is_no_tare_is_said_with_its_reason(foot_of: Any) -> None:
 def test_without_a_lead_that_could_be_used_the_tare_of_before_stays_and_that_is_said(
     foot: Foot,
 ) -> None:
-    before = foot.node.estimator.live.tare
+    before = foot.node.estimator.live.usable_tare
     again = {"stream_id": "1" * 32}
     info = foot.hello.array_info.model_copy(update=again)
     foot.hello = foot.hello.model_copy(update={"array_info": info})
-    foot.node.apply_hello(foot.hello, UTC_NS)
+    foot.node.apply_checked_hello(foot.hello, UTC_NS)
     foot.seq = 0
     foot.live(1.0, lead=True, silent=0)
     foot.live(1.0)
-    assert foot.node.estimator.live.tare is not None
+    assert foot.node.estimator.live.usable_tare is not None
     assert before is not None
-    assert foot.node.estimator.live.tare.t_ns == before.t_ns
-    assert "tile T01 has 0 readable frames" in str(foot.node.estimator.tare_controller.problem)
+    assert foot.node.estimator.live.usable_tare.t_ns == before.t_ns
+    assert "tile T01 has 0 readable frames" in str(
+        foot.node.estimator.tare_controller.missing_tare_reason
+    )
 
 
 def test_a_lead_whose_tare_cannot_be_kept_is_a_storage_problem_and_tried_again(
@@ -253,7 +258,7 @@ def test_a_foot_whose_lead_failed_is_tared_as_soon_as_it_steps(foot_of: Any) -> 
     assert foot.history == [("flight", False)]
     assert foot.offset_counts == pytest.approx([2.0, 2.0], abs=0.6)
     assert foot.node.estimator.tare_controller.problem is None
-    assert "between two steps" in foot.node.estimator.tare_history.all_tares[0].reason
+    assert "between two steps" in foot.node.estimator.tare_history.all_tares_with_undone[0].reason
 
 
 def test_a_foot_that_stands_from_the_beginning_is_never_tared_unasked(foot_of: Any) -> None:
@@ -272,9 +277,16 @@ def test_a_dome_that_warms_is_followed_between_steps_and_each_time_is_in_the_his
         for _ in range(20):
             foot.live(2.0, COUNTS_PER_K * warmer_k, warmer_k=warmer_k)
             foot.live(1.0, COUNTS_PER_K * warmer_k + 40.0, warmer_k=warmer_k)
-    flights = [t for t in foot.node.estimator.tare_history.all_tares if t.tare.source == "flight"]
+    flights = [
+        t
+        for t in foot.node.estimator.tare_history.all_tares_with_undone
+        if t.tare.source == "flight"
+    ]
     assert 3 <= len(flights) <= 5
-    t_s = np.array([t.tare.t_ns for t in foot.node.estimator.tare_history.all_tares]) * 1e-9
+    t_s = (
+        np.array([t.tare.t_ns for t in foot.node.estimator.tare_history.all_tares_with_undone])
+        * 1e-9
+    )
     assert (np.diff(t_s) >= 60.0 - 1e-6).all()
     assert all(" kPa from the tare before" in t.reason for t in flights)
     assert foot.offset_counts == pytest.approx([COUNTS_PER_K * 2.0] * 2, abs=COUNTS_PER_K * 0.6)
@@ -329,7 +341,9 @@ def test_an_automatic_tare_that_is_undone_does_not_come_back_until_somebody_tare
     foot.live(70.0, 0.9)
     assert foot.history == [("lead", False), ("flight", False)]
     assert foot.auto_tare == "on"
-    foot.node.estimator.tare_controller.undo_tare(foot.node.estimator.tare_history.all_tares[-1].id)
+    foot.node.estimator.tare_controller.undo_any_tare_and_pause_automatic(
+        foot.node.estimator.tare_history.all_tares_with_undone[-1].id
+    )
     assert foot.offset_counts == pytest.approx([0.0, 0.0], abs=0.4)
     assert foot.auto_tare == "paused"
     foot.live(200.0, 0.9)
@@ -346,11 +360,11 @@ def test_an_automatic_tare_that_is_undone_does_not_come_back_until_somebody_tare
 def test_an_automatic_tare_that_cannot_be_kept_is_not_in_force(
     foot: Foot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before = foot.node.estimator.live.tare
+    before = foot.node.estimator.live.usable_tare
     monkeypatch.setattr("service.sessions.tares.write_tares", refusing(StorageError, "full"))
     foot.live(70.0, 0.9)
     assert foot.history == [("lead", False)]
-    assert foot.node.estimator.live.tare is before
+    assert foot.node.estimator.live.usable_tare is before
     assert foot.node.storage_problem == "full"
 
 

@@ -349,7 +349,11 @@ def test_frames_of_an_unsealed_session_are_never_pruned(
     monkeypatch.setattr("service.server.node.RING_DURATION_NS", 0)
     pending(tared)
     node = running.server.nodes.get("bench")
-    running.call(lambda: node.delete_unneeded_step(running.server.recorder.needed_frames("bench")))
+    running.call(
+        lambda: node.delete_old_frames_or_one_ended_journal(
+            running.server.recorder.needed_frames("bench")
+        )
+    )
     assert not (Intervals([(70, 119)]) - node.present_stream.stored)
 
 
@@ -367,7 +371,9 @@ def test_journals_that_nobody_needs_go_one_at_a_time(running: Running, tared: Fa
     folder = running.data / "journal" / "bench"
     left = []
     while running.call(
-        lambda: node.delete_unneeded_step(running.server.recorder.needed_frames("bench"))
+        lambda: node.delete_old_frames_or_one_ended_journal(
+            running.server.recorder.needed_frames("bench")
+        )
     ):
         left.append(sorted(path.name for path in folder.iterdir()))
     assert left == [sorted(boots[1:]), boots[2:]]

@@ -149,7 +149,7 @@ def test_tares_that_are_damaged_and_cannot_be_set_aside_are_not_written_over(
         with pytest.raises(StorageError, match="Move it away by hand"):
             TareHistory(path)
     assert contents(tmp_path) == before
-    assert len(TareHistory(path).all_tares) == 1
+    assert len(TareHistory(path).all_tares_with_undone) == 1
 
 
 @pytest.mark.parametrize("name", ["hello.json", "tares.json"])
@@ -185,7 +185,7 @@ def refused_journals(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
     monkeypatch.setattr(sealer, "_RETRY_S", 0.1)
     with monkeypatch.context() as disk:
-        disk.setattr(journal_module, "recover_segment", refuse)
+        disk.setattr(journal_module, "recover_or_delete_segment", refuse)
         yield
 
 

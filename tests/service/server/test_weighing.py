@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.server.weighing import HOLD_S, REST_S, Action, Begin, Weighing, Withdraw
+from service.server.weighing import HOLD_S, REST_S, Begin, MarkerChange, Weighing, Withdraw
 
 RATE_HZ = 100
 EMPTY_KPA = 100.0
@@ -23,7 +23,7 @@ class Tile:
         """Have nothing read for so long."""
         self._readings += round(seconds * RATE_HZ)
 
-    def reads(self, kpa: float, seconds: float, *, per_s: float = 0.0) -> list[Action]:
+    def reads(self, kpa: float, seconds: float, *, per_s: float = 0.0) -> list[MarkerChange]:
         """Have it read so much for so long, rising or falling; what was done."""
         n = round(seconds * RATE_HZ)
         since_s = np.arange(n) / RATE_HZ
@@ -35,7 +35,7 @@ class Tile:
         )
 
 
-def labels(actions: list[Action]) -> list[str]:
+def labels(actions: list[MarkerChange]) -> list[str]:
     """What is marked and withdrawn, in short."""
     return [
         action.label if isinstance(action, Begin) else type(action).__name__ for action in actions
@@ -111,7 +111,7 @@ def test_a_weight_that_was_another_one_is_repeated_from_its_rest_on() -> None:
     tile.reads(5.0, HOLD_S + 2.0)
     tile.reads(0.0, REST_S + 2.0)
     assert tile.weighing.weight_index == 1
-    assert labels(tile.weighing.repeat_last_weight()) == [
+    assert labels(tile.weighing.repeat_held_or_last_weight()) == [
         "Withdraw",
         "Withdraw",
     ]  # the rest, and the weight
@@ -124,7 +124,7 @@ def test_a_weight_that_is_repeated_while_it_is_held_is_no_rest() -> None:
     tile = Tile()
     tile.reads(0.0, REST_S + 2.0)
     tile.reads(5.0, 3.0)
-    assert labels(tile.weighing.repeat_last_weight()) == ["Withdraw"]
+    assert labels(tile.weighing.repeat_held_or_last_weight()) == ["Withdraw"]
     assert tile.reads(5.0, REST_S + 2.0) == []
     assert tile.weighing.prompt == "Take everything off T01"
     assert labels(tile.reads(0.0, REST_S + 2.0)) == ["T01 rest", "End"]

@@ -10,7 +10,7 @@ import numpy as np
 
 from devices.flags import FrameFlag
 from devices.frames import ArrayInfo, FrameBatch
-from service.sessions.recovery import RecoveredSession, RecoveryReport, recover_folder
+from service.sessions.recovery import RecoveredSession, RecoveryReport, recover_locked_folder
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes, compute_max_lost_tail_frames
 from storage.sessions.folder import Ledger, Marker, Part, Session, SessionsFolder
@@ -77,7 +77,7 @@ def session(data: Path, session_id: str = ID, **changes: Any) -> Session:
         "markers": (Marker(id="e1", label="slip", t_ns=t_ns(500)),),
     }
     kept = Session(**content | changes)
-    SessionsFolder(data / "sessions").save(kept)
+    SessionsFolder(data / "sessions").save_session_json(kept)
     return kept
 
 
@@ -87,7 +87,7 @@ def loaded(data: Path, session_id: str = ID) -> Session:
 
 def recovered(data: Path, **how: Any) -> tuple[RecoveredSession, Ledger]:
     """The one session that is recovered, and what became of its frames."""
-    (one,) = recover_folder(data, **how).sessions
+    (one,) = recover_locked_folder(data, **how).sessions
     assert one.ledger is not None
     return one, one.ledger
 

@@ -13,10 +13,10 @@ from tests.service.sessions.tares import INFO, history, rewrite
 
 def assert_lost(path: Path) -> None:
     found = TareHistory(path)
-    assert found.all_tares == []
-    assert found.tare_in_force(INFO) is None
+    assert found.all_tares_with_undone == []
+    assert found.tare_in_force_unless_lost(INFO) is None
     assert found.is_tare_lost(INFO)
-    assert [tare.is_lost for tare in found.tares_in_force_between(INFO, 0, 9)] == [True]
+    assert [tare.is_lost for tare in found.tares_in_force_or_lost_between(INFO, 0, 9)] == [True]
     assert path.with_name("tares.json.damaged-1").exists()
     assert found.problem is not None
     assert "tares.json.damaged-1" in found.problem

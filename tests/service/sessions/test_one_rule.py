@@ -21,7 +21,7 @@ from service.server.nodes import NodeRegistry
 from service.server.recorder import Recorder
 from service.server.sealer import SessionSealer
 from service.server.session_store import SessionStore, Trash
-from service.sessions.recovery import recover_folder
+from service.sessions.recovery import recover_locked_folder
 from service.sessions.tares import TareHistory
 from storage.clock.log import ClockOffset
 from storage.intervals import Losses
@@ -29,7 +29,7 @@ from storage.journal.journal import Journal
 from storage.journal.node.journal import NodeJournal
 from storage.journal.stream_notes import StreamNotes
 from storage.sessions.folder import Part, Session, SessionsFolder
-from storage.sessions.ledger import compute_ledger, settle_losses
+from storage.sessions.ledger import compute_ledger, mark_damaged_and_abandoned_lost
 from storage.verify.session import verify_session
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.calibrations import make_calibration, make_tare
@@ -103,7 +103,7 @@ SEQ = st.integers(0, BATCHES * BATCH)
 
 def keep(data: Path, kept: Session) -> Path:
     folder = SessionsFolder(data / "sessions")
-    folder.save(kept)
+    folder.save_session_json(kept)
     return folder.get_path(kept.id)
 
 
@@ -152,7 +152,7 @@ def test_a_node_alone_and_recovery_in_its_folder_seal_the_same_session(
         )
         recording.seal_earlier_sessions()
         journal.end_streams_and_close()
-        recover_folder(recovered)
+        recover_locked_folder(recovered)
         done = loaded(alone)
         assert done.state == "sealed"
         assert what_it_is(done) == what_it_is(loaded(recovered))
@@ -206,24 +206,26 @@ def test_a_server_and_recovery_in_its_folder_come_to_the_same_session(
             history = TareHistory(data / "nodes" / "bench" / "tares.json")
             history.store_and_apply_tare(make_tare(t_ns=t_ns(tared)), INFO)
         recorder, node = server_on(data, begun)
-        made = recorder.collect_inputs(ID)
+        made = recorder.collect_unsealed_inputs(ID)
         waiting = recorder.get_ledger(ID)
         if end is not None:
             counted = verify_session(data / "sessions" / ID).ledger
             assert counted is not None
             assert (counted.parts, counted.missed_slots) == (waiting.parts, waiting.missed_slots)
-            (one,) = recover_folder(data).sessions
+            (one,) = recover_locked_folder(data).sessions
             assert one.outcome == "sealed" or one.ledger == waiting
             keep(data, begun)
         abandoned = session_parts.abandon_missing(begun, node)
-        (one,) = recover_folder(data, abandon_missing=True).sessions
+        (one,) = recover_locked_folder(data, abandon_missing=True).sessions
         done = one.session
         assert done.state == "sealed"
         assert (done.parts, done.is_abandoned) == (abandoned.parts, True)
         assert done.max_lost_tail_frames == abandoned.max_lost_tail_frames
         streams_then = session_parts.collect_stream_facts(abandoned, node)
         ledger = compute_ledger(
-            abandoned.parts, settle_losses(abandoned, streams_then), is_finished=True
+            abandoned.parts,
+            mark_damaged_and_abandoned_lost(abandoned, streams_then),
+            has_all_parts=True,
         )
         assert done.ledger == ledger
         if done.frames and made.problem is not None:
@@ -245,7 +247,7 @@ def server_on(data: Path, begun: Session) -> tuple[Recorder, ServerNode]:
         calibration=None,
         calibration_problem="for this test",
     )
-    node = nodes.get_or_create(hello)
+    node = nodes.check_hello_and_get_or_create(hello)
     node.save_hello()
     keep(data, begun)
     book = SessionStore(

@@ -21,7 +21,7 @@ from devices.errors import StorageError, UsageError
 from devices.frames import FrameBatch
 from service.estimation.tare.tare import Tare
 from service.sessions.checkpoints import make_preview_stream
-from service.sessions.frames import iterate_raw_frames
+from service.sessions.frames import iterate_raw_frames_with_part
 from service.sessions.inputs import SessionInputs
 from service.sessions.preview import SessionPreview, SessionPreviews
 from service.sessions.preview_frames import PreviewFrames
@@ -121,7 +121,7 @@ def text_of(content: Any, part: Slice) -> bytes:
 
 def in_one_go(sources: SessionInputs, part: Slice) -> bytes:
     stream = make_preview_stream(sources)
-    raw = iterate_raw_frames(sources)
+    raw = iterate_raw_frames_with_part(sources)
     pieces = raw if stream is None else stream.estimate_batches(raw)
     return text_of(make_one_pass_frame_source(pieces, axis=sources.compute_time_axis()), part)
 
@@ -132,9 +132,9 @@ def so_it_is(so_far: SessionPreview, sources: SessionInputs, part: Slice) -> Non
         wanted = in_one_go(sources, part)
     except UsageError:
         with pytest.raises(UsageError):
-            text_of(PreviewFrames(so_far, sources, part).make_content(), part)
+            text_of(PreviewFrames(so_far, sources, part).make_one_pass_source(), part)
         return
-    assert text_of(PreviewFrames(so_far, sources, part).make_content(), part) == wanted
+    assert text_of(PreviewFrames(so_far, sources, part).make_one_pass_source(), part) == wanted
 
 
 HAPPENS = st.one_of(
@@ -161,7 +161,7 @@ def test_any_slice_at_any_moment_is_that_of_the_whole_in_one_go(
     if tared:
         recorded.tares.append(taken_at(0, 0.0))
     so_fars = SessionPreviews(folder)
-    so_far = so_fars.advance_preview(recorded.sources())
+    so_far = so_fars.advance_preview_within_time_limit(recorded.sources())
     try:
         for what, n in [*happened, ("look", 0), ("slice", 0), ("slice", 100)]:
             match what:
@@ -171,7 +171,7 @@ def test_any_slice_at_any_moment_is_that_of_the_whole_in_one_go(
                     journal, frames = recorded.late.pop(0)
                     journal.append_new_frames(frames)
                 case "look":
-                    so_far = so_fars.advance_preview(recorded.sources())
+                    so_far = so_fars.advance_preview_within_time_limit(recorded.sources())
                 case "tare":
                     at = max(
                         [PERIOD_NS * (recorded.now + n), *(t.t_ns - 10**18 for t in recorded.tares)]
@@ -185,7 +185,7 @@ def test_any_slice_at_any_moment_is_that_of_the_whole_in_one_go(
                     so_it_is(so_far, recorded.sources(), part)
         so_it_is(so_far, recorded.sources(), Slice())
         assert_the_overview_is_as_in_one_go(
-            so_fars.advance_preview(recorded.sources()), recorded.sources()
+            so_fars.advance_preview_within_time_limit(recorded.sources()), recorded.sources()
         )
     finally:
         recorded.close()
@@ -194,7 +194,7 @@ def test_any_slice_at_any_moment_is_that_of_the_whole_in_one_go(
 
 def assert_the_overview_is_as_in_one_go(so_far: SessionPreview, sources: SessionInputs) -> None:
     stream = make_preview_stream(sources)
-    raw = iterate_raw_frames(sources)
+    raw = iterate_raw_frames_with_part(sources)
     wanted = PreviewBins()
     for frames, columns in raw if stream is None else stream.estimate_batches(raw, is_final=False):
         names = required_frame_columns(has_estimates=stream is not None)
@@ -230,19 +230,19 @@ def read_by(
 
     def counted(*arguments: Any) -> Iterator[Any]:
         nonlocal read
-        for frames, columns in iterate_raw_frames(*arguments):
+        for frames, columns in iterate_raw_frames_with_part(*arguments):
             read += len(frames)
             yield frames, columns
 
-    monkeypatch.setattr(service.sessions.preview_frames, "iterate_raw_frames", counted)
-    text_of(PreviewFrames(so_far, recorded.sources(), part).make_content(), part)
+    monkeypatch.setattr(service.sessions.preview_frames, "iterate_raw_frames_with_part", counted)
+    text_of(PreviewFrames(so_far, recorded.sources(), part).make_one_pass_source(), part)
     return read
 
 
 def test_what_a_slice_costs_does_not_depend_on_where_it_is(
     long: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    so_far = SessionPreviews(tmp_path).advance_preview(long.sources())
+    so_far = SessionPreviews(tmp_path).advance_preview_within_time_limit(long.sources())
     apart = so_far.checkpoints.distance_frames
     assert len(so_far.checkpoints.checkpoints) <= 6
     assert 1000 <= apart < 4000
@@ -262,14 +262,14 @@ def test_after_frames_that_came_late_only_what_is_behind_them_is_estimated_anew(
     recorded.come(4000)
     recorded.come(100, late=True)
     recorded.come(900)
-    so_far = so_fars.advance_preview(recorded.sources())
+    so_far = so_fars.advance_preview_within_time_limit(recorded.sources())
     before = so_far.checkpoints.checkpoints
     journal, frames = recorded.late.pop()
     journal.append_new_frames(frames)
     true = so_far.valid_checkpoints(recorded.sources())
     assert 4000 - 2 * EVERY < true[-1].fed_frames <= 4000
     assert list(true) == list(before[: len(true)])
-    assert so_fars.advance_preview(recorded.sources()) is so_far
+    assert so_fars.advance_preview_within_time_limit(recorded.sources()) is so_far
     assert so_far.checkpoints.checkpoints[: len(true) - 2] == before[: len(true) - 2]
     assert_the_overview_is_as_in_one_go(so_far, recorded.sources())
     so_it_is(so_far, recorded.sources(), Slice(8.1, 8.3))
@@ -286,7 +286,7 @@ def test_a_disk_that_is_full_or_forgets_costs_time_and_no_frame(
     so_fars = SessionPreviews(tmp_path)
     if failing == "put":
         monkeypatch.setattr(ScratchFile, "append", refuse)
-    so_far = so_fars.advance_preview(long.sources())
+    so_far = so_fars.advance_preview_within_time_limit(long.sources())
     assert (len(so_far.checkpoints.checkpoints) == 1) == (failing == "put")
     if failing == "get":
         monkeypatch.setattr(ScratchFile, "read", refuse)
@@ -298,13 +298,13 @@ def test_without_a_tare_there_are_raw_frames_and_once_there_is_one_estimates(
 ) -> None:
     recorded, so_fars = Recorded(tmp_path), SessionPreviews(tmp_path)
     recorded.come(300)
-    raw = so_fars.advance_preview(recorded.sources())
+    raw = so_fars.advance_preview_within_time_limit(recorded.sources())
     so_it_is(raw, recorded.sources(), Slice(0.3, 0.4))
-    assert not raw.has_estimates
+    assert not raw.has_estimate_stream
     recorded.tares.append(taken_at(2_000_000 * 200, 0.0))
     so_it_is(raw, recorded.sources(), Slice(0.3, 0.4))
-    estimated = so_fars.advance_preview(recorded.sources())
-    assert estimated.has_estimates
+    estimated = so_fars.advance_preview_within_time_limit(recorded.sources())
+    assert estimated.has_estimate_stream
     so_it_is(estimated, recorded.sources(), Slice(0.3, 0.4))
     recorded.close()
 
@@ -321,7 +321,7 @@ def test_a_clock_that_was_set_back_has_its_parts_one_behind_the_other(
             recorded.begin_part(150)
         recorded.come(1)
         if come == looked - 1:
-            so_far = so_fars.advance_preview(recorded.sources())
+            so_far = so_fars.advance_preview_within_time_limit(recorded.sources())
     for begin_s, number in ((0.2, 0), (0.42, 1)):
         part = Slice(begin_s, begin_s + 0.02, ("part",))
         so_it_is(so_far, recorded.sources(), part)
@@ -334,5 +334,5 @@ def test_before_the_first_frame_there_is_nothing(tmp_path: Path) -> None:
     recorded = Recorded(tmp_path)
     sources = recorded.sources()
     with pytest.raises(UsageError, match="no frames"):
-        PreviewFrames(SessionPreview(sources, tmp_path), sources, Slice()).make_content()
+        PreviewFrames(SessionPreview(sources, tmp_path), sources, Slice()).make_one_pass_source()
     recorded.close()

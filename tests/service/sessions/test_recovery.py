@@ -14,7 +14,7 @@ import pytest
 
 from devices.errors import StorageError
 from service.sessions import recovery as recover_module
-from service.sessions.recovery import recover_folder
+from service.sessions.recovery import recover_locked_folder
 from service.sessions.sealing import seal_session
 from storage.clock.log import ClockOffset
 from storage.durable_files import lock_folder
@@ -49,7 +49,7 @@ def test_a_node_that_died_while_recording_leaves_a_sealed_session(tmp_path: Path
     (segment,) = folder.glob("*.arrows")
     segment.write_bytes(segment.read_bytes() + b"half a batch")
     session(tmp_path, calibration=make_calibration("T01", "T02").model_dump(mode="json"))
-    recovery = recover_folder(tmp_path)
+    recovery = recover_locked_folder(tmp_path)
     assert (outcomes(recovery), recovery.problems) == (["sealed"], [])
     assert recovery.sessions[0].problem == ""
     assert recovery.cut_bytes == {f"bench/{BOOT}": len(b"half a batch")}
@@ -72,10 +72,10 @@ def test_a_node_that_died_while_recording_leaves_a_sealed_session(tmp_path: Path
 def test_a_second_run_finds_nothing_and_changes_nothing(tmp_path: Path) -> None:
     stream(tmp_path, info_of(), (0, 99), closed=False)
     session(tmp_path)
-    assert not recover_folder(tmp_path, make_sessions=True).is_empty
+    assert not recover_locked_folder(tmp_path, make_sessions=True).is_empty_or_all_waiting
     before = state_of(tmp_path)
-    again = recover_folder(tmp_path, make_sessions=True)
-    assert again.is_empty
+    again = recover_locked_folder(tmp_path, make_sessions=True)
+    assert again.is_empty_or_all_waiting
     assert again.sessions == []
     assert state_of(tmp_path) == before
 
@@ -83,7 +83,7 @@ def test_a_second_run_finds_nothing_and_changes_nothing(tmp_path: Path) -> None:
 def test_without_tare_or_calibration_raw_frames_are_kept_and_it_says_so(tmp_path: Path) -> None:
     stream(tmp_path, info_of(), (0, 99))
     session(tmp_path)
-    (one,) = recover_folder(tmp_path).sessions
+    (one,) = recover_locked_folder(tmp_path).sessions
     assert "no calibration" in one.problem
     assert loaded(tmp_path).frames == 100
 
@@ -92,7 +92,7 @@ def test_a_process_that_was_killed_on_a_machine_that_stayed_up_lost_nothing(tmp_
     folder = stream(tmp_path, info_of(), (0, 99), closed=False)
     InFlightWriter(folder, info_of()).close()
     session(tmp_path)
-    assert recover_folder(tmp_path).sessions[0].ledger == loaded(tmp_path).ledger
+    assert recover_locked_folder(tmp_path).sessions[0].ledger == loaded(tmp_path).ledger
     ledger = loaded(tmp_path).ledger
     assert ledger is not None
     assert ledger.complete
@@ -106,7 +106,7 @@ def test_after_another_start_of_the_machine_what_was_in_flight_is_gone(
     InFlightWriter(folder, info_of()).close()
     monkeypatch.setattr("storage.journal.node.in_flight.read_kernel_boot_id", lambda: "another")
     session(tmp_path)
-    assert recover_folder(tmp_path).sessions[0].ledger == loaded(tmp_path).ledger
+    assert recover_locked_folder(tmp_path).sessions[0].ledger == loaded(tmp_path).ledger
     ledger = loaded(tmp_path).ledger
     assert ledger is not None
     assert ledger.parts[0].max_lost_tail_frames == TAIL
@@ -139,7 +139,7 @@ def test_several_parts_become_one_file(tmp_path: Path) -> None:
         Part(stream_id=OTHER_BOOT, seq_first=0),
     )
     session(tmp_path, parts=parts)
-    assert outcomes(recover_folder(tmp_path)) == ["sealed"]
+    assert outcomes(recover_locked_folder(tmp_path)) == ["sealed"]
     assert loaded(tmp_path).frames == 145
     assert verify_path(tmp_path).to_json_dict()["problems"] == []
 
@@ -150,7 +150,7 @@ def test_a_session_of_which_nothing_reached_the_disk_is_sealed_as_that(tmp_path:
     assert one.outcome == "sealed"
     assert ledger.parts[0].max_lost_tail_frames == compute_max_lost_tail_frames(1000.0)
     assert (loaded(tmp_path).frames, loaded(tmp_path).problem) == (0, "no frame was recorded")
-    assert recover_folder(tmp_path).is_empty
+    assert recover_locked_folder(tmp_path).is_empty_or_all_waiting
 
 
 # --- a server -------------------------------------------------------------------------------------
@@ -164,11 +164,11 @@ def test_what_a_node_may_still_bring_is_waited_for(tmp_path: Path) -> None:
     parts = (Part(stream_id=BOOT, seq_first=130, seq_last=150),)
     session(tmp_path, ID[:-1] + "c", state="pending", stopped_t_ns=t_ns(150), parts=parts)
     before = (tmp_path / "sessions" / ID / "session.json").read_bytes()
-    recovery = recover_folder(tmp_path)
+    recovery = recover_locked_folder(tmp_path)
     assert outcomes(recovery) == ["waiting", "waiting", "sealed"]
     assert "20 frames may still come" in recovery.sessions[1].problem
     assert (tmp_path / "sessions" / ID / "session.json").read_bytes() == before
-    assert recover_folder(tmp_path).is_empty
+    assert recover_locked_folder(tmp_path).is_empty_or_all_waiting
 
 
 def test_what_is_given_up_is_lost_and_says_so(tmp_path: Path) -> None:
@@ -185,8 +185,8 @@ def test_a_stop_that_was_never_reached_bounds_what_is_given_up(tmp_path: Path) -
     clock = ClockOffset(stream_id=BOOT, t_mono_ns=0, server_minus_node_ns=10**9, uncertainty_ns=1)
     stopped_t_ns = t_ns(99) + 10**9 + 4 * 10**9
     session(tmp_path, state="pending", stopped_t_ns=stopped_t_ns, clock=(clock,))
-    assert outcomes(recover_folder(tmp_path)) == ["waiting"]
-    (one,) = recover_folder(tmp_path, abandon_missing=True).sessions
+    assert outcomes(recover_locked_folder(tmp_path)) == ["waiting"]
+    (one,) = recover_locked_folder(tmp_path, abandon_missing=True).sessions
     assert one.session.max_lost_tail_frames == {BOOT: 2000}
 
 
@@ -194,7 +194,7 @@ def test_a_session_that_was_stopped_is_ended_by_its_clock(tmp_path: Path) -> Non
     stream(servers(tmp_path), info_of(), (0, 99))
     clock = ClockOffset(stream_id=BOOT, t_mono_ns=0, server_minus_node_ns=10**9, uncertainty_ns=1)
     session(tmp_path, state="pending", stopped_t_ns=t_ns(50) + 10**9, clock=(clock,))
-    (one,) = recover_folder(tmp_path).sessions
+    (one,) = recover_locked_folder(tmp_path).sessions
     assert (one.outcome, one.session.parts[0].seq_last) == ("sealed", 50)
 
 
@@ -225,9 +225,9 @@ def test_frames_of_no_session_become_one_if_asked(tmp_path: Path) -> None:
         stopped_t_ns=t_ns(149),
         parts=(Part(stream_id=BOOT, seq_first=50, seq_last=149),),
     )
-    assert outcomes(recover_folder(tmp_path)) == ["sealed"]
+    assert outcomes(recover_locked_folder(tmp_path)) == ["sealed"]
     at = datetime(2020, 1, 2, tzinfo=UTC)
-    recovery = recover_folder(tmp_path, make_sessions=True, now=lambda: at)
+    recovery = recover_locked_folder(tmp_path, make_sessions=True, now=lambda: at)
     assert outcomes(recovery) == ["sealed", "sealed"]
     found = [one.session for one in recovery.sessions]
     assert [s.parts[0].seq_first for s in found] == [0, 150]
@@ -235,7 +235,7 @@ def test_frames_of_no_session_become_one_if_asked(tmp_path: Path) -> None:
     assert {s.name for s in found} == {f"recovered bench {BOOT}"}
     assert [s.started_t_ns for s in found] == [t_ns(0), t_ns(150)]
     assert all(s.id.startswith("20200102T000000Z-") for s in found)
-    assert recover_folder(tmp_path, make_sessions=True).is_empty
+    assert recover_locked_folder(tmp_path, make_sessions=True).is_empty_or_all_waiting
     assert find_verdict(verify_path(tmp_path)) == "complete"
 
 
@@ -244,7 +244,7 @@ def test_what_was_deleted_is_not_brought_back(tmp_path: Path) -> None:
     session(tmp_path, state="sealed")
     (tmp_path / "trash").mkdir()
     (tmp_path / "sessions" / ID).rename(tmp_path / "trash" / ID)
-    assert recover_folder(tmp_path, make_sessions=True).sessions == []
+    assert recover_locked_folder(tmp_path, make_sessions=True).sessions == []
 
 
 # --- what else a crash leaves ---------------------------------------------------------------------
@@ -257,23 +257,23 @@ def test_what_dead_processes_left_half_written_is_removed(tmp_path: Path) -> Non
     dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], stdout=-1)
     stale = tmp_path / "sessions" / ID / f".frames.parquet.{int(dead.stdout)}.7.0123abcd.tmp"
     stale.write_bytes(b"PAR1")
-    assert recover_folder(tmp_path).removed_temporaries == [stale]
+    assert recover_locked_folder(tmp_path).removed_temporaries == [stale]
     assert not stale.exists()
 
 
 def test_events_that_were_not_written_in_time_are_written_anew(tmp_path: Path) -> None:
     stream(tmp_path, info_of(), (0, 99), next_seq=100)
     session(tmp_path)
-    recover_folder(tmp_path)
+    recover_locked_folder(tmp_path)
     done = loaded(tmp_path)
     marked = done.model_copy(
         update={"markers": (*done.markers, Marker(id="e2", label="fall", t_ns=1))}
     )
-    SessionsFolder(tmp_path / "sessions").save(marked)
+    SessionsFolder(tmp_path / "sessions").save_session_json(marked)
     assert verify_path(tmp_path).to_json_dict()["problems"]
-    assert recover_folder(tmp_path).rewritten_markers == [ID]
+    assert recover_locked_folder(tmp_path).rewritten_markers == [ID]
     assert verify_path(tmp_path).to_json_dict()["problems"] == []
-    assert recover_folder(tmp_path).is_empty
+    assert recover_locked_folder(tmp_path).is_empty_or_all_waiting
 
 
 def test_what_cannot_be_read_is_named_and_holds_up_nothing_else(tmp_path: Path) -> None:
@@ -285,7 +285,7 @@ def test_what_cannot_be_read_is_named_and_holds_up_nothing_else(tmp_path: Path) 
     hopeless = tmp_path / "journal" / "bench" / OTHER_BOOT
     hopeless.mkdir()
     (hopeless / f"{0:020d}.arrows").write_bytes(b"nothing of ours")
-    recovery = recover_folder(tmp_path)
+    recovery = recover_locked_folder(tmp_path)
     assert outcomes(recovery) == ["sealed"]
     text = "; ".join(recovery.problems)
     assert bad.name in text
@@ -307,12 +307,12 @@ def test_a_file_that_does_not_prove_itself_is_not_called_recovered(
         return done
 
     monkeypatch.setattr(recover_module, "seal_session", careless)
-    (one,) = recover_folder(tmp_path).sessions
+    (one,) = recover_locked_folder(tmp_path).sessions
     assert one.outcome == "failed"
     assert "changed since it was sealed" in one.problem
     assert loaded(tmp_path).state == "sealing"
     monkeypatch.undo()
-    assert outcomes(recover_folder(tmp_path)) == ["sealed"]
+    assert outcomes(recover_locked_folder(tmp_path)) == ["sealed"]
 
 
 def test_a_full_disk_leaves_the_session_for_the_next_run(
@@ -321,10 +321,10 @@ def test_a_full_disk_leaves_the_session_for_the_next_run(
     stream(tmp_path, info_of(), (0, 99), next_seq=100)
     session(tmp_path)
     monkeypatch.setattr(recover_module, "seal_session", refusing(StorageError, "no space left"))
-    (one,) = recover_folder(tmp_path).sessions
+    (one,) = recover_locked_folder(tmp_path).sessions
     assert (one.outcome, loaded(tmp_path).state) == ("failed", "sealing")
     monkeypatch.undo()
-    assert outcomes(recover_folder(tmp_path)) == ["sealed"]
+    assert outcomes(recover_locked_folder(tmp_path)) == ["sealed"]
 
 
 class Killed(BaseException):
@@ -340,7 +340,7 @@ def test_killed_at_any_write_the_next_run_comes_to_the_same(
     session(begun)
     once = tmp_path / "once"
     shutil.copytree(begun, once)
-    recover_folder(once)
+    recover_locked_folder(once)
     wanted = state_of(once)
     real, rounds, left = os.fsync, 0, 1
     while left:
@@ -358,12 +358,12 @@ def test_killed_at_any_write_the_next_run_comes_to_the_same(
 
         monkeypatch.setattr(os, "fsync", counted)
         try:
-            recover_folder(again)
+            recover_locked_folder(again)
             left = 0
         except Killed:
             pass
         monkeypatch.setattr(os, "fsync", real)
-        recover_folder(again)
+        recover_locked_folder(again)
         assert state_of(again) == wanted, rounds
     assert rounds > 5
 

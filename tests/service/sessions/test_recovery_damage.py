@@ -6,7 +6,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-from service.sessions.recovery import recover_folder
+from service.sessions.recovery import recover_locked_folder
 from storage.clock.log import ClockOffset
 from storage.intervals import Losses
 from storage.journal.journal import Journal
@@ -57,13 +57,13 @@ def test_what_is_damaged_on_a_server_may_come_again_until_it_is_given_up(
     parts = (Part(stream_id=BOOT, seq_first=0, seq_last=99),)
     session(data, state="pending", stopped_t_ns=t_ns(99), parts=parts)
     shutil.copytree(data, again)
-    (one,) = recover_folder(data).sessions
+    (one,) = recover_locked_folder(data).sessions
     assert (one.outcome, one.problem) == ("waiting", "10 frames may still come from node bench")
     assert verify_journal(folder).to_json_dict()["lost"] == {"corrupt": 10}
-    (one,) = recover_folder(data, abandon_missing=True).sessions  # they are cut off by now
+    (one,) = recover_locked_folder(data, abandon_missing=True).sessions  # they are cut off by now
     assert one.ledger is not None
     assert (one.outcome, one.ledger.parts[0].lost) == ("sealed", {"corrupt": 10})
-    (one,) = recover_folder(again, abandon_missing=True).sessions
+    (one,) = recover_locked_folder(again, abandon_missing=True).sessions
     assert one.ledger is not None
     assert (one.outcome, one.ledger.parts[0].lost) == ("sealed", {"corrupt": 10})
 
@@ -76,7 +76,7 @@ def test_a_damaged_batch_at_the_stop_is_lost_and_the_others_tell_the_end(tmp_pat
     segment.write_bytes(content)
     session(tmp_path, state="pending", stopped_t_ns=t_ns(35))
     session(tmp_path, ID[:-1] + "b", state="pending", stopped_t_ns=t_ns(20))
-    here, other = recover_folder(tmp_path).sessions
+    here, other = recover_locked_folder(tmp_path).sessions
     assert (here.outcome, other.outcome) == ("sealed", "sealed")
     by_id = {one.session.id: one for one in (here, other)}
     assert by_id[ID[:-1] + "b"].session.parts[0].seq_last == 20
@@ -97,7 +97,7 @@ def test_a_stop_where_time_runs_back_fails_one_session_and_not_the_recovery(tmp_
     journal.close()
     clock = ClockOffset(stream_id=BOOT, t_mono_ns=0, server_minus_node_ns=0, uncertainty_ns=1)
     session(tmp_path, state="pending", stopped_t_ns=t_ns(70), clock=(clock,))
-    (one,) = recover_folder(tmp_path).sessions
+    (one,) = recover_locked_folder(tmp_path).sessions
     assert one.outcome in ("failed", "waiting")
     assert one.problem
 
@@ -105,5 +105,5 @@ def test_a_stop_where_time_runs_back_fails_one_session_and_not_the_recovery(tmp_
 def test_notes_of_a_servers_stream_that_cannot_be_read_are_replaced(tmp_path: Path) -> None:
     folder = stream(servers(tmp_path), info_of(), (0, 99))
     (folder / "stream.json").write_bytes(b"{")
-    assert "it has no hash" in recover_folder(tmp_path).problems[0]
-    assert recover_folder(tmp_path).is_empty
+    assert "it has no hash" in recover_locked_folder(tmp_path).problems[0]
+    assert recover_locked_folder(tmp_path).is_empty_or_all_waiting

@@ -9,7 +9,7 @@ import pytest
 
 from devices.errors import StateError
 from service.server.session_store import SessionStore, Trash
-from service.sessions.recovery import recover_folder
+from service.sessions.recovery import recover_locked_folder
 from storage.checksummed_json import append_json_checksum, verify_and_strip_json_checksum
 from storage.clock.log import ClockLog, ClockOffset
 from storage.sessions.folder import Session, SessionsFolder
@@ -28,7 +28,7 @@ def data(tmp_path: Path) -> Path:
         ClockOffset(stream_id=BOOT, t_mono_ns=10**9, server_minus_node_ns=5, uncertainty_ns=300)
     )
     session(tmp_path, calibration=make_calibration("T01", "T02").model_dump(mode="json"))
-    recover_folder(tmp_path)
+    recover_locked_folder(tmp_path)
     assert find_verdict(verify_path(tmp_path)) == "complete"
     return tmp_path
 
@@ -58,9 +58,9 @@ def test_of_a_sealed_session_it_is_made_again_from_the_files_beside_it(data: Pat
     if by == "server":
         assert [one.id for one in book(data).iterate_newest_first()] == [ID]
     else:
-        recovery = recover_folder(data)
+        recovery = recover_locked_folder(data)
         assert (recovery.rebuilt_sessions, recovery.problems) == ([ID], [])
-        assert recover_folder(data).is_empty
+        assert recover_locked_folder(data).is_empty_or_all_waiting
     made = assert_made_again(data, before)
     assert made.problem == (
         "its session.json was damaged and was rebuilt from frames.parquet; lost are subject, "
@@ -87,7 +87,7 @@ def test_one_that_is_gone_is_made_again_and_lost_marks_are_said(data: Path) -> N
     (one,) = book(data).iterate_newest_first()
     assert one.markers == ()
     assert str(one.problem).endswith("lost are subject, notes and tags, markers")
-    recover_folder(data)
+    recover_locked_folder(data)
     assert find_verdict(verify_path(data)) == "complete"
 
 
@@ -112,7 +112,7 @@ def test_one_that_nothing_proves_is_named_and_its_files_stay(data: Path) -> None
     assert "it was changed" in found.unreadable[ID]
     with pytest.raises(StateError, match="cannot be read"):
         found.get_session(ID)
-    assert ID in " ".join(recover_folder(data).problems)
+    assert ID in " ".join(recover_locked_folder(data).problems)
     assert path.read_bytes() == before
 
 

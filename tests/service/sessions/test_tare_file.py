@@ -60,11 +60,11 @@ def in_use(tares: TareHistory) -> dict[str, str]:
     found = {}
     for name, info in zip("IO", ARRAYS, strict=True):
         found[f"{name} now"] = told(tares.tare_in_force_or_lost(info))
-        lost = any(tare.is_lost for tare in tares.tares_in_force_between(info, 0, END))
+        lost = any(tare.is_lost for tare in tares.tares_in_force_or_lost_between(info, 0, END))
         found[f"{name} empty"] = "lost" if lost else str(tares.is_empty(info))
         for begin in range(0, END, 20):
             for end in range(begin, END, 20):
-                during = tares.tares_in_force_between(info, begin + 5, end + 5)
+                during = tares.tares_in_force_or_lost_between(info, begin + 5, end + 5)
                 for t_ns in range(begin, end + 10, 10):
                     until = [tare for tare in during if tare.t_ns < t_ns]
                     used = until[-1] if until else during[0] if during else None
@@ -149,7 +149,7 @@ def test_a_file_that_is_cut_off_anywhere_gives_what_is_whole_and_lost_ones(
     for length in range(0, len(text), 3 if count == 1 else 29):
         found = play(tmp_path / "cut", text[:length], used)
         assert found.problem is not None
-        assert len(found.all_tares) == len(
+        assert len(found.all_tares_with_undone) == len(
             re.findall(rb'"sha256": "[0-9a-f]{64}"\}', text[:length])
         )
 
@@ -161,7 +161,7 @@ def test_an_older_file_line_of_the_same_place_is_not_believed(tmp_path: Path) ->
     lines[2] = older[2]
     path.write_bytes(b"\n".join(lines))
     found = TareHistory(path)
-    assert found.all_tares == [], "it is not known which of both files it is"
+    assert found.all_tares_with_undone == [], "it is not known which of both files it is"
     assert found.is_tare_lost(INFO)
 
 
@@ -173,17 +173,19 @@ def test_a_tare_after_the_lost_one_puts_all_right_again_and_so_it_stays(tmp_path
     assert found.tare_in_force_or_lost(OTHER) is not None
     assert found.is_tare_lost(INFO)
     assert found.is_tare_lost(OTHER), "it is not known whose it was"
-    assert found.last_non_automatic_or_oldest(INFO) is None
+    assert found.last_not_in_flight_or_oldest(INFO) is None
     assert not found.is_empty(INFO)
     mine = found.store_and_apply_tare(make_tare(2, t_ns=90, source="flight"), INFO)
     for tares in (found, TareHistory(path)):
         assert tares.problem is None or tares is found
-        in_force = tares.tare_in_force(INFO)
+        in_force = tares.tare_in_force_unless_lost(INFO)
         assert in_force is not None
         assert in_force.id == mine.id
         assert not tares.is_tare_lost(INFO)
         assert tares.is_tare_lost(OTHER)
-        assert [(t.t_ns, t.is_lost) for t in tares.tares_in_force_between(INFO, 75, 95)] == [
+        assert [
+            (t.t_ns, t.is_lost) for t in tares.tares_in_force_or_lost_between(INFO, 75, 95)
+        ] == [
             (75, True),
             (90, False),
         ]
@@ -230,7 +232,7 @@ def test_what_is_no_file_is_set_aside_and_all_is_lost(
     whole = in_use(TareHistory(path))
     damage(path)
     found = assert_right_or_lost(path, whole)
-    assert found.all_tares == []
+    assert found.all_tares_with_undone == []
     assert os.path.lexists(path.with_name("tares.json.damaged-1"))
 
 
@@ -240,7 +242,7 @@ def test_a_foreign_text_is_set_aside_and_all_is_lost(tmp_path: Path, content: by
     whole = in_use(TareHistory(path))
     path.write_bytes(content)
     found = assert_right_or_lost(path, whole)
-    assert found.all_tares == []
+    assert found.all_tares_with_undone == []
     assert found.problem is not None
     assert str(path) in found.problem
 
@@ -258,4 +260,4 @@ def test_tares_of_a_later_version_are_set_aside_and_lost(tmp_path: Path) -> None
     later = TareHistory(path)
     write_checksummed_json(path, b'{"baselines": []}')
     assert TareHistory(path).is_tare_lost(INFO)
-    assert later.all_tares
+    assert later.all_tares_with_undone

@@ -27,68 +27,68 @@ from tests.storage.faulty_disk import NO_SPACE, refusing
 
 def test_a_node_that_was_never_tared_has_none(tmp_path: Path) -> None:
     tares = history(tmp_path)
-    assert tares.tare_in_force(INFO) is None
-    assert tares.all_tares == []
-    assert tares.tares_in_force_between(INFO, 0, 100) == ()
+    assert tares.tare_in_force_unless_lost(INFO) is None
+    assert tares.all_tares_with_undone == []
+    assert tares.tares_in_force_or_lost_between(INFO, 0, 100) == ()
     assert list(tmp_path.iterdir()) == []
 
 
 def test_the_newest_is_in_force_and_undone_the_one_before(tmp_path: Path) -> None:
     tares = history(tmp_path)
     one, two, three = (tares.store_and_apply_tare(tare(t), INFO) for t in (1, 2, 3))
-    assert tares.tare_in_force(INFO) is three
+    assert tares.tare_in_force_unless_lost(INFO) is three
     tares.undo_tare(three.id)
-    same_as_two = tares.tare_in_force(INFO)
+    same_as_two = tares.tare_in_force_unless_lost(INFO)
     assert same_as_two is not None
     same(same_as_two, two)
     tares.undo_tare(one.id)  # one that is not in force, too
-    assert [recorded.undone for recorded in tares.all_tares] == [True, False, True]
+    assert [recorded.undone for recorded in tares.all_tares_with_undone] == [True, False, True]
     tares.undo_tare(two.id)
-    assert tares.tare_in_force(INFO) is None
+    assert tares.tare_in_force_unless_lost(INFO) is None
     again = tares.store_and_apply_tare(tare(4), INFO)
-    assert tares.tare_in_force(INFO) is again
+    assert tares.tare_in_force_unless_lost(INFO) is again
 
 
 def test_only_what_is_there_and_in_force_can_be_undone(tmp_path: Path) -> None:
     tares = history(tmp_path, 1)
-    recorded = tares.all_tares[0]
+    recorded = tares.all_tares_with_undone[0]
     tares.undo_tare(recorded.id)
     for tare_id in (recorded.id, "", "nothing", recorded.id[:-1]):
         with pytest.raises(UnknownError, match="could be undone"):
             tares.undo_tare(tare_id)
-    assert len(tares.all_tares) == 1
+    assert len(tares.all_tares_with_undone) == 1
 
 
 def test_tares_of_other_tiles_do_not_count(tmp_path: Path) -> None:
     tares = history(tmp_path, 1)
-    mine = tares.all_tares[0]
+    mine = tares.all_tares_with_undone[0]
     for number, info in enumerate(OTHERS):
         tares.store_and_apply_tare(tare(10 + number, tiles=len(info.tiles)), info)
-    assert tares.tare_in_force(INFO) is mine
-    assert instants(tares.tares_in_force_between(INFO, 0, 100)) == [1]
+    assert tares.tare_in_force_unless_lost(INFO) is mine
+    assert instants(tares.tares_in_force_or_lost_between(INFO, 0, 100)) == [1]
     for number, info in enumerate(OTHERS):
-        assert instants(tares.tares_in_force_between(info, 0, 100)) == [10 + number]
+        assert instants(tares.tares_in_force_or_lost_between(info, 0, 100)) == [10 + number]
 
 
 def test_a_tare_does_not_count_for_a_part_that_was_swapped(tmp_path: Path) -> None:
     tares = history(tmp_path, 1)
     other = INFO.tiles[1].model_copy(update={"coefficient_words": (1790 * 8, 0xC000, 0, 0)})
     swapped = INFO.model_copy(update={"tiles": (INFO.tiles[0], other)})
-    assert tares.tare_in_force(swapped) is None
-    assert tares.tares_in_force_between(swapped, 0, 100) == ()
+    assert tares.tare_in_force_unless_lost(swapped) is None
+    assert tares.tares_in_force_or_lost_between(swapped, 0, 100) == ()
     tares.store_and_apply_tare(tare(2), swapped)
-    assert instants(history(tmp_path).tares_in_force_between(INFO, 0, 100)) == [1]
+    assert instants(history(tmp_path).tares_in_force_or_lost_between(INFO, 0, 100)) == [1]
 
 
 def test_ids_are_all_different(tmp_path: Path) -> None:
     tares = history(tmp_path, *range(30))
-    assert len({recorded.id for recorded in tares.all_tares}) == 30
+    assert len({recorded.id for recorded in tares.all_tares_with_undone}) == 30
 
 
 def test_what_is_given_out_is_no_handle_on_the_history(tmp_path: Path) -> None:
     tares = history(tmp_path, 1)
-    tares.all_tares.clear()
-    assert len(tares.all_tares) == 1
+    tares.all_tares_with_undone.clear()
+    assert len(tares.all_tares_with_undone) == 1
 
 
 # --- during an interval ---------------------------------------------------------------------------
@@ -107,7 +107,7 @@ def test_during_an_interval_are_those_that_were_in_force_at_some_time_of_it(
     length: int,
 ) -> None:
     tares = history(tmp_path_factory.mktemp("during"), *(t for t, _ in taken))
-    for recorded, (_, undone) in zip(tares.all_tares, taken, strict=True):
+    for recorded, (_, undone) in zip(tares.all_tares_with_undone, taken, strict=True):
         if undone:
             tares.undo_tare(recorded.id)
     valid = [t for t, undone in taken if not undone]
@@ -115,7 +115,7 @@ def test_during_an_interval_are_those_that_were_in_force_at_some_time_of_it(
     for instant in range(begin, begin + length + 1):
         before = [t for t in valid if t <= instant]
         in_force |= {before[-1]} if before else set()
-    found = instants(tares.tares_in_force_between(INFO, begin, begin + length))
+    found = instants(tares.tares_in_force_or_lost_between(INFO, begin, begin + length))
     assert sorted(set(found)) == sorted(in_force)
     assert found == sorted(found)
 
@@ -129,7 +129,7 @@ def test_every_tare_has_a_reason_in_words(tmp_path: Path) -> None:
     tares.store_and_apply_tare(tare(2), INFO)
     tares.store_and_apply_tare(tare(3), INFO, "new shoe")
     tares.store_and_apply_tare(tare(4), INFO, "x" * 500)
-    assert [recorded.reason for recorded in history(tmp_path).all_tares] == [
+    assert [recorded.reason for recorded in history(tmp_path).all_tares_with_undone] == [
         "unloaded lead of the emulation",
         "by hand",
         "new shoe",
@@ -144,7 +144,7 @@ def test_an_undone_tare_pauses_automatic_ones_until_somebody_tares(tmp_path: Pat
     two = tares.store_and_apply_tare(tare(3, source="flight"), INFO)
     assert not tares.is_automatic_paused(INFO)
     tares.undo_tare(two.id)
-    in_force = tares.tare_in_force(INFO)
+    in_force = tares.tare_in_force_unless_lost(INFO)
     assert in_force is not None
     assert in_force.id == one.id
     assert tares.is_automatic_paused(INFO)
@@ -160,15 +160,15 @@ def test_automatic_tares_are_held_against_the_last_one_by_hand_or_the_oldest(
     tmp_path: Path,
 ) -> None:
     tares = history(tmp_path)
-    assert tares.last_non_automatic_or_oldest(INFO) is None
+    assert tares.last_not_in_flight_or_oldest(INFO) is None
     first = tares.store_and_apply_tare(tare(1, source="flight"), INFO)
     tares.store_and_apply_tare(tare(2, source="flight"), INFO)
-    assert tares.last_non_automatic_or_oldest(INFO) is first
+    assert tares.last_not_in_flight_or_oldest(INFO) is first
     by_hand = tares.store_and_apply_tare(tare(3), INFO)
     tares.store_and_apply_tare(tare(4, source="flight"), INFO)
-    assert tares.last_non_automatic_or_oldest(INFO) is by_hand
+    assert tares.last_not_in_flight_or_oldest(INFO) is by_hand
     tares.undo_tare(by_hand.id)
-    anchor = tares.last_non_automatic_or_oldest(INFO)
+    anchor = tares.last_not_in_flight_or_oldest(INFO)
     assert anchor is not None
     assert anchor.id == first.id
 
@@ -180,9 +180,14 @@ def test_automatic_tares_never_push_out_one_that_was_taken_by_hand(
     tares = history(tmp_path, 0)
     for t in range(1, 301):
         tares.store_and_apply_tare(tare(t, source="unloaded" if t % 100 == 0 else "flight"), INFO)
-        assert sum(recorded.is_automatic for recorded in tares.all_tares) <= 20
-    assert instants([t.tare for t in tares.all_tares if not t.is_automatic]) == [0, 100, 200, 300]
-    kept = instants([t.tare for t in tares.all_tares if t.is_automatic])
+        assert sum(recorded.is_taken_in_flight for recorded in tares.all_tares_with_undone) <= 20
+    assert instants([t.tare for t in tares.all_tares_with_undone if not t.is_taken_in_flight]) == [
+        0,
+        100,
+        200,
+        300,
+    ]
+    kept = instants([t.tare for t in tares.all_tares_with_undone if t.is_taken_in_flight])
     assert kept == sorted(kept)
     assert kept[0] == 1, "the first of them"
     assert set(range(290, 300)) <= set(kept), "the newest without a gap"
@@ -195,23 +200,29 @@ def test_automatic_tares_never_push_out_one_that_was_taken_by_hand(
 def test_the_history_survives_a_restart_bit_by_bit(tmp_path: Path) -> None:
     tares = history(tmp_path, 1, 2**62)
     tares.store_and_apply_tare(tare(5, tiles=1), array("Ü"))
-    tares.undo_tare(tares.all_tares[1].id)
+    tares.undo_tare(tares.all_tares_with_undone[1].id)
     again = history(tmp_path)
-    assert len(again.all_tares) == 3
-    for one, other in zip(tares.all_tares, again.all_tares, strict=True):
+    assert len(again.all_tares_with_undone) == 3
+    for one, other in zip(tares.all_tares_with_undone, again.all_tares_with_undone, strict=True):
         same(one, other)
-    in_force = again.tare_in_force(INFO)
+    in_force = again.tare_in_force_unless_lost(INFO)
     assert in_force is not None
     assert in_force.tare.t_ns == 1
     again.undo_tare(in_force.id)
-    assert history(tmp_path).tare_in_force(INFO) is None
+    assert history(tmp_path).tare_in_force_unless_lost(INFO) is None
 
 
 def test_only_the_newest_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.sessions.tares.KEPT_MAX", 5)
     tares = history(tmp_path, *range(8))
-    assert instants([recorded.tare for recorded in tares.all_tares]) == [3, 4, 5, 6, 7]
-    assert instants([recorded.tare for recorded in history(tmp_path).all_tares]) == [3, 4, 5, 6, 7]
+    assert instants([recorded.tare for recorded in tares.all_tares_with_undone]) == [3, 4, 5, 6, 7]
+    assert instants([recorded.tare for recorded in history(tmp_path).all_tares_with_undone]) == [
+        3,
+        4,
+        5,
+        6,
+        7,
+    ]
     assert KEPT_MAX >= 100
 
 
@@ -219,19 +230,26 @@ def test_a_disk_that_cannot_be_written_leaves_the_history_as_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tares = history(tmp_path, 1, 2)
-    before = tares.all_tares
+    before = tares.all_tares_with_undone
     with monkeypatch.context() as patch:
         patch.setattr("os.fsync", refusing(*NO_SPACE))
         with pytest.raises(StorageError, match="No space left"):
             tares.store_and_apply_tare(tare(3), INFO)
         with pytest.raises(StorageError, match="No space left"):
             tares.undo_tare(before[0].id)
-    assert tares.all_tares == before
-    assert tares.tare_in_force(INFO) is before[1]
-    assert instants([recorded.tare for recorded in history(tmp_path).all_tares]) == [1, 2]
-    assert not any(recorded.undone for recorded in history(tmp_path).all_tares)
+    assert tares.all_tares_with_undone == before
+    assert tares.tare_in_force_unless_lost(INFO) is before[1]
+    assert instants([recorded.tare for recorded in history(tmp_path).all_tares_with_undone]) == [
+        1,
+        2,
+    ]
+    assert not any(recorded.undone for recorded in history(tmp_path).all_tares_with_undone)
     tares.store_and_apply_tare(tare(4), INFO)
-    assert instants([recorded.tare for recorded in history(tmp_path).all_tares]) == [1, 2, 4]
+    assert instants([recorded.tare for recorded in history(tmp_path).all_tares_with_undone]) == [
+        1,
+        2,
+        4,
+    ]
 
 
 def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from storage.clock.log import ClockOffset
 from storage.clock.table import (
     ClockTable,
     StreamClockFacts,
-    group_rows_by_stream,
+    group_unsorted_rows_by_stream,
     read_clock_file,
     write_clock_file,
 )
@@ -53,7 +53,7 @@ def test_frames_of_each_part_have_the_servers_time_within_its_bound(
     table = ClockTable(rows, facts, ["a", "b"])
     assert [stream.steps for stream in table.summarize_streams().streams] == [(), ()]
     t_mono_ns = np.full(2, BEGIN_NS + round(since_s * SECOND))
-    found = table.compute_server_time_columns(
+    found = table.compute_server_time_columns_or_unknown(
         t_mono_ns, t_mono_ns + UTC_NS, np.array([0, 1], dtype=np.uint16)
     )
     true_ns = t_mono_ns + UTC_NS + np.concatenate([c.at(t_mono_ns[:1]) for c in clocks])
@@ -97,7 +97,7 @@ def test_an_unmeasured_stream_has_no_servers_time(clock_set: bool | None, state:
     assert [stream.state for stream in table.summarize_streams().streams] == ["measured", state]
     at_ns = np.full(3, BEGIN_NS)
     part = np.array([0, 1, 7], dtype=np.uint16)
-    for values in table.compute_server_time_columns(at_ns, at_ns, part).values():
+    for values in table.compute_server_time_columns_or_unknown(at_ns, at_ns, part).values():
         assert (values == UNKNOWN_T_NS).tolist() == [False, True, True]
 
 
@@ -106,7 +106,9 @@ def test_times_out_of_range_have_no_servers_time() -> None:
     for end, is_t_ns in ((T_NS_END, True), (T_MONO_NS_END, False)):
         ends = np.array([-(2**63), 2**63 - 1, end, -end, end - 1, 0])
         t_mono_ns, t_ns = (zeros, ends) if is_t_ns else (ends, zeros)
-        t_server_ns = table.compute_server_time_columns(t_mono_ns, t_ns, None)["t_server_ns"]
+        t_server_ns = table.compute_server_time_columns_or_unknown(t_mono_ns, t_ns, None)[
+            "t_server_ns"
+        ]
         assert (t_server_ns == UNKNOWN_T_NS).tolist() == [True] * 4 + [False] * 2
         assert t_server_ns[-1] == 2**60 - 1
 
@@ -114,7 +116,9 @@ def test_times_out_of_range_have_no_servers_time() -> None:
 def test_a_sum_out_of_range_is_no_time() -> None:
     begin_ns = 2**62 - 3 * 10**9
     table = table_of(rows_of((0, begin_ns, 0), (10**14, begin_ns + 2 * 10**9, 0)))
-    found = table.compute_server_time_columns(np.full(2, 2**59), np.array([2**62 - 1, 0]), None)
+    found = table.compute_server_time_columns_or_unknown(
+        np.full(2, 2**59), np.array([2**62 - 1, 0]), None
+    )
     for values in found.values():
         assert (values == UNKNOWN_T_NS).tolist() == [True, False]
 
@@ -122,7 +126,7 @@ def test_a_sum_out_of_range_is_no_time() -> None:
 def test_frames_without_parts_are_of_the_first_stream() -> None:
     rows = {"a": rows_of((0, 0, 0)), "b": rows_of((0, 1, 0))}
     table = ClockTable(rows, [StreamClockFacts("a"), StreamClockFacts("b")], ["a", "b"])
-    found = table.compute_server_time_columns(np.array([0]), np.array([7]), None)
+    found = table.compute_server_time_columns_or_unknown(np.array([0]), np.array([7]), None)
     assert found["t_server_ns"].tolist() == [7]
 
 
@@ -143,7 +147,7 @@ def test_a_row_out_of_range_is_refused_by_column(
 ) -> None:
     row = row_of("b", t_mono_ns, offset_ns, uncertainty_ns)
     with pytest.raises(FileFormatError, match=named):
-        ClockTable(group_rows_by_stream([row]), [StreamClockFacts("b")], ["b"])
+        ClockTable(group_unsorted_rows_by_stream([row]), [StreamClockFacts("b")], ["b"])
 
 
 # --- clock.parquet --------------------------------------------------------------------------------

@@ -277,7 +277,7 @@ def test_a_slice_between_two_frames_still_has_a_header(to: str, every: int) -> N
 
 def test_only_a_slice_of_everything_is_unrestricted() -> None:
     slices = (Slice(), Slice(start_s=0.0), Slice(columns=("seq",)))
-    assert [each.is_unrestricted for each in slices] == [True, False, False]
+    assert [each.has_all_rows_and_columns for each in slices] == [True, False, False]
 
 
 # --- columns --------------------------------------------------------------------------------------

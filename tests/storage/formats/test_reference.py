@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError, FootTileError, UsageError
-from storage.formats.readers.table import spread_repeated_times_evenly
+from storage.formats.readers.table import fit_constant_rate_if_times_repeat
 from storage.formats.reference import ReferenceData, ReferenceOptions, read_reference
 from storage.parquet_hash import write_hashed_table
 
@@ -179,7 +179,7 @@ def test_rounded_times_are_spread_evenly_within_their_rounding(
 ) -> None:
     true_s = begin_s + np.arange(count) / hz
     rounded_s = np.round(true_s / quantum_s) * quantum_s
-    found_s, note = spread_repeated_times_evenly(rounded_s)
+    found_s, note = fit_constant_rate_if_times_repeat(rounded_s)
     np.testing.assert_allclose(found_s, true_s, atol=quantum_s)
     assert bool(note) == bool((np.diff(rounded_s) == 0.0).any())
     if note:
@@ -189,7 +189,7 @@ def test_rounded_times_are_spread_evenly_within_their_rounding(
 def test_times_that_pause_or_fall_are_not_spread() -> None:
     time_s = np.repeat(np.arange(20.0), 2)
     for other_s in (np.where(time_s > 10.0, time_s + 5.0, time_s), time_s[::-1]):
-        found_s, note = spread_repeated_times_evenly(other_s)
+        found_s, note = fit_constant_rate_if_times_repeat(other_s)
         assert found_s is other_s
         assert note == ""
 

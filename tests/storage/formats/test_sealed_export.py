@@ -321,4 +321,4 @@ def test_a_page_of_another_kind_is_not_left_out(tmp_path: Path) -> None:
         path.write_bytes(content)
         assert refused_or(path, part, right) == "refused"
         with SealedFileReader(path, only_slices=True) as reader, pytest.raises(FileFormatError):
-            reader.read_span_ns()
+            reader.read_span_on_axis_ns()

@@ -189,7 +189,7 @@ def test_frames_of_a_closed_segment_are_checked_when_they_are_read(tmp_path: Pat
     with pytest.raises(DamagedFramesError, match="frames 10 to 19") as caught:
         list(journal.read_frames(0, 29))
     assert (caught.value.seq_first, caught.value.seq_last) == (10, 19)
-    journal.invalidate_whole_batches(Intervals([(10, 19)]))
+    journal.invalidate_batches_wholly_within(Intervals([(10, 19)]))
     assert_holds(journal, {*range(10), *range(20, 30)})
     # A copy that comes later is the one that counts, after a restart, too.
     journal.append_new_frames(part(10, 19))
@@ -216,7 +216,7 @@ def test_a_damaged_batch_among_thousands_of_frames_costs_its_own(tmp_path: Path)
         before += (int(seq) for batch in journal.read_frames(3, 9000) for seq in batch.seq)
     assert (caught.value.seq_first, caught.value.seq_last) == (5000, 5024)
     assert before == list(range(3, 5000))
-    journal.invalidate_whole_batches(Intervals([(5000, 5024)]))
+    journal.invalidate_batches_wholly_within(Intervals([(5000, 5024)]))
     stored = {*range(5000), *range(5025, 9000)}
     assert_holds(journal, stored, 3, 8990, of=whole)
     assert max(len(batch) for batch in journal.read_frames(0, 9000)) > 1000

@@ -107,7 +107,7 @@ def test_refused_and_invalidated_frames_can_come_again(tmp_path: Path) -> None:
     (path,) = segments(tmp_path)
     with disk_with_room_for(path.stat().st_size + 100), pytest.raises(StorageError):
         journal.sync()
-    journal.invalidate_whole_batches(Intervals([(10, 39)]))
+    journal.invalidate_batches_wholly_within(Intervals([(10, 39)]))
     assert_holds(journal, set(range(10)))
     journal.append_new_frames(part(10, 19))
     journal.close()

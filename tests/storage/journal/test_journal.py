@@ -305,7 +305,7 @@ def test_batches_of_a_replaced_file_are_invalidated_as_well(tmp_path: Path) -> N
     journal.append_new_frames(part(10, 19))
     (tmp_path / "data").rename(tmp_path / "away")
     (tmp_path / "copy").rename(tmp_path / "data")
-    journal.invalidate_whole_batches(Intervals([(10, 19)]))
+    journal.invalidate_batches_wholly_within(Intervals([(10, 19)]))
     assert journal.stored == Intervals([(0, 9)])
     journal.append_new_frames(part(10, 19))
     assert_holds(journal, set(range(20)))
@@ -320,7 +320,7 @@ def test_an_invalidated_copy_is_cut_off_when_its_segment_is_closed(tmp_path: Pat
     """
     journal = filled(tmp_path, (0, 9), (10, 19))
     (path,) = segments(tmp_path)
-    journal.invalidate_whole_batches(Intervals([(10, 19)]))
+    journal.invalidate_batches_wholly_within(Intervals([(10, 19)]))
     journal.append_new_frames(part(10, 19))
     journal.close()
     assert path.stat().st_size == HEADER + len(encode_frames(part(0, 9), SCHEMA))

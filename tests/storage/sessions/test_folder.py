@@ -107,7 +107,7 @@ def test_what_is_no_id_is_no_session_and_no_path(tmp_path: Path, bad: str) -> No
     with pytest.raises(UnknownError):
         folder.load(bad)
     with pytest.raises(UnknownError):
-        folder.save(session(bad))
+        folder.save_session_json(session(bad))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -146,7 +146,7 @@ def test_ids_are_newest_first_and_other_names_are_none(tmp_path: Path) -> None:
     folder = SessionsFolder(tmp_path)
     made = [f"2020013{i}T000000Z-00000{i}" for i in (1, 0, 5, 3)]
     for one in made:
-        folder.save(session(one))
+        folder.save_session_json(session(one))
     for name in ("lost+found", ".20200131T235959Z-0a1b2c.tmp", "20200131"):
         (tmp_path / name).mkdir()
     assert list(folder.list_ids_newest_first()) == sorted(made, reverse=True)
@@ -164,7 +164,7 @@ def test_a_folder_that_is_not_there_yet_has_no_sessions(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kept", [session(), whole()], ids=["new", "sealed"])
 def test_a_session_survives_its_file(tmp_path: Path, kept: Session) -> None:
     folder = SessionsFolder(tmp_path / "data" / "sessions")
-    folder.save(kept)
+    folder.save_session_json(kept)
     assert folder.load(ID) == kept
     assert [p.name for p in folder.get_path(ID).iterdir()] == ["session.json"]
 
@@ -176,15 +176,15 @@ def test_whatever_a_person_writes_is_kept_as_it_is(
 ) -> None:
     folder = SessionsFolder(tmp_path_factory.mktemp("sessions"))
     kept = session(name=text, notes=text[::-1], subject=text, tags=tuple(tags))
-    folder.save(kept)
+    folder.save_session_json(kept)
     assert folder.load(ID) == kept
 
 
 def test_saving_again_replaces_and_touches_no_other_file(tmp_path: Path) -> None:
     folder = SessionsFolder(tmp_path)
-    folder.save(session())
+    folder.save_session_json(session())
     (folder.get_path(ID) / "frames.parquet").write_bytes(b"frames")
-    folder.save(whole())
+    folder.save_session_json(whole())
     assert folder.load(ID) == whole()
     assert (folder.get_path(ID) / "frames.parquet").read_bytes() == b"frames"
 
@@ -210,7 +210,7 @@ def test_a_session_that_is_not_there_is_unknown(tmp_path: Path) -> None:
 )
 def test_what_is_no_session_is_refused_by_path(tmp_path: Path, old: bytes, new: bytes) -> None:
     folder = SessionsFolder(tmp_path)
-    folder.save(session())
+    folder.save_session_json(session())
     path = folder.get_path(ID) / "session.json"
     content = path.read_bytes()
     assert old in content
@@ -228,10 +228,10 @@ def test_what_is_no_session_is_refused_by_path(tmp_path: Path, old: bytes, new: 
 
 def test_a_failed_save_keeps_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = SessionsFolder(tmp_path)
-    folder.save(session())
+    folder.save_session_json(session())
     monkeypatch.setattr("os.fsync", refusing(*NO_SPACE))
     with pytest.raises(StorageError, match="No space left"):
-        folder.save(whole())
+        folder.save_session_json(whole())
     assert folder.load(ID) == session()
     assert [p.name for p in folder.get_path(ID).iterdir()] == ["session.json"]
 
@@ -239,7 +239,7 @@ def test_a_failed_save_keeps_the_old_one(tmp_path: Path, monkeypatch: pytest.Mon
 def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path: Path) -> None:
     (tmp_path / "sessions").write_bytes(b"a file")
     with pytest.raises(StorageError):
-        SessionsFolder(tmp_path / "sessions").save(session())
+        SessionsFolder(tmp_path / "sessions").save_session_json(session())
 
 
 @pytest.mark.parametrize("sync", range(4))
@@ -252,12 +252,12 @@ def test_a_failed_first_save_leaves_no_folder(
     folder = SessionsFolder(tmp_path / "sessions")
     monkeypatch.setattr(os, "fsync", fails)
     try:
-        folder.save(session())
+        folder.save_session_json(session())
     except StorageError:
         assert list((tmp_path / "sessions").iterdir()) == []
     else:
         assert sync == next(calls) == 3  # of the folder's name, the file, and the file's name
-    folder.save(session())
+    folder.save_session_json(session())
     assert folder.load(ID) == session()
 
 

@@ -49,7 +49,7 @@ def test_recorded_and_lost_and_pending_are_all_there_is(
         obtainable=Intervals(may_come),
     )
     part = Part(stream_id="a", seq_first=first, seq_last=first + length - 1)
-    counted = compute_ledger((part,), {"a": stream}, is_finished=True)
+    counted = compute_ledger((part,), {"a": stream}, has_all_parts=True)
     (one,) = counted.parts
     assert one.recorded + sum(one.lost.values()) + one.pending == length
     assert one.recorded == Intervals(stored).restricted_to(first, first + length - 1).number_count
@@ -59,7 +59,7 @@ def test_recorded_and_lost_and_pending_are_all_there_is(
 
 def test_a_part_without_an_end_is_not_complete() -> None:
     stream = StreamState(stored=Intervals([(5, 9)]), obtainable=Intervals([(0, NO_END)]))
-    counted = compute_ledger((Part(stream_id="a", seq_first=3),), {"a": stream}, is_finished=True)
+    counted = compute_ledger((Part(stream_id="a", seq_first=3),), {"a": stream}, has_all_parts=True)
     assert counted.parts[0].seq_last == 9
     assert (counted.parts[0].recorded, counted.parts[0].pending) == (5, 2)
     assert not counted.complete
@@ -67,7 +67,9 @@ def test_a_part_without_an_end_is_not_complete() -> None:
 
 
 def test_what_the_node_came_back_without_is_named() -> None:
-    counted = compute_ledger((Part(stream_id="a", seq_first=0, seq_last=9),), {}, is_finished=True)
+    counted = compute_ledger(
+        (Part(stream_id="a", seq_first=0, seq_last=9),), {}, has_all_parts=True
+    )
     assert counted.parts[0].lost == {"node_restarted": 10}
     assert counted.lossy
 
@@ -75,7 +77,7 @@ def test_what_the_node_came_back_without_is_named() -> None:
 def test_an_open_tail_is_no_counted_loss_and_not_complete() -> None:
     stream = StreamState(stored=Intervals([(0, 9)]), max_lost_tail_frames=280)
     part = Part(stream_id="a", seq_first=0, seq_last=9)
-    counted = compute_ledger((part,), {"a": stream}, is_finished=True)
+    counted = compute_ledger((part,), {"a": stream}, has_all_parts=True)
     assert counted.parts[0].lost == {}
     assert counted.parts[0].max_lost_tail_frames == 280
     assert counted.lossy

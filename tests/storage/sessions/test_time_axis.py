@@ -118,7 +118,7 @@ def test_parts_of_unmeasured_clocks_are_joined(wrong_ns: int, measured: tuple[bo
     axis, on_axis, _ = found(parts)
     assert axis.bases == ("node", "joined")
     assert on_axis[1] == SECOND + PERIOD_NS
-    assert "not compared" in axis.describe_shift()
+    assert "not compared" in axis.explain_shift_or_empty()
 
 
 def test_a_step_of_the_servers_date_shifts_no_part() -> None:
@@ -163,7 +163,7 @@ def test_no_frame_of_a_time_is_left_out(
 def test_it_is_read_back_as_it_was_stated() -> None:
     axis = TimeAxis((0, -YEARS_57), ("node", "server"))
     assert TimeAxis.from_json_list(axis.to_json_list(), where="x") == axis
-    assert NODE_AXIS.describe_shift() == ""
+    assert NODE_AXIS.explain_shift_or_empty() == ""
     odd: list[object] = [None, 5, [{}], [{"shift_ns": "a", "by": "node"}]]
     odd.append([{"shift_ns": 1, "by": "x"}])
     for wrong in odd:

@@ -230,7 +230,7 @@ def test_notes_survive_and_may_be_added_late(tmp_path: Path) -> None:
     path = tmp_path / "s.parquet"
     with SealedFileWriter(path, make_array(), {"seed": 7, "scene": {"name": "mud"}}) as writer:
         writer.append_frames(frames(3), {})
-        writer.add_notes({"lag_ms": 9.2})
+        writer.add_notes_before_first_row_group({"lag_ms": 9.2})
     with SealedFileReader(path) as session:
         assert session.notes == {"seed": 7, "scene": {"name": "mud"}, "lag_ms": 9.2}
 

@@ -73,7 +73,7 @@ def session(session_id: str = ID, **changes: Any) -> Session:
 
 def keep(data: Path, kept: Session, *, place: str = "sessions") -> Path:
     """As a server keeps it, with the hash of its own text."""
-    SessionsFolder(data / place).save(kept)
+    SessionsFolder(data / place).save_session_json(kept)
     return data / place / kept.id
 
 
@@ -89,7 +89,7 @@ def sealed(data: Path, session_id: str = ID, **changes: Any) -> Path:
         stream_id: StreamState(stored=held.stored, lost=lost.get(stream_id, Losses()))
         for stream_id, held in journals.items()
     }
-    ledger = compute_ledger(begun.parts, states, is_finished=True)
+    ledger = compute_ledger(begun.parts, states, has_all_parts=True)
     notes = {"lost": {stream_id: losses.to_pairs() for stream_id, losses in lost.items()}}
     folder = keep(data, begun)
     done = seal_session(

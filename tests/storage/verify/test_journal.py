@@ -257,7 +257,7 @@ def test_batches_written_again_are_no_disorder(tmp_path: Path) -> None:
     journal = Journal(folder, array())
     for first in range(0, 40, 10):
         journal.append_new_frames(frames(first, first + 9))
-    journal.invalidate_whole_batches(Intervals([(20, 39)]))
+    journal.invalidate_batches_wholly_within(Intervals([(20, 39)]))
     for first in range(20, 60, 10):
         journal.append_new_frames(frames(first, first + 9))
     StreamNotes(array_info=array(), next_seq=60).save(folder)

@@ -64,7 +64,7 @@ def test_a_whole_session_is_proven_and_nothing_is_touched(tmp_path: Path) -> Non
 
 def test_a_session_without_a_frame_is_whole(tmp_path: Path) -> None:
     begun = session(parts=(Part(stream_id=STREAM_IDS[0], seq_first=0, seq_last=-1),))
-    ledger = compute_ledger(begun.parts, {}, is_finished=True)
+    ledger = compute_ledger(begun.parts, {}, has_all_parts=True)
     folder = keep(tmp_path, begun)
     inputs = SessionInputs(begun, array(), {}, None, "none", (), {})
     keep(tmp_path, seal_session(inputs, folder, ledger))

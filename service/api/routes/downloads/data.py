@@ -158,10 +158,10 @@ def _place_markers(session: Session, query: DataQuery, server: Server) -> Placed
     if session.sha256 is not None:
         with server.sessions.open_frames(session.id, only_slices=True) as reader:
             return place_session_markers(reader, session.markers, query.slice)
-    sources = server.recorder.collect_inputs(session.id)
+    sources = server.recorder.collect_unsealed_inputs(session.id)
     times = (
         {name: getattr(frames, name) for name in PLACEMENT_COLUMNS} | {"part": columns["part"]}
-        for frames, columns in SessionFrames(sources).iterate_raw()
+        for frames, columns in SessionFrames(sources).iterate_raw_with_part()
     )
     axis = sources.compute_time_axis()
     return place_markers(session.markers, times, sources.make_clock_table(), query.slice, axis=axis)
@@ -171,18 +171,18 @@ def _write_export(
     session: Session, query: DataQuery, server: Server, markers: PlacedMarkers | None
 ) -> Chunks:
     if session.sha256 is None:
-        sources = server.recorder.collect_inputs(session.id)
+        sources = server.recorder.collect_unsealed_inputs(session.id)
         clock = sources.make_clock_table() if query.clock == "server" else None
         # A whole session is estimated once: no cached preview is needed.
         is_some, so_fars = query.slice.has_time_bounds, server.previews
         so_far = (
-            so_fars.advance_unless_catching_up(sources)
+            so_fars.advance_unless_behind_journals(sources)
             if is_some
             else SessionPreview(sources, server.data)
         )
         frames = PreviewFrames(so_far, sources, query.slice)
         source = {"session": session.id, "state": session.state}
-        content = frames.make_content()  # reads the first frames, which sets `notes`
+        content = frames.make_one_pass_source()  # reads the first frames, which sets `notes`
         yield from query.format_spec.encode(
             Export(
                 content,
@@ -197,7 +197,7 @@ def _write_export(
         )
         return
     with server.sessions.open_frames(
-        session.id, only_slices=not query.slice.is_unrestricted
+        session.id, only_slices=not query.slice.has_all_rows_and_columns
     ) as reader:
         export = make_sealed_export(
             reader, query.slice, clock=query.clock, markers=markers, options=query.options

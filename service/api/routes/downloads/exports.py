@@ -104,7 +104,7 @@ class DataQuery(ExportQuery):
         is_plain = (
             self.clock == "node" and not self.has_markers and not self.options.specified_names
         )
-        return self.format_spec is PARQUET and self.slice.is_unrestricted and is_plain
+        return self.format_spec is PARQUET and self.slice.has_all_rows_and_columns and is_plain
 
 
 class TakeDataQuery(ExportQuery):

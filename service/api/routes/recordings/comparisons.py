@@ -194,7 +194,7 @@ def _encode_series(session: Session, name: str, query: SeriesQuery, server: Serv
             remedy="It has too many frames: compare parts of it",
         )
     with server.sessions.open_frames(session.id, only_slices=True) as reader:
-        begin_ns, end_ns = reader.read_span_ns()
+        begin_ns, end_ns = reader.read_span_on_axis_ns()
     part = Slice(query.start_s, query.end_s)
     bins, size = cached.get_bins(*part.compute_bounds_ns(begin_ns), query.points)
     columns = {column: values for column, values in bins.items() if column != "part"}

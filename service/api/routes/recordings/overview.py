@@ -138,11 +138,11 @@ async def get_timeseries(
 async def _preview_response(
     session: Session, query: OverviewQuery, server: Server, *, as_arrow: bool, as_gzip: bool
 ) -> Response:
-    sources = server.recorder.collect_inputs(session.id)
+    sources = server.recorder.collect_unsealed_inputs(session.id)
     part = Slice(query.start_s, query.end_s)
 
     def make() -> bytes:
-        so_far = server.previews.advance_preview(sources)
+        so_far = server.previews.advance_preview_within_time_limit(sources)
         seen, serials = so_far.get_bins(part, query.points), list(sources.info.serials)
         flags = {"provisional": True, "catching_up": so_far.is_catching_up}
         return _encode(session, seen, serials, flags, query, as_arrow=as_arrow, as_gzip=as_gzip)

@@ -147,14 +147,14 @@ async def start_session(
     if earlier:
         session = earlier[0]
     else:
-        session = server.recorder.start_session(
+        session = server.recorder.start_another_session(
             body.node,
             body.name,
             pre_roll_s=body.pre_roll_s,
             subject=body.subject or "",
             notes=body.notes,
             tags=body.tags,
-            request=record,
+            request_to_store=record,
         )
         server.notify_node_changed(server.nodes.get(body.node))
     response.headers["Location"] = f"/api/v1/sessions/{session.id}"
@@ -309,7 +309,7 @@ async def delete_session(session_id: str, server: ServerState, if_match: IfMatch
     Only emptying the trash frees its space.
     """
     server.recorder.move_to_trash(session_id, if_revision=parse_if_match(if_match))
-    server.broadcaster.queue_notice({"type": "deleted", "session_id": session_id})
+    server.broadcaster.queue_droppable_notice({"type": "deleted", "session_id": session_id})
 
 
 @router.post(

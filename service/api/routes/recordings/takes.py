@@ -91,7 +91,7 @@ async def start_take(
     A node that cannot be recorded is in `failed` with the reason; the others are recorded. A
     repeated request with the same key starts no session later.
     """
-    take = server.takes.start_take(
+    take = server.takes.start_take_where_possible(
         body.name,
         body.nodes,
         pre_roll_s=body.pre_roll_s,
@@ -145,7 +145,7 @@ async def stop_take(take_id: str, server: ServerState) -> TakeView:
 async def mark_take(take_id: str, body: one.AddMarker, server: ServerState) -> TakeView:
     """Add a marker at one time and with one id to all sessions that are being recorded."""
     return TakeView.from_take(
-        server.takes.add_marker(take_id, body.label, body.t_ns, body.id), server
+        server.takes.add_marker_while_recording(take_id, body.label, body.t_ns, body.id), server
     )
 
 
@@ -232,7 +232,9 @@ def _write_exports(
         exports = [
             make_sealed_export(
                 opened.enter_context(
-                    server.sessions.open_frames(session.id, only_slices=not part.is_unrestricted)
+                    server.sessions.open_frames(
+                        session.id, only_slices=not part.has_all_rows_and_columns
+                    )
                 ),
                 part,
                 clock=query.clock_name,
@@ -241,4 +243,4 @@ def _write_exports(
             )
             for number, session in enumerate(sessions)
         ]
-        yield from query.format_spec.encode_together(exports)
+        yield from query.format_spec.encode_together_on_server_clock(exports)

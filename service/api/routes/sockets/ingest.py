@@ -38,7 +38,7 @@ from service.protocol import (
     strip_binary_crc,
     strip_text_crc,
 )
-from service.server.identities import IdentityClaim, VerifiedClaim
+from service.server.identities import IdentityClaim, ProvenOrFirstContact
 from service.server.node import ServerNode
 from service.server.nodes import is_valid_node_name
 from service.server.server import NodeLink, Server
@@ -120,7 +120,7 @@ def _require_message(kind: type[_Message], message: str | bytes) -> _Message:
     return parsed
 
 
-def _verify_claim(server: Server, claim: IdentityClaim) -> VerifiedClaim:
+def _verify_claim(server: Server, claim: IdentityClaim) -> ProvenOrFirstContact:
     before = server.identities.refused_machines.get(claim.node)
     try:
         with _close_on_storage_error():
@@ -163,8 +163,8 @@ def _registered_node(server: Server, hello: Hello, claim: IdentityClaim) -> Iter
         other.request_close(LinkCloseCode.SUPERSEDED, "the same node has connected again")
     is_new = server.nodes.find(name) is None
     try:
-        node = server.nodes.get_or_create(hello)
-        node.apply_hello(hello, server_utc_ns())
+        node = server.nodes.check_hello_and_get_or_create(hello)
+        node.apply_checked_hello(hello, server_utc_ns())
         server.recorder.cache_missing_clock_offsets(node)
         server.sealer.extend_node_sessions(node)
     except Exception as error:
@@ -191,7 +191,7 @@ def _registered_node(server: Server, hello: Hello, claim: IdentityClaim) -> Iter
 async def _send_welcome(socket: WebSocket, server: Server, link: NodeLink) -> None:
     node = link.node
     link.retention_request = server.recorder.make_retention_request(node.name)
-    lacks = node.frames_to_request(server.recorder.needed_frames(node.name))
+    lacks = node.needed_and_present_frames_to_request(server.recorder.needed_frames(node.name))
     welcome = Welcome(protocol=PROTOCOL, missing=lacks, retention=link.retention_request)
     await send_message(socket, encode_message(welcome))
     log.info("node %s connected, stream %s", node.name, node.stream_id)
@@ -224,7 +224,7 @@ async def _receive_messages(socket: WebSocket, server: Server, link: NodeLink) -
         await asyncio.sleep(0)
         message = await _receive_message(socket)
         if isinstance(message, bytes):
-            tare_before = node.estimator.live.tare
+            tare_before = node.estimator.live.usable_tare
             try:
                 due = node.receive_frames(link.stream, _verify_frames(message), server_utc_ns())
             except LinkError as error:
@@ -232,7 +232,7 @@ async def _receive_messages(socket: WebSocket, server: Server, link: NodeLink) -
             server.broadcaster.add_to_history_and_updates(node, due)
             server.live_feeds.add_to_existing_buffer(node, due)
             server.weighings.feed_frames(node, due)
-            if node.estimator.live.tare is not tare_before:
+            if node.estimator.live.usable_tare is not tare_before:
                 server.notify_node_changed(node)
             continue
         parsed = _parse_message(message)
@@ -254,7 +254,7 @@ async def _receive_messages(socket: WebSocket, server: Server, link: NodeLink) -
 
 
 def _find_announced_stream(node: ServerNode, stream_id: str) -> ServerStream:
-    if stream_id not in node.stream_order:
+    if stream_id not in node.announced_stream_order:
         raise CloseConnection(LinkCloseCode.REFUSED, f"stream {stream_id!r} was not announced")
     return node.streams[stream_id]
 

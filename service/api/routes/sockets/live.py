@@ -21,7 +21,7 @@ from service.server.broadcast.views import SessionView
 from service.server.data_folder import start_key
 from service.server.live_feed.encoder import ArrowEncoder, check_columns
 from service.server.live_feed.events import FeedEvent, Gap, Position, StreamStart
-from service.server.live_feed.reader import POLICIES, FeedReader, Policy, start_position
+from service.server.live_feed.reader import POLICIES, FeedReader, Policy, find_requested_position
 from service.server.node import ServerNode
 from service.server.server import Server
 from service.server_clock import server_utc_ns
@@ -61,7 +61,7 @@ class LiveFeedSession:
             check_columns(self._node.last_info, self._columns)
         except UsageError as error:
             raise CloseConnection(LinkCloseCode.POLICY, error.what) from error
-        position = start_position(
+        position = find_requested_position(
             self._node,
             _require_match(parameters.get("stream_id"), _STREAM_ID, "stream_id", "32 hex digits"),
             _parse_seq(parameters.get("from_seq")),
@@ -97,7 +97,7 @@ class LiveFeedSession:
             "policy": self._policy,
         }
         await self._send_message(encode_json(hello))
-        async with aclosing(self._reader.iterate_events_forever()) as items:
+        async with aclosing(self._reader.iterate_events_until_closed()) as items:
             async for item in items:
                 await self._send_event(item)
 
@@ -268,7 +268,7 @@ def _make_hello(server: Server, node: str | None) -> dict[str, object]:
         "protocol": PROTOCOL,
         "software": SOFTWARE_VERSION,
         "t_ns": server_utc_ns(),
-        "problems": [strip_private_folders(text) for text in server.problems],
+        "problems": [strip_private_folders(text) for text in server.file_problems],
         "nodes": [
             view
             for known in server.nodes

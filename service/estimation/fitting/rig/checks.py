@@ -23,7 +23,7 @@ from service.estimation.fitting.rig.indentation import (
     Indentation,
     Strokes,
     average_stroke_blocks,
-    compute_rest_before_strokes_kpa,
+    compute_rest_before_strokes_absolute_kpa,
     find_slow_stroke_rows,
     format_origin,
     measure_initial_unloaded,
@@ -60,7 +60,7 @@ def fit_unloaded_recovery(recording: Indentation) -> UnloadedRecovery | None:
         return None
     begins_s = t_s[[stroke.begin for stroke in find_slow_stroke_rows(recording)]]
     at_s = np.append(begins_s, alone_s)
-    kpa = np.append(compute_rest_before_strokes_kpa(recording), alone_kpa)
+    kpa = np.append(compute_rest_before_strokes_absolute_kpa(recording), alone_kpa)
     known = np.isfinite(kpa)
     at_s, above_kpa = at_s[known], kpa[known] - kpa[known][0]
     crept = _compute_crept_forces(t_s, recording, at_s)
@@ -241,7 +241,7 @@ def select_before_saturation(
     return UnsaturatedStrokes(blocks, wrapped)
 
 
-def check_baseline_drift_kpa(recordings: Sequence[Indentation]) -> float:
+def check_baseline_drift_between_repeats_kpa(recordings: Sequence[Indentation]) -> float:
     """Check the unloaded pressure's drift; return its largest change from repeat 2 on.
 
     Raises:
@@ -250,7 +250,7 @@ def check_baseline_drift_kpa(recordings: Sequence[Indentation]) -> float:
     """
     drift_kpa = 0.0
     for recording in recordings:
-        all_kpa = compute_rest_before_strokes_kpa(recording)
+        all_kpa = compute_rest_before_strokes_absolute_kpa(recording)
         known = all_kpa[np.isfinite(all_kpa)]
         if len(known) < 2:
             continue

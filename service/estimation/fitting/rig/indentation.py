@@ -212,7 +212,7 @@ def _average_blocks(
     ]
 
 
-def compute_rest_before_strokes_kpa(recording: Indentation) -> Floats:
+def compute_rest_before_strokes_absolute_kpa(recording: Indentation) -> Floats:
     """Compute the mean pressure in the last half second of rest before each slow stroke, or NaN."""
     found = []
     for stroke in find_slow_stroke_rows(recording):
@@ -236,7 +236,7 @@ def select_loaded(recordings: Sequence[Indentation]) -> list[Indentation]:
     return [recording for recording in recordings if recording.is_under_indenter.any()]
 
 
-def extract_soak(recording: Indentation, noise_kpa: float) -> ThermalSoak:
+def extract_soak_or_empty(recording: Indentation, noise_kpa: float) -> ThermalSoak:
     """Return the thermal soak of a recording, without any load."""
     rows = recording.phase == "soak"
     return ThermalSoak(

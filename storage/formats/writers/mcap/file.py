@@ -212,7 +212,7 @@ def _metadata_texts(session: _ExportedSession, *, is_ros2: bool) -> dict[str, st
     export = session.export
     clock = "the node's" if export.clock is None else "the server's"
     facts = {
-        **export.metadata,
+        **export.provenance_and_slice_metadata,
         "log_time": f"log time and publish time are the instant of the frame by {clock} clock",
         "log_time_uncertainty_ns": session.uncertainty_ns,
         "topics": f"{session.topic_prefix}/",

@@ -20,7 +20,7 @@ from service.estimation.dead_weights import (
 from service.estimation.fitting.rig.indentation import Indentation
 from service.estimation.fitting.weights_fit import fit_dead_weights
 from service.server import weighing, weighings
-from service.server.weighing import Action, Begin, Withdraw
+from service.server.weighing import Begin, MarkerChange, Withdraw
 from service.sessions.calibration_file import parse_calibration, write_calibration
 from storage.sessions.reader import SealedFileReader
 from tests.service.cli.outcome import Run, scene_text, static_only
@@ -116,14 +116,16 @@ def test_the_command_guides_through_the_weights_and_writes_what_is_accepted(
     class Followed(weighing.Weighing):
         """A guide whose prompts somebody follows."""
 
-        def feed_pressures(self, t_ns: npt.NDArray[np.int64], absolute_kpa: Floats) -> list[Action]:
+        def feed_tile_pressures(
+            self, t_ns: npt.NDArray[np.int64], tile_absolute_kpa: Floats
+        ) -> list[MarkerChange]:
             # By now the prompt is there, and the markers before it are made.
             known = parse_weight(self.weights[self.weight_index]) if self.step == "put on" else None
             if known is not None:
                 play.force_n = known.force_n
             elif self.step == "empty":
                 play.force_n = 0.0
-            return super().feed_tile_pressures(t_ns, absolute_kpa)
+            return super().feed_tile_pressures(t_ns, tile_absolute_kpa)
 
     monkeypatch.setattr(weighings, "Weighing", Followed)
     monkeypatch.setenv("FOOTTILE_TOKEN", tared.running.shown["Authorization"].split()[-1])

@@ -50,7 +50,7 @@ def data(tmp_path: Path) -> Path:
         take="20200101T000000Z-00000b",
         problem=HOSTILE,
     )
-    SessionsFolder(root / "sessions").save(kept)
+    SessionsFolder(root / "sessions").save_session_json(kept)
     return root
 
 

@@ -81,7 +81,7 @@ def test_ctrl_c_is_said_and_leaves_no_file_and_no_process(
     [
         ("service.offline.export.make_sealed_export", "export s.parquet --format csv --out x.csv"),
         ("storage.verify.data_folder.verify_path", "verify ."),
-        ("service.sessions.recovery.recover_folder", "recover data"),
+        ("service.sessions.recovery.recover_locked_folder", "recover data"),
         ("service.offline.estimate.session.estimate_session", "estimate s.parquet --out x.parquet"),
         ("service.offline.doctor.diagnose_bus", "doctor --bus emulated"),
         ("foottile.server.Server.sessions", "sessions"),

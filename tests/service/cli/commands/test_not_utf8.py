@@ -9,7 +9,7 @@ import pytest
 
 from devices.errors import StorageError
 from service.cli.main import SUMMARIES
-from storage.permissions import set_umask_and_restrict_folder
+from storage.permissions import set_umask_and_create_private_folder
 from tests.service.cli.commands.test_any_value import COMMANDS
 from tests.service.cli.outcome import Run
 
@@ -39,7 +39,7 @@ def test_no_server_or_node_begins_to_write_in_such_a_folder(tmp_path: Path) -> N
     umask = os.umask(0o022)
     os.umask(umask)
     with pytest.raises(StorageError, match="not UTF-8"):
-        set_umask_and_restrict_folder(tmp_path / ODD)
+        set_umask_and_create_private_folder(tmp_path / ODD)
     assert list(tmp_path.iterdir()) == []
     assert os.umask(umask) == umask
 

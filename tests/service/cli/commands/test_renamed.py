@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from service.server.session_store import SessionStore, Trash
-from service.sessions.recovery import recover_folder
+from service.sessions.recovery import recover_locked_folder
 from storage.durable_files import lock_folder
 from storage.sessions.folder import Part, Session, SessionsFolder, SessionState
 from storage.verify.data_folder import find_verdict, verify_path
@@ -29,7 +29,7 @@ def put(data: Path, session_id: str = ID, state: SessionState = "recording") -> 
         scene="test",
     )
     folder = SessionsFolder(data / "sessions")
-    folder.save(session)
+    folder.save_session_json(session)
     return folder.get_path(session_id)
 
 
@@ -76,7 +76,7 @@ def test_a_copy_is_told_of_and_neither_is_merged_nor_deleted(
     assert listed.out.count(ID) == 1
     assert f"is a copy of session {ID}" in listed.err
     with lock_folder(data):
-        recovery = recover_folder(data, abandon_missing=True)
+        recovery = recover_locked_folder(data, abandon_missing=True)
     assert [found.session.id for found in recovery.sessions] == [ID]
     assert any("copy" in problem for problem in recovery.problems)
     assert files_in(data / "sessions" / name) == before

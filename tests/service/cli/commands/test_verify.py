@@ -55,7 +55,7 @@ def begun(root: Path, session_id: str = ID, *, last: int | None = None) -> None:
         parts=(Part(stream_id=BOOT, seq_first=0, seq_last=last),),
         scene="test",
     )
-    SessionsFolder(root / "sessions").save(kept)
+    SessionsFolder(root / "sessions").save_session_json(kept)
 
 
 def test_a_crash_is_recovered_and_proven(run: Run, data: Path) -> None:
@@ -357,7 +357,7 @@ def test_a_list_of_sessions_says_how_much_was_not_sampled(run: Run, data: Path) 
     session = folder.load(ID)
     assert session.ledger is not None
     ledger = session.ledger.model_copy(update={"missed_slots": 25})
-    folder.save(session.model_copy(update={"ledger": ledger}))
+    folder.save_session_json(session.model_copy(update={"ledger": ledger}))
     assert "sealed, 20 % not" in run("sessions", "--data", data).out  # as wide as a terminal
     (listed,) = run("sessions", "--data", data, "--json").printed()["items"]
     assert (listed["missed_slots"], listed["lost"]) == (25, {})

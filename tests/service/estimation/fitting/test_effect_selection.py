@@ -13,8 +13,8 @@ import pytest
 from service.estimation.effects import WALL_PER_KPA, Effects
 from service.estimation.fitting.dome_model import DomeModel, FittedEffects
 from service.estimation.fitting.effects_fit import (
+    _convert_centred_cubic_to_c1_c2_c3,
     collect_loadings,
-    convert_centred_cubic_to_c1_c2_c3,
     fit_determined_effects,
 )
 from service.estimation.fitting.output_error import OutputErrorProblem
@@ -159,7 +159,7 @@ def test_without_a_soak_at_two_temperatures_there_is_neither_temperature_nor_amb
     effects = found_in(recorded(soak_s=soak_s, strokes=2, holds=0, taps=0))
     assert effects.temperature is None
     assert (effects.refused["temperature"], effects.refused["ambient"]) == (reason, reason)
-    assert effects.wall_compliance_per_kpa == WALL_PER_KPA
+    assert effects.wall_compliance_or_default_per_kpa == WALL_PER_KPA
 
 
 def test_what_a_loading_is_off_by_if_it_is_held_out_is_what_a_fit_without_it_says() -> None:
@@ -167,7 +167,7 @@ def test_what_a_loading_is_off_by_if_it_is_held_out_is_what_a_fit_without_it_say
     tile = fit_static_curve(recording)
     points, baseline_kpa = collect_loadings([recording])
     static = DomeModel(
-        convert_centred_cubic_to_c1_c2_c3(tile.coefficients),
+        _convert_centred_cubic_to_c1_c2_c3(tile.coefficients),
         tile.range_kpa[1],
         baseline_kpa,
         WALL_PER_KPA,

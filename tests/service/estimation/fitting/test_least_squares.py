@@ -16,8 +16,8 @@ from service.estimation.fitting.dome_model import (
     list_unknowns,
 )
 from service.estimation.fitting.effects_fit import (
+    _convert_centred_cubic_to_c1_c2_c3,
     collect_loadings,
-    convert_centred_cubic_to_c1_c2_c3,
 )
 from service.estimation.fitting.least_squares import minimize_squares
 from service.estimation.fitting.output_error import OutputErrorProblem
@@ -78,7 +78,7 @@ def test_a_tiles_fit_is_that_of_a_long_search_within_a_small_part_of_its_sigma()
     tile = fit_static_curve(recording)
     points, baseline_kpa = collect_loadings([recording])
     static = DomeModel(
-        convert_centred_cubic_to_c1_c2_c3(tile.coefficients),
+        _convert_centred_cubic_to_c1_c2_c3(tile.coefficients),
         tile.range_kpa[1],
         baseline_kpa,
         WALL_PER_KPA,

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from devices.frames import ServoInfo
 from service.estimation.foot.geometry import (
-    compute_grid_indices,
+    compute_grid_indices_from_1,
     compute_hull_half_planes,
     compute_segment_rad_per_count,
     compute_tilt_loss,
@@ -88,7 +88,7 @@ def test_tiles_a_micrometre_out_of_line_are_in_line() -> None:
 
 def test_grid_indices_count_from_one_along_each_axis() -> None:
     positions = np.array([(0.0, 0.0), (0.01, 0.0), (0.0, 0.02), (0.01, 0.02)])
-    grid = compute_grid_indices(positions)
+    grid = compute_grid_indices_from_1(positions)
     assert grid is not None
     assert grid[0].tolist() == [1.0, 2.0, 1.0, 2.0]
     assert grid[1].tolist() == [1.0, 1.0, 2.0, 2.0]
@@ -100,7 +100,7 @@ def test_tiles_of_a_grid_have_their_indices_in_whatever_order_they_are_listed(
 ) -> None:
     places = [(i, j) for i in range(1, columns + 1) for j in range(1, rows + 1)]
     random.shuffle(places)
-    grid = compute_grid_indices(np.array([(0.013 * i - 0.1, 0.02 * j) for i, j in places]))
+    grid = compute_grid_indices_from_1(np.array([(0.013 * i - 0.1, 0.02 * j) for i, j in places]))
     assert grid is not None
     assert list(zip(*(axis.tolist() for axis in grid), strict=True)) == places
 
@@ -114,7 +114,7 @@ def test_tiles_of_a_grid_have_their_indices_in_whatever_order_they_are_listed(
     ],
 )
 def test_tiles_that_fill_no_grid_have_no_indices(positions: list[tuple[float, float]]) -> None:
-    assert compute_grid_indices(np.array(positions)) is None
+    assert compute_grid_indices_from_1(np.array(positions)) is None
 
 
 # --- angle ----------------------------------------------------------------------------------------

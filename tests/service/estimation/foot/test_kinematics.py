@@ -16,7 +16,7 @@ from service.estimation.estimate import Estimator
 from service.estimation.foot.geometry import (
     ServoReading,
     interpolate_servo_counts,
-    store_servo_reading,
+    store_servo_reading_and_flag_wraps,
 )
 from service.estimation.records import RecordArray
 from tests.builders.arrays import array_at, make_servo
@@ -52,7 +52,7 @@ def readings_of(frames: FrameBatch, broken: Sequence[bool]) -> RecordArray[Servo
     """Store the servo readings of frames, some of them after a gap."""
     readings = ServoReading.array(len(frames))
     for i, after_gap in enumerate(broken):
-        store_servo_reading(
+        store_servo_reading_and_flag_wraps(
             readings,
             i,
             frames.t_mono_ns[i],

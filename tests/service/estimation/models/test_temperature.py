@@ -16,7 +16,7 @@ from service.estimation.models.temperature import (
     TemperatureModel,
     compute_gas_temperature_noise_counts,
     initial_state,
-    refer_to_tare_temperature,
+    refer_to_tare_temperature_with_sigma,
 )
 from tests.builders.readings import through
 
@@ -34,7 +34,12 @@ def taken_back(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pressures as they would be at the tare's temperature, and their uncertainty."""
     out, sigma_kpa = through(
-        refer_to_tare_temperature, of.to_records(), initial_state(1), kpa, temperature_raw, t_ns
+        refer_to_tare_temperature_with_sigma,
+        of.to_records(),
+        initial_state(1),
+        kpa,
+        temperature_raw,
+        t_ns,
     ).T
     return out, sigma_kpa
 

@@ -94,7 +94,7 @@ NEWTON_KPA = 100 * COUNT_KPA
 def read_n(force_n: Floats) -> Floats:
     """What a tile of one newton a count seems to bear, its gas heated by being squeezed."""
     curve = np.array([100.0, 0.0, 0.0])
-    wall = GAS.wall_compliance_per_kpa
+    wall = GAS.wall_compliance_or_default_per_kpa
     model = DomeModel(curve, NEWTON_KPA, UNLOADED_KPA, wall, gamma=GAMMA, tau_s=TAU_S)
     pressed = model.compute_response(
         1e-9 * PERIOD_NS * np.arange(len(force_n), dtype=np.float64), force_n

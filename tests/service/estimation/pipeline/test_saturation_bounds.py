@@ -111,7 +111,7 @@ def a_dome(rng: np.random.Generator, lag_ms: float) -> tuple[DomeModel, Estimati
     ]
     tare = make_tare(2, noise_kpa=NOISE_KPA)
     plan = make_plan(info, make_calibration(*tiles), tare, models=LADDER, lag_ms=lag_ms)
-    wall = effects.wall_compliance_per_kpa
+    wall = effects.wall_compliance_or_default_per_kpa
     dome = DomeModel(
         np.array(CURVE), SCALE_KPA, UNLOADED_KPA, wall, gamma, tau_s, part, creep_s, loop
     )

@@ -43,7 +43,9 @@ def _average_all(params: KernelParams, buffer: FrameBuffer, out: Floats) -> None
     forces: RecordArray[TileForce] = np.zeros(len(params.tiles), TILE_FORCE)
     rows, windows = (0, 0), denoise.allocate_scratch()
     for i in range(len(out)):
-        rows = denoise.find_window_rows(buffer.t_mono_ns, i, 0, len(out), rows, 100_000_000)
+        rows = denoise.find_oldest_and_newest_window_rows(
+            buffer.t_mono_ns, i, 0, len(out), rows, 100_000_000
+        )
         for j in range(len(forces)):
             forces[j].force_n, forces[j].noise_n = buffer.usable_n[i, j], buffer.noise_n[i, j]
         denoise_forces(params, buffer, i, rows, windows, forces)

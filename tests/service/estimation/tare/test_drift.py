@@ -13,7 +13,7 @@ from service.estimation.tare.tare import (
     TREND_OVER_NS,
     TREND_SPAN_MIN_NS,
     Tare,
-    compute_thermal_shift_kpa,
+    compute_sealed_gas_shift_kpa,
     compute_warming_k,
     fit_recent_baseline_trend,
     has_temperature_changed,
@@ -45,7 +45,7 @@ def test_five_kelvin_are_27_counts_less_and_1_7_kilopascals_more() -> None:
     # 100 kPa sealed at 298 K: 0.3356 kPa/K
     warmer = compute_warming_k(tare(), np.array([480.0 - 26.75, 500.0]))
     assert warmer == pytest.approx([5.0, 0.0])
-    assert compute_thermal_shift_kpa(tare(), warmer) == pytest.approx([500.0 / 298.0, 0.0])
+    assert compute_sealed_gas_shift_kpa(tare(), warmer) == pytest.approx([500.0 / 298.0, 0.0])
 
 
 def test_a_tile_has_warmed_once_its_chip_has_moved_by_more_than_the_bound() -> None:

@@ -110,7 +110,7 @@ def test_minimum_and_maximum_of_all_that_was_skipped_go_with_the_newest(
 ) -> None:
     summary = PendingUpdate()
     for a, b in pairwise(accumulate(sizes, initial=0)):
-        summary.add_summary("bench", piece(a, b - a, silent=silent))
+        summary.join_summary_or_drop_older("bench", piece(a, b - a, silent=silent))
     total = sum(sizes)
     columns = estimates(0, total, silent=silent)
     (message,) = taken(summary)
@@ -134,7 +134,10 @@ def test_joining_pieces_is_summing_up_their_frames_and_in_any_grouping(sizes: li
     a, b, c, end = accumulate(sizes, initial=0)
     one, two, three = piece(a, b - a), piece(b, c - b), piece(c, end - c)
     whole = piece(0, end)
-    for joined in (one.join(two).join(three), one.join(two.join(three))):
+    for joined in (
+        one.join_extremes(two).join_extremes(three),
+        one.join_extremes(two.join_extremes(three)),
+    ):
         np.testing.assert_array_equal(joined.span, whole.span)
         assert joined.newest == whole.newest
         for name in ("gauge_min_kpa", "gauge_max_kpa", "force_min_n", "force_max_n"):
@@ -170,7 +173,7 @@ def test_every_number_is_in_a_message_or_reported_as_dropped(
         lost |= set(range(seq, seq + gap)) if begin is not None else set()
         seq += gap
         begin = seq if begin is None else begin
-        summary.add_summary("bench", piece(seq, rows, period_ns=period_ns))
+        summary.join_summary_or_drop_older("bench", piece(seq, rows, period_ns=period_ns))
         sent |= set(range(seq, seq + rows))
         seq += rows
         if at in takes:
@@ -191,14 +194,14 @@ def test_every_number_is_in_a_message_or_reported_as_dropped(
 
 def test_the_first_piece_says_nothing_of_what_was_before() -> None:
     summary = PendingUpdate()
-    summary.add_summary("bench", piece(1000, 10))
+    summary.join_summary_or_drop_older("bench", piece(1000, 10))
     assert [m["type"] for m in taken(summary)] == ["frame"]
 
 
 def test_a_summary_is_of_a_second_at_most_and_older_frames_are_dropped() -> None:
     summary = PendingUpdate()
     for first in range(0, 2000, 10):  # 4 s
-        summary.add_summary("bench", piece(first, 10))
+        summary.join_summary_or_drop_older("bench", piece(first, 10))
     messages = taken(summary)
     (frame,), (dropped,) = of_type(messages, "frame"), of_type(messages, "dropped")
     assert frame["n"] <= SUMMARY_NS // PERIOD_NS + 10
@@ -210,7 +213,7 @@ def test_a_summary_is_of_a_second_at_most_and_older_frames_are_dropped() -> None
 def test_a_summary_is_of_a_second_at_most_although_frames_come_slower_than_they_should() -> None:
     summary, period_ns = PendingUpdate(), 10 * PERIOD_NS
     for first in range(0, 400, 5):  # 8 s
-        summary.add_summary("bench", piece(first, 5, period_ns=period_ns))
+        summary.join_summary_or_drop_older("bench", piece(first, 5, period_ns=period_ns))
     (frame,) = of_type(taken(summary), "frame")
     assert (frame["n"] - 1) * period_ns <= SUMMARY_NS + 5 * period_ns
 
@@ -222,7 +225,7 @@ def test_a_client_that_never_takes_stays_bounded(frames_sent: int) -> None:
     one = vars(piece(0, 1))
     for at in range(0, 3 * frames_sent, 3):
         span = piece(0, 1).span._replace(seq_first=at, seq=at, t_ns=at * period_ns)
-        summary.add_summary("bench", FrameSummary(**one | {"span": span}))
+        summary.join_summary_or_drop_older("bench", FrameSummary(**one | {"span": span}))
         summary.add_notice('{"type":"node"}')
     messages = taken(summary)
     assert len(of_type(messages, "node")) == 256
@@ -233,10 +236,10 @@ def test_a_client_that_never_takes_stays_bounded(frames_sent: int) -> None:
 
 def test_a_node_that_begins_anew_has_lost_nothing_by_that() -> None:
     summary = PendingUpdate()
-    summary.add_summary("bench", piece(100, 10))
+    summary.join_summary_or_drop_older("bench", piece(100, 10))
     taken(summary)
-    summary.add_summary("bench", piece(0, 5, stream_id="1" * 32))
-    summary.add_summary("bench", piece(7, 5, stream_id="1" * 32))
+    summary.join_summary_or_drop_older("bench", piece(0, 5, stream_id="1" * 32))
+    summary.join_summary_or_drop_older("bench", piece(7, 5, stream_id="1" * 32))
     messages = taken(summary)
     assert [(m["from_seq"], m["to_seq"]) for m in of_type(messages, "dropped")] == [(5, 6)]
     assert [(m["seq"], m["n"]) for m in of_type(messages, "frame")] == [(11, 10)]
@@ -244,8 +247,8 @@ def test_a_node_that_begins_anew_has_lost_nothing_by_that() -> None:
 
 def test_frames_of_before_a_restart_that_were_not_told_are_dropped() -> None:
     summary = PendingUpdate()
-    summary.add_summary("bench", piece(100, 10))
-    summary.add_summary("bench", piece(0, 5, stream_id="1" * 32))
+    summary.join_summary_or_drop_older("bench", piece(100, 10))
+    summary.join_summary_or_drop_older("bench", piece(0, 5, stream_id="1" * 32))
     messages = taken(summary)
     assert [(m["seq"], m["n"]) for m in of_type(messages, "frame")] == [(4, 5)]
     assert [(m["from_seq"], m["to_seq"]) for m in of_type(messages, "dropped")] == [(100, 109)]
@@ -258,7 +261,7 @@ def test_nodes_do_not_mix_and_one_may_look_at_one_only() -> None:
     everything, only = PendingUpdate(), PendingUpdate("right")
     for name, first in (("left", 0), ("right", 50), ("left", 10), ("right", 60)):
         for summary in (everything, only):
-            summary.add_summary(name, piece(first, 10))
+            summary.join_summary_or_drop_older(name, piece(first, 10))
     assert [(m["node"], m["seq"], m["n"]) for m in taken(everything)] == [
         ("left", 19, 20),
         ("right", 69, 20),
@@ -269,11 +272,11 @@ def test_nodes_do_not_mix_and_one_may_look_at_one_only() -> None:
 def test_there_is_something_to_tell_until_it_is_taken() -> None:
     summary = PendingUpdate("left")
     assert not summary
-    summary.add_summary("right", piece(0, 1))
+    summary.join_summary_or_drop_older("right", piece(0, 1))
     summary.add_progress("right", {"session": {"frames": 1}})
     assert not summary
     changes: list[Callable[[], None]] = [
-        lambda: summary.add_summary("left", piece(0, 1)),
+        lambda: summary.join_summary_or_drop_older("left", piece(0, 1)),
         lambda: summary.add_progress("left", {"session": {"frames": 1}}),
         lambda: summary.add_notice('{"type":"notice"}'),
     ]
@@ -286,7 +289,7 @@ def test_there_is_something_to_tell_until_it_is_taken() -> None:
 
 def test_notices_come_first_in_their_order_and_the_oldest_are_forgotten() -> None:
     summary = PendingUpdate()
-    summary.add_summary("bench", piece(0, 1))
+    summary.join_summary_or_drop_older("bench", piece(0, 1))
     for n in range(1000):
         summary.add_notice(json.dumps({"type": "notice", "n": n}))
     messages = taken(summary)
@@ -305,7 +308,7 @@ def test_a_session_is_not_told_as_smaller_after_it_is_told_as_sealed() -> None:
 @pytest.mark.parametrize(("age_ms", "told"), [(None, None), (0.0, 0.0), (12.34, 12.3)])
 def test_the_age_goes_with_it_if_it_is_known(age_ms: float | None, told: float | None) -> None:
     summary = PendingUpdate()
-    summary.add_summary("bench", piece(0, 5))
+    summary.join_summary_or_drop_older("bench", piece(0, 5))
     (message,) = taken(summary, {} if age_ms is None else {"bench": age_ms})
     assert message["age_ms"] == told
 
@@ -324,7 +327,7 @@ def test_what_was_taken_and_not_told_is_told_later_as_if_it_had_not_been_taken(
     for at, (gap, rows) in enumerate(runs):
         seq += gap if at else 0
         for summary in (told_once, feed):
-            summary.add_summary("bench", piece(seq, rows, period_ns=period_ns))
+            summary.join_summary_or_drop_older("bench", piece(seq, rows, period_ns=period_ns))
             summary.add_notice(json.dumps({"type": "notice", "n": at}))
             summary.add_progress("bench", {"session": {"frames": seq}})
         seq += rows
@@ -351,7 +354,7 @@ def told_or_dropped(messages: Sequence[dict[str, Any]]) -> int:
 
 def test_without_estimates_everything_estimated_is_null() -> None:
     summary = PendingUpdate()
-    summary.add_summary("bench", summed_up(frames(0, 5), {}))
+    summary.join_summary_or_drop_older("bench", summed_up(frames(0, 5), {}))
     (message,) = taken(summary)
     for name in ("gauge_kpa", "force_n", "force_sigma_n", "gauge_min_kpa", "force_max_n"):
         assert message[name] == [None, None], name

@@ -124,7 +124,7 @@ class World:
         """It sends all that the server has asked for, the present stream's last."""
         if not self._is_there:
             return
-        for each in self.node.frames_to_request(self.needed()):
+        for each in self.node.needed_and_present_frames_to_request(self.needed()):
             stream = self.streams[each.stream_id]
             wanted = Intervals((a, NO_END if b is None else b) for a, b in each.numbers)
             for first, last in wanted & stream.held:
@@ -187,7 +187,7 @@ class World:
 
     def connect(self) -> None:
         """The node connects."""
-        self.node.apply_hello(self._hello(), UTC_NS)
+        self.node.apply_checked_hello(self._hello(), UTC_NS)
         self._is_there = True
 
     def leave(self) -> None:
@@ -201,7 +201,7 @@ class World:
 
     def prune(self) -> None:
         """It deletes what nobody needs."""
-        while self.node.delete_unneeded_step(self.needed()):
+        while self.node.delete_old_frames_or_one_ended_journal(self.needed()):
             pass
 
     def needed(self) -> Mapping[str, Intervals]:

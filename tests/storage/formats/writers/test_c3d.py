@@ -40,7 +40,11 @@ class Read(C3dFile):
     """What was written of an export, or of several."""
 
     def __init__(self, export: Export | list[Export]) -> None:
-        chunks = C3D.encode_together(export) if isinstance(export, list) else C3D.encode(export)
+        chunks = (
+            C3D.encode_together_on_server_clock(export)
+            if isinstance(export, list)
+            else C3D.encode(export)
+        )
         self.content = b"".join(chunks)
         super().__init__(self.content)
 
@@ -306,4 +310,4 @@ def test_sessions_of_different_days_are_refused_and_not_joined() -> None:
         one, frame_source=two_feet()[1].frame_source, clock=compared(86_400_000_000_000)
     )
     with pytest.raises(UsageError, match="gaps included"):
-        list(C3D.encode_together([one, other]))
+        list(C3D.encode_together_on_server_clock([one, other]))

@@ -155,7 +155,7 @@ EACH = pytest.mark.parametrize(
 
 def written(to: str, exports: Sequence[Export], options: FormatOptions = NO_OPTIONS) -> bytes:
     given = [replace(each, options=options) for each in exports]
-    return b"".join(get_multi_session_format(to).encode_together(given))
+    return b"".join(get_multi_session_format(to).encode_together_on_server_clock(given))
 
 
 def test_formats_of_one_session_name_those_of_several() -> None:
@@ -320,4 +320,4 @@ def test_octave_reads_an_array_of_structs(tmp_path: Path) -> None:
 def test_too_many_bytes_for_a_variable_are_refused_first(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(matlab, "BYTES_MAX", 100_000)
     with pytest.raises(UsageError, match="bytes in these sessions, and 100000 in a variable"):
-        next(get_multi_session_format("mat").encode_together(two_feet()))
+        next(get_multi_session_format("mat").encode_together_on_server_clock(two_feet()))

@@ -297,7 +297,9 @@ def test_opensim_presses_each_foot_of_a_take_with_its_own_force(
     opensim: Any, tmp_path: Path
 ) -> None:
     options = FormatOptions(body="calcn_l,calcn_r")
-    content = OPENSIM.encode_together([replace(e, options=options) for e in two_feet()])
+    content = OPENSIM.encode_together_on_server_clock(
+        [replace(e, options=options) for e in two_feet()]
+    )
     with zipfile.ZipFile(io.BytesIO(b"".join(content))) as file:
         file.extractall(tmp_path)
     mot = opensim.TimeSeriesTable(str(next(tmp_path.glob("*.mot"))))

@@ -53,14 +53,14 @@ def test_a_failing_disk_costs_what_memory_cannot_store(
             segment_writer, "write_all_or_none", refusing(OSError, number, os.strerror(number))
         )
         fill(journal, stream, 50, 69)
-        until(lambda: journal.disk_warnings)
-        assert words in journal.disk_warnings[0]
+        until(lambda: journal.disk_refusal_warnings)
+        assert words in journal.disk_refusal_warnings[0]
         fill(journal, stream, 70, 999)
         lost = stream.lost.by_reason[reason]
         assert next(iter(lost))[0] == 50
         assert stream.available.number_count + lost.number_count == 1000
         assert given(stream, 990, 999) == [990]  # the live picture, and what still waits
-    until(lambda: journal.disk_warnings == ())
+    until(lambda: journal.disk_refusal_warnings == ())
     until(lambda: stream.stored.last == 999)
     assert stream.stored.number_count + stream.lost.by_reason[reason].number_count == 1000
 
@@ -105,14 +105,14 @@ def test_batches_of_a_failed_sync_are_written_again(
 def test_frames_of_a_failed_sync_can_be_read_all_the_while(
     journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    disown = Journal.invalidate_whole_batches
+    disown = Journal.invalidate_batches_wholly_within
     seen: list[tuple[Intervals, list[int]]] = []
 
     def then_looked_at(journal_: Journal, numbers: Intervals) -> None:
         disown(journal_, numbers)
         seen.append((stream.available, given(stream, 0, 49)))
 
-    monkeypatch.setattr(Journal, "invalidate_whole_batches", then_looked_at)
+    monkeypatch.setattr(Journal, "invalidate_batches_wholly_within", then_looked_at)
     before_each_sync_of_frames(monkeypatch, failing_once(lambda: None, *IO_ERROR))
     fill(journal, stream, 0, 49)
     until(lambda: seen and stream.available.last == 49 and stream.is_synced)
@@ -157,7 +157,7 @@ def test_over_the_bound_of_memory_the_oldest_frames_of_all_go(
     journal = start()
     before = journal.switch_to_new_stream(make_array())
     fill(journal, before, 0, 149)
-    until(lambda: journal.disk_warnings)
+    until(lambda: journal.disk_refusal_warnings)
     present = journal.switch_to_new_stream(make_array(stream_id="1" * 32))
     fill(journal, present, 0, 99)
     assert present.available == Intervals([(0, 99)])

@@ -27,7 +27,7 @@ def test_every_frame_is_stored_soon_and_can_be_read_at_any_time(
     until(lambda: stream.stored == Intervals([(0, 99)]))
     assert given(stream, 15, 44) == [10, 20, 30, 40]
     assert stream.available == Intervals([(0, 99)])
-    assert journal.disk_warnings == ()
+    assert journal.disk_refusal_warnings == ()
 
 
 def test_two_processes_do_not_use_one_nodes_folder(start: Start, tmp_path: Path) -> None:
@@ -82,7 +82,7 @@ def test_with_damaged_requests_only_the_budget_drops_frames(
     store(journal, stream, 300, 1499)
     until(lambda: stream.stored.first != 0)
     assert stream.stored.last == 1499
-    assert journal.disk_warnings == ()
+    assert journal.disk_refusal_warnings == ()
 
 
 def test_over_the_budget_the_ring_goes_first_then_frames_are_lost(
@@ -93,12 +93,12 @@ def test_over_the_budget_the_ring_goes_first_then_frames_are_lost(
     journal = start(budget_bytes=60_000)
     stream = journal.switch_to_new_stream(make_array())
     fill(journal, stream, 0, 99)
-    until(lambda: not stream.waiting_bytes)
+    until(lambda: not stream.unwritten_bytes)
     journal.update_retention_request("laptop", wants((100, None)))
     for first in range(100, 1000, 50):
         fill(journal, stream, first, first + 49)
-        until(lambda: not stream.waiting_bytes or journal.disk_warnings)
-    assert "is full" in journal.disk_warnings[0]
+        until(lambda: not stream.unwritten_bytes or journal.disk_refusal_warnings)
+    assert "is full" in journal.disk_refusal_warnings[0]
     fill(journal, stream, 1000, 1999)
     lost = stream.lost.by_reason
     assert lost["evicted"] == Intervals([(0, 99)])
@@ -109,7 +109,7 @@ def test_over_the_budget_the_ring_goes_first_then_frames_are_lost(
     # A server has taken some of them after all: there is room, and it goes on.
     stream.record_acknowledgement("laptop", 100, 1999)
     fill(journal, stream, 2000, 2009)
-    until(lambda: journal.disk_warnings == () and stream.stored.last == 2009)
+    until(lambda: journal.disk_refusal_warnings == () and stream.stored.last == 2009)
     assert "disk_full" not in stream.lost.to_pairs()
 
 
@@ -121,7 +121,9 @@ def test_required_frames_of_no_server_are_undelivered(
     assert journal.available_undelivered_numbers(stream) == Intervals([(50, 99)])
     stream.record_acknowledgement("laptop", 0, 79)
     assert journal.available_undelivered_numbers(stream) == Intervals([(80, 99)])
-    assert journal.retention_requests.required_numbers_of("0" * 32) == Intervals([(50, NO_END)])
+    assert journal.retention_requests.node_session_or_server_numbers_of("0" * 32) == Intervals(
+        [(50, NO_END)]
+    )
 
 
 def test_frames_of_the_nodes_own_session_stay(

@@ -20,8 +20,8 @@ def test_a_request_outlives_the_process(tmp_path: Path) -> None:
     )
     wanted.save()
     again = RetentionRequests(tmp_path / "retention.json")
-    assert again.required_numbers_of("a") == Intervals([(5, 9), (20, NO_END)])
-    assert again.required_numbers_of("b") == Intervals()
+    assert again.node_session_or_server_numbers_of("a") == Intervals([(5, 9), (20, NO_END)])
+    assert again.node_session_or_server_numbers_of("b") == Intervals()
 
 
 def test_an_unknown_stream_is_required_while_a_session_is_recorded(tmp_path: Path) -> None:
@@ -29,9 +29,9 @@ def test_an_unknown_stream_is_required_while_a_session_is_recorded(tmp_path: Pat
     wanted.update_request_in_memory(
         "laptop", RetentionRequest(streams={"b": ((7, None),)}, recording=True, known=("a", "b"))
     )
-    assert wanted.required_numbers_of("c") == Intervals([(0, NO_END)])
-    assert wanted.required_numbers_of("b") == Intervals([(7, NO_END)])
-    assert wanted.required_numbers_of("a") == Intervals()
+    assert wanted.node_session_or_server_numbers_of("c") == Intervals([(0, NO_END)])
+    assert wanted.node_session_or_server_numbers_of("b") == Intervals([(7, NO_END)])
+    assert wanted.node_session_or_server_numbers_of("a") == Intervals()
 
 
 def test_one_server_does_not_give_up_what_another_needs(tmp_path: Path) -> None:
@@ -39,9 +39,9 @@ def test_one_server_does_not_give_up_what_another_needs(tmp_path: Path) -> None:
     wanted.update_request_in_memory("laptop", RetentionRequest(streams={"a": ((0, 9),)}))
     wanted.update_request_in_memory("other", RetentionRequest(streams={"a": ((5, 14),)}))
     wanted.set_node_session_numbers({"a": Intervals([(100, 109)])})
-    assert wanted.required_numbers_of("a") == Intervals([(0, 14), (100, 109)])
+    assert wanted.node_session_or_server_numbers_of("a") == Intervals([(0, 14), (100, 109)])
     wanted.update_request_in_memory("laptop", RetentionRequest())
-    assert wanted.required_numbers_of("a") == Intervals([(5, 14), (100, 109)])
+    assert wanted.node_session_or_server_numbers_of("a") == Intervals([(5, 14), (100, 109)])
 
 
 DAMAGES = (b"", b"{", b"[]", b"null", b'{"servers": 7}', b"\xff", b"[" * 100_000, b"1e999")
@@ -60,7 +60,7 @@ def test_while_a_damaged_file_is_there_all_frames_may_be_required(
     wanted.update_request_in_memory("laptop", RetentionRequest(streams={"a": ((0, 9),)}))
     wanted.save()
     again = RetentionRequests(path)
-    assert again.required_numbers_of("a") == Intervals([(0, 9)])
+    assert again.node_session_or_server_numbers_of("a") == Intervals([(0, 9)])
     assert again.is_unknown
     assert "Delete" in again.problems[0]
     path.with_name("retention.json.damaged-1").unlink()

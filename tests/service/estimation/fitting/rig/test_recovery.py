@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from devices.errors import CalibrationError
-from service.estimation.fitting.rig.checks import check_baseline_drift_kpa, fit_unloaded_recovery
+from service.estimation.fitting.rig.checks import (
+    check_baseline_drift_between_repeats_kpa,
+    fit_unloaded_recovery,
+)
 from service.estimation.fitting.rig.indentation import Indentation
 
 STEP_S = 0.01
@@ -73,7 +76,7 @@ def leaked_kpa(leak_s: float) -> np.ndarray:
 def test_creep_of_up_to_15_percent_over_seconds_is_no_drift(times_s: tuple[float, ...]) -> None:
     part = 0.15 / len(times_s)
     recording = bench(crept_kpa((part,) * len(times_s), times_s))
-    assert check_baseline_drift_kpa([recording]) < 0.8
+    assert check_baseline_drift_between_repeats_kpa([recording]) < 0.8
     settled = fit_unloaded_recovery(recording)
     assert settled is not None
     assert np.ptp(settled.kpa[:STROKES]) > 0.9
@@ -84,13 +87,13 @@ def test_that_much_creep_is_refused_where_nothing_shows_that_it_goes_back() -> N
     kpa = crept_kpa((0.15,), (9.0,))
     for alone_s in (0.0, 4.0):
         with pytest.raises(CalibrationError, match=r"drifts by .* leave it alone for 15 s"):
-            check_baseline_drift_kpa([bench(kpa, alone_s=alone_s)])
+            check_baseline_drift_between_repeats_kpa([bench(kpa, alone_s=alone_s)])
 
 
 @pytest.mark.parametrize("leak_s", [5.0, 20.0, 100.0])
 def test_a_dome_that_leaks_is_refused_although_it_breathes_in_again(leak_s: float) -> None:
     with pytest.raises(CalibrationError, match=r"creep would leave .* the dome leaks"):
-        check_baseline_drift_kpa([bench(leaked_kpa(leak_s))])
+        check_baseline_drift_between_repeats_kpa([bench(leaked_kpa(leak_s))])
 
 
 @pytest.mark.parametrize("stroke", [0, 1, 2])
@@ -101,20 +104,20 @@ def test_a_seal_that_slipped_is_refused_because_nothing_goes_back(
     slipped_s = stroke * (REST_S + STROKE_S) + REST_S + STROKE_S / 2
     t_s = STEP_S * np.arange(len(everything_n()))
     with pytest.raises(CalibrationError, match=r"creep would leave"):
-        check_baseline_drift_kpa([bench(np.where(t_s > slipped_s, slip_kpa, 0.0))])
+        check_baseline_drift_between_repeats_kpa([bench(np.where(t_s > slipped_s, slip_kpa, 0.0))])
 
 
 def test_a_slip_beside_creep_is_refused() -> None:
     t_s = STEP_S * np.arange(len(everything_n()))
     kpa = crept_kpa((0.1,), (3.0,)) + np.where(t_s > 13.0, 1.0, 0.0)
     with pytest.raises(CalibrationError, match=r"creep would leave"):
-        check_baseline_drift_kpa([bench(kpa)])
+        check_baseline_drift_between_repeats_kpa([bench(kpa)])
 
 
 def test_a_tile_that_goes_on_warming_up_is_refused() -> None:
     t_s = STEP_S * np.arange(len(everything_n()))
     with pytest.raises(CalibrationError, match=r"creep would leave"):
-        check_baseline_drift_kpa([bench(0.04 * t_s)])
+        check_baseline_drift_between_repeats_kpa([bench(0.04 * t_s)])
 
 
 def test_what_comes_with_a_change_of_temperature_does_not_count_as_what_the_load_left() -> None:
@@ -124,9 +127,9 @@ def test_what_comes_with_a_change_of_temperature_does_not_count_as_what_the_load
     warm_s = t_s[-1] - 5.0
     recording = bench(kpa + 1.2 * (t_s > warm_s - 1.0))
     warmed = replace(recording, temperature_raw=recording.temperature_raw - 20.0 * (t_s > warm_s))
-    assert check_baseline_drift_kpa([warmed]) < 0.8
+    assert check_baseline_drift_between_repeats_kpa([warmed]) < 0.8
     with pytest.raises(CalibrationError, match=r"creep would leave"):
-        check_baseline_drift_kpa([recording])
+        check_baseline_drift_between_repeats_kpa([recording])
 
 
 def test_a_pause_of_the_recording_under_load_is_no_load_that_explains_a_drift() -> None:
