@@ -30,7 +30,7 @@ from devices.scene.scene_file import load_scene
 from service.offline.calibration_lookup import find_calibration
 from service.offline.compare.alignment import Alignment, align_signals
 from service.offline.compare.signals import ForceSignal
-from storage.formats.load_trace import read_load_trace
+from storage.formats.load_trace import read_load_to_emulate
 from studies.benchmark.draws import compute_estimates, record_with_calibration
 
 MARK = "<!-- tables -->"
@@ -120,7 +120,7 @@ Draws = Iterator[tuple[ForceSignal, ForceSignal, Injected]]
 
 def drawn_alone(load: Load, data: Path, draws: int) -> Draws:
     """Ours and reference from a recorded load, without any estimator."""
-    trace = read_load_trace(data / load.file)
+    trace = read_load_to_emulate(data / load.file)
     total_n = trace.fz_n if trace.cells_n is None else trace.cells_n.sum(axis=1)
     assert total_n is not None
     force = PchipInterpolator(trace.time_s, load.scale * total_n)

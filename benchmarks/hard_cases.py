@@ -44,7 +44,7 @@ from service.estimation.tare.unloaded_windows import compute_recording_tare
 from service.offline.calibration_lookup import find_calibration
 from service.offline.simulation import EmulatedRun, SimulationOptions
 from service.rig.emulated_foot import EmulatedFoot
-from storage.formats.load_trace import read_load_trace
+from storage.formats.load_trace import read_load_to_emulate
 
 LAG_MS = 10.0
 AT_A_TIME = 50
@@ -238,7 +238,7 @@ def healthy_feet(
         foot = EmulatedFoot(seed=101 + seed)
         if load is not None:
             scale, cop = (0.05, 1.0) if name == "insole" else (0.03, 0.2)
-            trace, transform = read_load_trace(data / load), CopTransform(scale=cop)
+            trace, transform = read_load_to_emulate(data / load), CopTransform(scale=cop)
             foot = replace(foot, load=trace, load_scale=scale, cop_transform=transform)
         yield load or name, scene, foot
 

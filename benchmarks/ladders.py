@@ -22,7 +22,7 @@ from service.estimation.calibration import PRESETS
 from service.estimation.pipeline.model_set import MODEL_NAMES
 from service.offline.calibration_lookup import find_calibration
 from service.rig.emulated_foot import EmulatedFoot
-from storage.formats.load_trace import read_load_trace
+from storage.formats.load_trace import read_load_to_emulate
 from studies.benchmark.draws import (
     BATCH_FRAMES,
     LAGS_MS,
@@ -73,7 +73,7 @@ class Case:
             return EmulatedFoot()
         cop = CopTransform(scale=self.cop_scale)
         return EmulatedFoot(
-            read_load_trace(data / self.load), load_scale=self.load_scale, cop_transform=cop
+            read_load_to_emulate(data / self.load), load_scale=self.load_scale, cop_transform=cop
         )
 
 

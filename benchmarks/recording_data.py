@@ -18,7 +18,7 @@ from devices.acquisition import BATCH_NS
 from devices.emulation.ground.load_trace import LoadTrace
 from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
 from devices.scene.scene_file import Scene, load_scene, validate_scene
-from storage.formats.load_trace import read_load_trace
+from storage.formats.load_trace import read_load_to_emulate
 
 FULL_RATE_HZ = 544.0
 """What four tiles at 1.6 ms give on a bus of 400 kHz, pipelined."""
@@ -94,7 +94,7 @@ def walked(folder: Path, seconds: float) -> Recording | None:
     """A person's walk, pressed on eight emulated tiles; None if the recording is not there."""
     if not (folder / WALK).is_file():
         return None
-    load = read_load_trace(folder / WALK)
+    load = read_load_to_emulate(folder / WALK)
     there_s = float(load.time_s[-1] - load.time_s[0])  # after it the foot would hang in the air
     return _simulated("8 tiles, a person's walk", load_scene("insole"), min(seconds, there_s), load)
 

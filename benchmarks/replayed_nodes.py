@@ -123,7 +123,7 @@ def played(tiles: int, rate_hz: float) -> Played:
             "models": load_scene(SCENE).models,
         }
     )
-    known = [bench.get_tile_or_preset(serial) for serial in foot.info.serials]
+    known = [bench.get_tile_or_wildcard(serial) for serial in foot.info.serials]
     calibration = bench.model_copy(
         update={
             "tiles": tuple(

@@ -41,7 +41,7 @@ class StaticKernel:
         )
         self.baseline_kpa = _column(plan.tare.baseline_kpa)
         self.a0 += PRESSURE_MIN_KPA
-        entries = [plan.calibration.get_tile_or_preset(tile.serial) for tile in tiles]
+        entries = [plan.calibration.get_tile_or_wildcard(tile.serial) for tile in tiles]
         self.offset = _column([t.p_offset_kpa for t in entries])
         self.per_kpa = 1.0 / _column([t.p_scale_kpa for t in entries])
         self.high_kpa = _column([t.range_kpa[1] for t in entries])

@@ -48,7 +48,7 @@ SECONDS_MAX = NUMBER_MAX = 1e9
 """Upper bounds of options: thirty years, and more than any plausible length, force or factor."""
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-ExactOption = Annotated[
+UnquantizedOption = Annotated[
     bool,
     typer.Option("--no-quantize", help="Keep estimates as computed: do not round off their noise."),
 ]
@@ -241,7 +241,7 @@ class FootOptions:
         """
         from devices.emulation.ground.load_trace import CopTransform
         from service.rig.emulated_foot import EmulatedFoot
-        from storage.formats.load_trace import read_load_trace
+        from storage.formats.load_trace import read_load_to_emulate
         from storage.formats.reference import ReferenceOptions
 
         for option, value, least in (
@@ -267,7 +267,7 @@ class FootOptions:
             )
         offset_m = parse_pair(self.cop_offset_m, "--cop-offset-m") or (0.0, 0.0)
         return EmulatedFoot(
-            load=read_load_trace(self.load, stated) if self.load is not None else None,
+            load=read_load_to_emulate(self.load, stated) if self.load is not None else None,
             load_scale=self.load_scale,
             cop_transform=CopTransform(self.cop_scale, offset_m, self.cop_axes),
             lead_s=self.lead_s,

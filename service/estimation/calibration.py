@@ -177,21 +177,21 @@ class Calibration(CalibrationPart):
         """Identifier: first 16 hexadecimal digits of the SHA-256 of the content."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
 
-    def find_tile_or_preset(self, serial: str) -> TileCalibration | None:
+    def find_tile_or_wildcard(self, serial: str) -> TileCalibration | None:
         """Return the entry for a serial, else for any (`*`); None without, as for bare tiles."""
         by_serial = {tile.serial: tile for tile in self.tiles}
         return by_serial.get(serial, by_serial.get(ANY_SERIAL))
 
-    def get_tile_or_preset(self, serial: str) -> TileCalibration:
+    def get_tile_or_wildcard(self, serial: str) -> TileCalibration:
         """Return the entry for a serial, else that for any (`*`).
 
         Raises:
             CalibrationError: there is none.
         """
-        return self.get_tiles_or_preset([serial])[0]
+        return self.get_tiles_or_wildcard([serial])[0]
 
-    def get_tiles_or_preset(self, serials: Sequence[str]) -> list[TileCalibration]:
-        """Return the entries for serials, as `get_tile_or_preset`.
+    def get_tiles_or_wildcard(self, serials: Sequence[str]) -> list[TileCalibration]:
+        """Return the entries for serials, as `get_tile_or_wildcard`.
 
         Raises:
             CalibrationError: one is missing.
@@ -204,12 +204,12 @@ class Calibration(CalibrationPart):
                 "name another calibration with --calibration",
             )
         return [
-            found for serial in serials if (found := self.find_tile_or_preset(serial)) is not None
+            found for serial in serials if (found := self.find_tile_or_wildcard(serial)) is not None
         ]
 
     def describe_missing_tiles(self, serials: Sequence[str]) -> str:
         """Return which tiles it covers and which of the serials it does not; empty: it does all."""
-        missing = [serial for serial in serials if self.find_tile_or_preset(serial) is None]
+        missing = [serial for serial in serials if self.find_tile_or_wildcard(serial) is None]
         if not missing:
             return ""
         known = _format_serials([tile.serial for tile in self.tiles]) or "nothing"
@@ -233,7 +233,7 @@ class Calibration(CalibrationPart):
         """
         return any(
             tile.absolute_scale == "assumed" and self.find_mount_gain(serial) is None
-            for serial, tile in zip(serials, self.get_tiles_or_preset(serials), strict=True)
+            for serial, tile in zip(serials, self.get_tiles_or_wildcard(serials), strict=True)
         )
 
     def to_json(self) -> str:
@@ -242,7 +242,7 @@ class Calibration(CalibrationPart):
         return json.dumps(content, indent=2) + "\n"
 
     @classmethod
-    def from_json_marking_unproven(cls, text: str, *, where: str) -> Calibration:
+    def from_json_verifying_id(cls, text: str, *, where: str) -> Calibration:
         """Parse a calibration file and check its id; without an id the name gets ", unproven".
 
         Raises:

@@ -83,7 +83,7 @@ def compute_volume_ratio(
     return float((initial_kpa / final_kpa) ** (1.0 / exponent))
 
 
-def compute_fast_to_slow_load_ratio(
+def compute_fast_to_slow_saturation_load_ratio(
     seal_kpa: float = SEAL_KPA, exponent: float = ADIABATIC
 ) -> float:
     """Return the change of volume at full scale of a fast load, relative to a slow one: 0.73.

@@ -302,7 +302,7 @@ def _estimate_due_rows(
         if foot_params.has_servo == 1:
             counts = interpolate_servo_counts(buffer.readings, i, end, lookahead_ns)
             out[grf_cop.FOOT_ANGLE] = (counts - foot_params.zero_counts) * foot_params.rad_per_count
-        grf_cop.set_vertical_fractions_and_shear_sigma(params, forces, out[grf_cop.FOOT_ANGLE])
+        grf_cop.set_plate_shear_fractions_and_sigma(params, forces, out[grf_cop.FOOT_ANGLE])
         grf_cop.compute_grf_cop(params, forces, out)
         min_ns = foot_params.contact_min_ns
         if is_debounced(buffer.since_ns, buffer.t_mono_ns, i, end, min_ns, lookahead_ns):

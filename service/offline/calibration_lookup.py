@@ -81,7 +81,7 @@ def find_calibration(
             tiles=tuple(tile for entry in entries for tile in entry.tiles),
         )
     calibration = PRESETS[name]() if name in PRESETS else read_calibration(Path(name))
-    calibration.get_tiles_or_preset(serials)
+    calibration.get_tiles_or_wildcard(serials)
     return calibration
 
 
@@ -160,7 +160,7 @@ def _read_cached(kept: Path, serial: str, progress: ProgressCallback) -> Calibra
         return None
     try:
         calibration = read_calibration(kept)
-        calibration.get_tile_or_preset(serial)
+        calibration.get_tile_or_wildcard(serial)
         what = "it states no hash" if calibration.name.endswith(UNPROVEN_SUFFIX) else ""
     except StorageError as error:
         progress(f"{kept} is left out: {error.what}")

@@ -357,7 +357,7 @@ class ServerStream:
         if not wrong and end is not None and last >= end:
             wrong = f"the stream has ended with frame {end - 1}"
         if not wrong and self.journal is not None:
-            wrong = self.journal.describe_time_reversal(frames)
+            wrong = self.journal.describe_reversal_against_stored(frames)
         if wrong:
             refused = Intervals([(first, last)]) - self.stored
             self._refused = self._refused | refused

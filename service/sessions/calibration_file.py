@@ -35,9 +35,7 @@ def parse_calibration(content: bytes, *, where: str) -> Calibration:
     except DamagedFileError as error:
         raise make_not_a_calibration_error(error.what, where) from error
     try:
-        return Calibration.from_json_marking_unproven(
-            content.decode("utf-8", "replace"), where=where
-        )
+        return Calibration.from_json_verifying_id(content.decode("utf-8", "replace"), where=where)
     except RecursionError as error:
         raise make_not_a_calibration_error("it is nested too deeply", where) from error
 

@@ -31,10 +31,10 @@ from storage.sessions.pyramid import (
     Bins,
     PyramidBuilder,
     bin_column_types,
+    bin_source_columns,
     concatenate_bins,
     make_single_frame_bins,
     merge_bins,
-    required_frame_columns,
     shift_bins_to_axis,
 )
 from storage.sessions.reader import SealedFileReader
@@ -67,7 +67,7 @@ class OverviewWriter:
         if self.problem is not None:
             return
         try:
-            wanted = required_frame_columns(has_estimates="grf_n" in columns)
+            wanted = bin_source_columns(has_estimates="grf_n" in columns)
             given_columns = {name: columns[name] for name in (*wanted, "part") if name in columns}
             frame_fields = {
                 name: getattr(frames, name) for name in wanted if name not in given_columns
@@ -175,7 +175,7 @@ def _bins_from_frames(
     while rows // (size * BINS_PER_COARSER_BIN) >= points:
         size *= BINS_PER_COARSER_BIN
     estimated = session.has_columns("grf_n")
-    names = required_frame_columns(has_estimates=estimated)
+    names = bin_source_columns(has_estimates=estimated)
     if session.has_columns("part"):
         names += ("part",)
     types = bin_column_types(len(session.info.tiles), has_estimates=estimated)
@@ -202,7 +202,7 @@ def _bins_from_frames(
 
 def _build_pyramid(session: SealedFileReader) -> PyramidBuilder:
     pyramid = PyramidBuilder()
-    names = required_frame_columns(has_estimates=session.has_columns("grf_n"))
+    names = bin_source_columns(has_estimates=session.has_columns("grf_n"))
     for piece in session.read_quantities(
         *names, *(("part",) if session.has_columns("part") else ())
     ):

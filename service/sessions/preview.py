@@ -23,7 +23,7 @@ from service.sessions.overview import BinnedSlice
 from storage.formats.slice import Slice
 from storage.sessions.pyramid import (
     PreviewBins,
-    required_frame_columns,
+    bin_source_columns,
     select_and_downsample_bins,
     shift_bins_to_axis,
 )
@@ -112,7 +112,7 @@ class SessionPreview:
         if is_again:
             self.repeated_work_s += time.monotonic() - begun_s
 
-    def is_outdated(self, inputs: SessionInputs) -> bool:
+    def has_past_changed(self, inputs: SessionInputs) -> bool:
         """Return whether frames or tares before the present position have changed."""
         return not self._is_valid(self._position, inputs)
 
@@ -171,7 +171,7 @@ class SessionPreview:
             if self._stream is None
             else self._stream.estimate_batches(pieces, is_final=False)
         )
-        names = required_frame_columns(has_estimates=self.has_estimate_stream)
+        names = bin_source_columns(has_estimates=self.has_estimate_stream)
         for estimated, columns in due:
             fields = {name: getattr(estimated, name) for name in names if name not in columns}
             fields |= {name: columns[name] for name in (*names, "part") if name in columns}
@@ -259,7 +259,7 @@ class SessionPreviews:
         preview = self._previews.get(name)
         if preview is None:
             preview = self._previews[name] = SessionPreview(inputs, self._folder)
-        elif not preview.has_valid_beginning(inputs) or preview.is_outdated(inputs):
+        elif not preview.has_valid_beginning(inputs) or preview.has_past_changed(inputs):
             if time.monotonic() < self._retry_after_s.get(name, 0.0):
                 return preview
             if preview.has_valid_beginning(inputs):

@@ -379,7 +379,7 @@ class TareHistory:
         self._store(_thin_out((*self._entries, recorded)))
         return recorded
 
-    def undo_tare(self, tare_id: str) -> None:
+    def undo_any_tare_and_pause_automatic(self, tare_id: str) -> None:
         """Undo a tare; the one before it is in force again.
 
         Raises:

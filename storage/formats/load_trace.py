@@ -161,7 +161,7 @@ _MAP_REMEDY = "Or name them: --map time_s=COLUMN,grf_n=COLUMN,cop_x_m=COLUMN,cop
 _UNITS = {"time": "time_s", "fz": "fz_n", "cop_x": "cop_x_m", "cop_y": "cop_y_m"}
 
 
-def read_load_trace(path: Path, options: ReferenceOptions | None = None) -> LoadTrace:
+def read_load_to_emulate(path: Path, options: ReferenceOptions | None = None) -> LoadTrace:
     """Read a load trace.
 
     Args:

@@ -26,7 +26,7 @@ from storage.journal.segment import (
     INDEX_SUFFIX,
     SUFFIX,
     Segment,
-    has_nonempty_index_or_two_batches,
+    had_frames_written,
     make_free_unread_path,
     read_schema_and_first_offset,
     recover_or_delete_segment,
@@ -78,9 +78,7 @@ class Journal:
             self.problems += set_aside_irregular_or_forbidden_files(folder)
             for path in sorted(folder.glob("*" + SUFFIX)):
                 index = path.with_suffix(INDEX_SUFFIX)
-                is_indexed = index.exists() and has_nonempty_index_or_two_batches(
-                    path, self._schema
-                )
+                is_indexed = index.exists() and had_frames_written(path, self._schema)
                 segment, damaged = recover_or_delete_segment(path, self._schema)
                 self.lost.add_if_new(damaged, CORRUPT)
                 if segment is not None:
@@ -134,14 +132,14 @@ class Journal:
         """True if the next sync closes a segment."""
         return self._open.has_segment_to_close
 
-    def describe_time_reversal(self, frames: FrameBatch) -> str:
+    def describe_reversal_against_stored(self, frames: FrameBatch) -> str:
         """Return a message if time would run back between `frames` and stored ones; else empty.
 
         Raises:
             StorageError: an index cannot be read.
         """
         with translate_storage_errors(self.folder):
-            return self._instants.describe_time_reversal(frames, self.stored)
+            return self._instants.describe_reversal_against_stored(frames, self.stored)
 
     def append_new_frames(self, batch: FrameBatch, payload: bytes | None = None) -> Intervals:
         """Append the frames of `batch` that are not stored yet; return their numbers.

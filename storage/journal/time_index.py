@@ -64,7 +64,7 @@ class TimeIndex:
         """Clear the cache: numbers are no longer stored."""
         self._t_ns_by_end.clear()
 
-    def describe_time_reversal(self, frames: FrameBatch, stored: Intervals) -> str:
+    def describe_reversal_against_stored(self, frames: FrameBatch, stored: Intervals) -> str:
         """Return a message if time would run back between `frames` and stored ones; else empty.
 
         Args:

@@ -93,7 +93,7 @@ def _column_type(name: str) -> npt.DTypeLike:
     return np.uint8 if name.startswith("tile_flags_") else _INTEGER_TYPES.get(name, np.float32)
 
 
-def required_frame_columns(*, has_estimates: bool) -> tuple[str, ...]:
+def bin_source_columns(*, has_estimates: bool) -> tuple[str, ...]:
     """Return the columns of frames that bins are made of, by logical name; `part` is optional."""
     same = ("seq", "t_ns", "tile_flags", "frame_flags")
     if not has_estimates:
@@ -110,7 +110,7 @@ def make_single_frame_bins(frames: Mapping[str, Array], previous_seq: int | None
     """Make a bin of each single frame.
 
     Args:
-        frames: `required_frame_columns`, (n,) or (n, tiles); `part` if there are several.
+        frames: `bin_source_columns`, (n,) or (n, tiles); `part` if there are several.
         previous_seq: number of the frame before the first one, if it is of the same part.
     """
     seq, n = frames["seq"], len(frames["seq"])
@@ -245,7 +245,7 @@ class PyramidBuilder:
         """Part and number of the last frame."""
 
     def add_frames(self, frames: Mapping[str, Array]) -> None:
-        """Add the next frames: `required_frame_columns`, and `part` if there are several."""
+        """Add the next frames: `bin_source_columns`, and `part` if there are several."""
         if not len(frames["seq"]):
             return
         part = int(frames["part"][0]) if "part" in frames else 0
@@ -334,7 +334,7 @@ class PreviewBins:
         """Add the next frames, apart from leading ones that were added before.
 
         Args:
-            frames: `storage.sessions.pyramid.required_frame_columns`, and `part`.
+            frames: `storage.sessions.pyramid.bin_source_columns`, and `part`.
             already_added: number of leading frames that were added before, at most all.
         """
         if already_added:

@@ -145,7 +145,7 @@ def _get_range_ends_kpa(recording: DrawRecording) -> Floats:
         [
             math.inf
             if tile.reference
-            else recording.calibration.get_tile_or_preset(tile.serial).range_kpa[1]
+            else recording.calibration.get_tile_or_wildcard(tile.serial).range_kpa[1]
             for tile in recording.info.tiles
         ]
     )
@@ -170,7 +170,7 @@ def describe_tiles(recording: DrawRecording, world: World, seed: int) -> tuple[T
             name: _compute_effect_size_n(felt_n - part.compute_static_force_n(kpa[loaded[:, i], i]))
             for name, kpa in less_kpa.items()
         }
-        entry = recording.calibration.get_tile_or_preset(serial)
+        entry = recording.calibration.get_tile_or_wildcard(serial)
         late_ns = draw_family_chip("broad", serial, seed).sample_delay_ns
         tiles.append(_describe_tile(entry, part, late_ns, effect_n))
     return tuple(tiles)

@@ -59,7 +59,7 @@ class Running:
         is_private: bool = False,
         hosts: Sequence[str] = (),
         bounds: LimitSettings | None = None,
-        exact: bool = False,
+        unquantized: bool = False,
     ) -> None:
         self.data = data
         self.server: Server
@@ -72,7 +72,7 @@ class Running:
         self.logins: Logins
         self._hosts = tuple(hosts)
         self._bounds = bounds
-        self._exact = exact
+        self._unquantized = unquantized
         self._thread: threading.Thread | None = None
         self._loop: asyncio.AbstractEventLoop
         self._stop: asyncio.Event
@@ -203,7 +203,7 @@ class Running:
         self._loop = asyncio.get_running_loop()
         self._stop = asyncio.Event()
         with open_listening_socket("127.0.0.1", self.port) as listening:
-            self.server = Server(self.data, unquantized=self._exact)
+            self.server = Server(self.data, unquantized=self._unquantized)
             if not self.shown or not hasattr(self, "logins"):
                 # Where a test is about something else, its pages stay logged in over a restart.
                 self.logins = Logins(self._token, is_private=self._is_private)

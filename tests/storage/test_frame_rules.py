@@ -91,7 +91,7 @@ def test_messages_taken_in_any_order_are_whole_for_verify(
             batch = with_columns(batch, t_mono_ns=batch.t_mono_ns + late_ns)
             if not describe_first_impossible_value(
                 batch, INFO
-            ) and not journal.describe_time_reversal(batch):
+            ) and not journal.describe_reversal_against_stored(batch):
                 taken += journal.append_new_frames(batch).number_count
     if taken:
         report = verify_journal(folder)
@@ -105,10 +105,13 @@ def test_what_does_not_fit_between_its_neighbours_is_misplaced(tmp_path: Path) -
     journal.append_new_frames(frames.slice_rows(0, 10))
     journal.append_new_frames(frames.slice_rows(20, 30))
     between = frames.slice_rows(10, 20)
-    assert journal.describe_time_reversal(between) == ""
+    assert journal.describe_reversal_against_stored(between) == ""
     late = with_columns(between, t_mono_ns=between.t_mono_ns + 20_000_000)
     early = with_columns(between, t_mono_ns=between.t_mono_ns - 20_000_000)
-    assert journal.describe_time_reversal(late) == "time runs back before frame 20"
-    assert journal.describe_time_reversal(early) == "time runs back before frame 10"
-    assert Journal(tmp_path, INFO).describe_time_reversal(late) == "time runs back before frame 20"
+    assert journal.describe_reversal_against_stored(late) == "time runs back before frame 20"
+    assert journal.describe_reversal_against_stored(early) == "time runs back before frame 10"
+    assert (
+        Journal(tmp_path, INFO).describe_reversal_against_stored(late)
+        == "time runs back before frame 20"
+    )
     journal.close()

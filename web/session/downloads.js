@@ -49,7 +49,7 @@ export class Downloads {
     this.links.get("parquet").hidden = whole.provisional;
     for (const format of this.formats) {
       const item = this.links.get(format.name)?.closest("li");
-      const isUnavailable = this.wholeTake.checked ? !format.holds_several || whole.provisional : format.needs_sealed && whole.provisional;
+      const isUnavailable = this.wholeTake.checked ? !format.can_hold_several_sessions || whole.provisional : format.needs_sealed && whole.provisional;
       if (item) item.hidden = isUnavailable || (format.needs_forces && !whole.estimated);
     }
   }

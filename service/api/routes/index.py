@@ -132,7 +132,7 @@ class FormatView(BaseModel):
     takes_columns: bool = Field(description="True: columns can be selected.")
     needs_forces: bool = Field(description="True: the session needs estimates.")
     needs_sealed: bool = Field(description="True: the session has to be sealed.")
-    holds_several: bool = Field(description="True: one file can have all sessions of a take.")
+    can_hold_several_sessions: bool = Field(description="One file can have all sessions of a take.")
     frames_max: int | None = Field(description="Frame limit of a download; null: no limit.")
     missing: str | None = Field(description="Missing extra of this server; null: none.")
 

@@ -13,7 +13,7 @@ from service.cli.options import JsonOption, echo, print_json, stdout
 from service.estimation.domes import (
     SlowSaturationLoad,
     compute_ambient_transmission,
-    compute_fast_to_slow_load_ratio,
+    compute_fast_to_slow_saturation_load_ratio,
     list_saturation_loads,
     select_likely_covering_dome,
 )
@@ -43,7 +43,7 @@ def domes_command(
                 if selected is None or load_n is None
                 else selected.judge_slow_load(load_n),
                 "basis": None if selected is None else selected.source,
-                "fast_share": compute_fast_to_slow_load_ratio(),
+                "fast_share": compute_fast_to_slow_saturation_load_ratio(),
                 "domes": [
                     {
                         "name": found.dome.name,
@@ -82,7 +82,7 @@ def domes_command(
                 *([] if load_n is None else [found.judge_slow_load(load_n)]),
             )
         stdout.print(table)
-        echo(_NOTES.format(fast=100 * compute_fast_to_slow_load_ratio()))
+        echo(_NOTES.format(fast=100 * compute_fast_to_slow_saturation_load_ratio()))
         if load_n is not None:
             echo(f"For {load_n:g} N: {_format_choice(selected, load_n)}")
     if load_n is not None and selected is None:

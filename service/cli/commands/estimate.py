@@ -20,9 +20,9 @@ from service.cli.multi_session import (
 )
 from service.cli.options import (
     EndOption,
-    ExactOption,
     JsonOption,
     StartOption,
+    UnquantizedOption,
     echo,
     parse_pair,
     print_json,
@@ -76,7 +76,7 @@ def estimate_command(
     ] = None,
     start_s: StartOption = None,
     end_s: EndOption = None,
-    exact: ExactOption = False,
+    unquantized: UnquantizedOption = False,
     manifest: ManifestOption = None,
     jobs: JobsOption = None,
     scheduler: SchedulerOption = None,
@@ -112,7 +112,7 @@ def estimate_command(
         scene=None if scene is None else load_scene(scene),
         tare_s=parse_pair(tare_s, "--tare-s"),
         part=Slice(start_s, end_s),
-        exact=exact,
+        unquantized=unquantized,
     )
     if not is_single_session(sessions, manifest) or is_remote(out):
         task = replace(task, calibration=_embed_calibration(calibration))

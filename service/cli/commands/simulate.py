@@ -11,9 +11,9 @@ from devices.errors import UsageError, require_extra
 from devices.scene.hardware_sections import AnySchedule, ScheduleName
 from devices.scene.scene_file import load_scene
 from service.cli.options import (
-    ExactOption,
     FootOptions,
     JsonOption,
+    UnquantizedOption,
     add_foot_options,
     check_emulated,
     echo,
@@ -54,7 +54,7 @@ def simulate_command(
         bool, typer.Option("--truth", help="Add the true_* columns and print the error.")
     ] = False,
     no_estimates: Annotated[bool, typer.Option("--no-estimates", help="Raw frames only.")] = False,
-    exact: ExactOption = False,
+    unquantized: UnquantizedOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Run a scene on emulated hardware in virtual time and write the session.
@@ -95,7 +95,9 @@ def simulate_command(
             family=the_scene.emulation.family,
             on_progress=remark,
         )
-        return EstimateOptions(calibration, the_scene.models, OFFLINE_LAG_MS, unquantized=exact)
+        return EstimateOptions(
+            calibration, the_scene.models, OFFLINE_LAG_MS, unquantized=unquantized
+        )
 
     with show_progress(f"simulating {the_scene.name}"):
         result = run_simulation(

@@ -76,7 +76,7 @@ def make_fault_limits(
     unloaded_kpa = UNLOADED_BAND_SIGMAS * np.hypot(tare.noise_kpa, tare.baseline_sigma_kpa)
     per_count = compute_sealed_gas_shift_kpa(tare, np.ones(len(tiles)) / TADC_PER_KELVIN)[bearing]
     for at, column in enumerate(bearing):
-        entry = calibration.find_tile_or_preset(tiles[column].serial)
+        entry = calibration.find_tile_or_wildcard(tiles[column].serial)
         if entry is not None and entry.effects.temperature is not None:
             per_count[at] = entry.effects.temperature.kpa_per_k.value / TADC_PER_KELVIN
     return FaultLimits(

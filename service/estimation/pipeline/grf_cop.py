@@ -43,7 +43,7 @@ COLUMNS_BY_AXIS = ((COP_X, COP_SIGMA_X, COP_GROUND_X), (COP_Y, COP_SIGMA_Y, COP_
 
 
 @jit_inlined
-def set_vertical_fractions_and_shear_sigma(
+def set_plate_shear_fractions_and_sigma(
     params: KernelParams, forces: RecordArray[TileForce], angle_rad: float
 ) -> None:
     """Set the vertical fraction of each tile's force: 1, or by the shear of a force plate.

@@ -94,7 +94,7 @@ def make_checked_model_set(
     """
     check_known_models_with_static(models)
     bearing = [tile for tile in info.tiles if not tile.reference]
-    tiles = calibration.get_tiles_or_preset([tile.serial for tile in bearing])
+    tiles = calibration.get_tiles_or_wildcard([tile.serial for tile in bearing])
     columns = np.array([i for i, tile in enumerate(info.tiles) if not tile.reference])
     for name in ("temperature", "ambient", "gas", "rubber", "hysteresis"):
         if name in models:

@@ -146,7 +146,7 @@ def make_plan(
     if not len(bearing):
         raise UsageError("every tile of the array is a reference tile: nothing bears load")
     model_set = make_checked_model_set(info, calibration, tare, models)
-    entries = calibration.get_tiles_or_preset([info.tiles[i].serial for i in bearing])
+    entries = calibration.get_tiles_or_wildcard([info.tiles[i].serial for i in bearing])
     for i, entry in zip(bearing, entries, strict=True):
         tile = info.tiles[i]
         if entry.coefficient_words not in (None, tile.coefficient_words):

@@ -82,7 +82,7 @@ def compute_forces_and_after_saturation(
         force.force_n = buffer.samples[i, j].apparent_n if is_load_bearing else math.nan
         force.noise_n, force.smoothing_error_n = buffer.noise_n[i, j], 0.0
     if foot_params.has_denoise == 1:
-        denoise_forces(params, buffer, i, rows, windows, forces)
+        denoise_forces_and_scale_noise(params, buffer, i, rows, windows, forces)
     unsettled = False
     for j in range(n):
         tile_params, sample = params.tiles[j], buffer.samples[i, j]
@@ -158,7 +158,7 @@ def _apply_mount_gain(tile_params: TileParams, force: TileForce) -> None:
 
 
 @jit_inlined
-def denoise_forces(
+def denoise_forces_and_scale_noise(
     params: KernelParams,
     buffer: FrameBuffer,
     i: int,

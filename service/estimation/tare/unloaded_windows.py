@@ -49,7 +49,7 @@ class CorrelatedNoise(NamedTuple):
     decay_readings: Floats
 
 
-def fit_correlated_noise(kpa: Floats) -> CorrelatedNoise:
+def fit_correlated_variance_fraction_and_decay(kpa: Floats) -> CorrelatedNoise:
     """Fit the correlated part of the variance of unloaded readings.
 
     Args:
@@ -165,7 +165,7 @@ class TareFrames:
         self.serials = serials
         self.kpa = compensation.compute_usable_kpa(self.frames)
         self.since_ns = frames.t_ns - frames.t_ns[:1]
-        entries = [calibration.find_tile_or_preset(serial) for serial in serials]
+        entries = [calibration.find_tile_or_wildcard(serial) for serial in serials]
         self.rig_baseline_kpa = np.array(
             [e.baseline_kpa if e else None for e in entries], dtype=float
         )
@@ -244,7 +244,7 @@ class TareFrames:
             self.compute_reading_rounding_sigma_kpa(temperature_raw_counts),
         )
         t_s = self.since_ns[rows] * 1e-9
-        noise = fit_correlated_noise(kpa)
+        noise = fit_correlated_variance_fraction_and_decay(kpa)
         return Tare(
             baseline_kpa=np.nanmean(kpa, axis=0),
             baseline_sigma_kpa=noise_kpa

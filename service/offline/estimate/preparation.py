@@ -44,7 +44,7 @@ class EstimateRequest:
         scene: source of models, calibration and tile positions; None: the session's.
         tare_s: unloaded interval, in seconds from the first frame of the session.
         part: time range to estimate; only the needed part of the file is read.
-        exact: True to store unquantized values.
+        unquantized: True to store unquantized values.
     """
 
     calibration: str | Calibration | None
@@ -53,7 +53,7 @@ class EstimateRequest:
     scene: Scene | None
     tare_s: tuple[float, float] | None
     part: Slice = _ALL
-    exact: bool = False
+    unquantized: bool = False
 
 
 BatchWithColumns = tuple[FrameBatch, Extra]
@@ -179,7 +179,7 @@ def prepare_estimate(
         lag_ms=request.lag_ms,
         tare_s=request.tare_s,
         tares=_read_tares(session) if request.tare_s is None else (),
-        unquantized=request.exact,
+        unquantized=request.unquantized,
     )
     kept = tuple(
         c.name
@@ -236,7 +236,7 @@ def _find_calibration(
     where = str(session.path)
     serials = [tile.serial for tile in session.info.tiles if not tile.reference]
     if isinstance(wanted, Calibration):
-        wanted.get_tiles_or_preset(serials)
+        wanted.get_tiles_or_wildcard(serials)
         return wanted
     inside = None
     if "calibration" in notes:

@@ -144,13 +144,13 @@ class DriftView(View):
         slope = unknown if live.ranges is None else live.ranges.slope_n_per_kpa
         warmer_by_k = (
             unknown
-            if live.usable_tare is None
-            else compute_warming_k(live.usable_tare, live.mean_recent_temperature_raw())
+            if live.tare_in_use_unless_lost is None
+            else compute_warming_k(live.tare_in_use_unless_lost, live.mean_recent_temperature_raw())
         )
         since_kpa = (
             unknown
-            if live.usable_tare is None
-            else compute_sealed_gas_shift_kpa(live.usable_tare, warmer_by_k)
+            if live.tare_in_use_unless_lost is None
+            else compute_sealed_gas_shift_kpa(live.tare_in_use_unless_lost, warmer_by_k)
         )
         # A bare tile has no sealed gas.
         since_kpa = np.where([tile.reference for tile in node.last_info.tiles], np.nan, since_kpa)

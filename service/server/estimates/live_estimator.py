@@ -63,7 +63,7 @@ class TileRanges:
         """
         serials = info.serials
         bearing = [i for i, tile in enumerate(info.tiles) if not tile.reference]
-        curves = StaticCurves(calibration.get_tiles_or_preset([serials[i] for i in bearing]))
+        curves = StaticCurves(calibration.get_tiles_or_wildcard([serials[i] for i in bearing]))
         gains = [calibration.find_mount_gain(serials[i]) for i in bearing]
         gain = np.array([1.0 if one is None else one.value for one in gains])
 
@@ -73,7 +73,7 @@ class TileRanges:
             return of_all
 
         return cls(
-            entries=tuple(calibration.find_tile_or_preset(serial) for serial in serials),
+            entries=tuple(calibration.find_tile_or_wildcard(serial) for serial in serials),
             end_kpa=by_tile(curves.range_high_kpa),
             full_scale_n=by_tile(
                 gain * curves.compute_forces(curves.range_high_kpa[None]).force_n[0]
@@ -155,7 +155,7 @@ class LiveEstimator:
         return self._calibration
 
     @property
-    def usable_tare(self) -> Tare | None:
+    def tare_in_use_unless_lost(self) -> Tare | None:
         """Tare in use; None: there is none, or it is lost."""
         tare = self._run.plan.tare if self._run is not None else None
         return None if tare is None or tare.is_lost else tare
@@ -260,7 +260,7 @@ class LiveEstimator:
         Args:
             anchor: tare with which an automatic one is compared; None without a tare.
         """
-        calibration, tare = self._calibration, self.usable_tare
+        calibration, tare = self._calibration, self.tare_in_use_unless_lost
         if calibration is None or not self._recent or is_compiling():
             return FlightTareResult()
         frames = FrameBatch.concatenate(list(self._recent))
@@ -290,7 +290,7 @@ class LiveEstimator:
         frames = FrameBatch.concatenate(list(self._recent))
         seen = self._tare_frames(frames, calibration)
         tare = compute_newest_unloaded_tare(
-            seen, present=self.usable_tare, is_load_bearing=self._is_loaded_tile
+            seen, present=self.tare_in_use_unless_lost, is_load_bearing=self._is_loaded_tile
         )
         return seen.remove_recovery(tare)
 

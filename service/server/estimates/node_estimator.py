@@ -108,7 +108,7 @@ def _read_assignment(path: Path) -> AssignedCalibration | None:
         if document["calibration"] is None:
             return None
         content = json.dumps(document["calibration"])
-        calibration = Calibration.from_json_marking_unproven(content, where=str(path))
+        calibration = Calibration.from_json_verifying_id(content, where=str(path))
         return AssignedCalibration(calibration, int(document["t_ns"]))
     except (CalibrationError, ValueError, KeyError, TypeError, RecursionError) as error:
         what = " ".join(str(error).split())[:200]

@@ -88,7 +88,7 @@ class TareController:
 
     def list_warnings(self) -> list[str]:
         """Return the reasons why the tare in force may no longer fit, as text."""
-        tare, newest_t_ns = self._live.usable_tare, self._live.newest_t_ns
+        tare, newest_t_ns = self._live.tare_in_use_unless_lost, self._live.newest_t_ns
         if tare is None or newest_t_ns is None:
             return []
         texts = []
@@ -139,7 +139,7 @@ class TareController:
         Raises:
             UnknownError, StorageError: as for `TareHistory.undo_any_tare_and_pause_automatic`.
         """
-        self._history.undo_tare(tare_id)
+        self._history.undo_any_tare_and_pause_automatic(tare_id)
         self._flight_warning = None
         self._live.set_tare(self._history.tare_in_force_or_lost(self._info))
 
@@ -201,9 +201,9 @@ class TareController:
         t_ns = live.newest_t_ns
         if t_ns is None or t_ns < self._next_check_t_ns:
             return False
-        if live.usable_tare is not None:
+        if live.tare_in_use_unless_lost is not None:
             free_t_ns = live.airborne_since_t_ns
-            if t_ns - live.usable_tare.t_ns < TARE_INTERVAL_MIN_NS or free_t_ns is None:
+            if t_ns - live.tare_in_use_unless_lost.t_ns < TARE_INTERVAL_MIN_NS or free_t_ns is None:
                 return False
             if t_ns - free_t_ns < RECOVERY_NS + WINDOW_NS:
                 return False

@@ -99,7 +99,7 @@ class ExportFormat:
             yield from self.group_encoder(exports)
 
     @property
-    def holds_several(self) -> bool:
+    def can_hold_several_sessions(self) -> bool:
         """True if one file can hold several sessions."""
         return self.group_encoder is not None
 

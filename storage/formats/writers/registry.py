@@ -31,7 +31,9 @@ FORMATS: Mapping[str, ExportFormat] = {
 }
 
 
-MULTI_SESSION_FORMATS = tuple(known.name for known in FORMATS.values() if known.holds_several)
+MULTI_SESSION_FORMATS = tuple(
+    known.name for known in FORMATS.values() if known.can_hold_several_sessions
+)
 """Names of the formats that hold several sessions in one file."""
 
 
@@ -53,7 +55,7 @@ def get_multi_session_format(name: str) -> ExportFormat:
         UsageError: no format has this name, or it holds one session only.
     """
     found = get_format(name)
-    if not found.holds_several:
+    if not found.can_hold_several_sessions:
         raise UsageError(
             f"{name} holds one session only",
             expected="one of " + ", ".join(MULTI_SESSION_FORMATS),

@@ -14,7 +14,7 @@ import pytest
 
 import foottile
 from service.pull import pull_export
-from storage.formats.load_trace import read_load_trace
+from storage.formats.load_trace import read_load_to_emulate
 from storage.formats.slice import Slice
 from storage.formats.writers.registry import get_format
 from tests.builders.arrays import PERIOD_NS
@@ -143,7 +143,7 @@ def test_no_format_fills_the_years_between(sealed: Recording) -> None:
 
 
 def test_a_load_has_no_years_between(sealed: Recording) -> None:
-    load = read_load_trace(sealed.folder / "frames.parquet")
+    load = read_load_to_emulate(sealed.folder / "frames.parquet")
     gap_s = (GAP_NS + PERIOD_NS) * 1e-9
     assert np.diff(load.time_s).max() == pytest.approx(gap_s, abs=SOON_S)
 

@@ -101,7 +101,7 @@ def test_of_tiles_in_one_row_neither_file_nor_answer_has_a_number_across_it(
 def test_a_server_that_is_told_so_seals_estimates_as_computed(
     serve_with: ServeWith, node_of: NodeOf
 ) -> None:
-    running = serve_with(exact=True)
+    running = serve_with(unquantized=True)
     node = node_of(running)
     node.connect()
     node.tared()

@@ -29,14 +29,14 @@ def take(running: Running, node_of: NodeOf) -> Take:
     return Take(running, [node_of(running, name) for name in ("right", "left")]).sealed()
 
 
-def test_every_format_that_holds_several_has_all_sessions_in_the_order_of_their_nodes(
+def test_every_format_that_can_hold_several_sessions_has_all_sessions_in_the_order_of_their_nodes(
     take: Take,
 ) -> None:
     take.running.http.post(f"{take.sessions[0].url}/markers", json={"label": "tap"})
     listed = {
         each["name"]
         for each in take.running.http.get("/formats").json()["items"]
-        if each["holds_several"]
+        if each["can_hold_several_sessions"]
     }
     assert listed == set(MULTI_SESSION_FORMATS)
     for to in MULTI_SESSION_FORMATS:

@@ -71,7 +71,7 @@ def test_a_calibration_survives_its_json_bit_by_bit(
         r2=0.9999,
     )
     calibration = make_calibration(tile)
-    again = Calibration.from_json_marking_unproven(calibration.to_json(), where="here")
+    again = Calibration.from_json_verifying_id(calibration.to_json(), where="here")
     assert again == calibration
     assert again.id == calibration.id
 
@@ -104,7 +104,7 @@ def test_an_edit_of_any_field_of_the_file_is_refused() -> None:
             at = at[key]
         at[path[-1]] = changed(at[path[-1]])
         with pytest.raises(CalibrationError) as caught:
-            Calibration.from_json_marking_unproven(json.dumps(content), where="bench.json")
+            Calibration.from_json_verifying_id(json.dumps(content), where="bench.json")
         assert "bench.json" in str(caught.value), path
 
 
@@ -112,7 +112,7 @@ def test_an_edited_number_is_named_as_an_edit_and_not_as_a_format_error() -> Non
     calibration = make_calibration(newton_tile("T01"))
     text = calibration.to_json().replace('"repeats": 4', '"repeats": 5')
     with pytest.raises(CalibrationError, match="edited by hand or damaged") as caught:
-        Calibration.from_json_marking_unproven(text, where="bench.json")
+        Calibration.from_json_verifying_id(text, where="bench.json")
     assert calibration.id in str(caught.value)
 
 
@@ -122,22 +122,22 @@ def test_an_edited_number_is_named_as_an_edit_and_not_as_a_format_error() -> Non
 )
 def test_a_text_that_is_no_calibration_is_refused_by_name(text: str) -> None:
     with pytest.raises(CalibrationError, match=r"bench\.json: not a calibration"):
-        Calibration.from_json_marking_unproven(text, where="bench.json")
+        Calibration.from_json_verifying_id(text, where="bench.json")
 
 
 def test_an_unknown_field_and_a_missing_one_are_named() -> None:
     content = json.loads(make_calibration(newton_tile("T01")).to_json())
     with pytest.raises(CalibrationError, match="colour"):
-        Calibration.from_json_marking_unproven(json.dumps(content | {"colour": "red"}), where="x")
+        Calibration.from_json_verifying_id(json.dumps(content | {"colour": "red"}), where="x")
     del content["tiles"][0]["p_scale_kpa"]
     with pytest.raises(CalibrationError, match=r"tiles\.0\.p_scale_kpa"):
-        Calibration.from_json_marking_unproven(json.dumps(content), where="x")
+        Calibration.from_json_verifying_id(json.dumps(content), where="x")
 
 
 def test_a_calibration_of_a_later_version_is_refused() -> None:
     content = json.loads(make_calibration(newton_tile("T01")).to_json()) | {"version": 2}
     with pytest.raises(CalibrationError, match="version"):
-        Calibration.from_json_marking_unproven(json.dumps(content), where="x")
+        Calibration.from_json_verifying_id(json.dumps(content), where="x")
 
 
 @pytest.mark.parametrize("value", ["NaN", "Infinity", "-Infinity"])
@@ -146,7 +146,7 @@ def test_nan_and_infinity_in_a_file_are_refused(field: str, value: str) -> None:
     content = json.loads(make_calibration(newton_tile("T01")).to_json())
     content["tiles"][0][field] = float(value)
     with pytest.raises(CalibrationError, match=field):
-        Calibration.from_json_marking_unproven(json.dumps(content), where="x")
+        Calibration.from_json_verifying_id(json.dumps(content), where="x")
 
 
 @pytest.mark.parametrize(
@@ -175,7 +175,7 @@ def test_a_contradictory_entry_cannot_be_made(changes: dict[str, object]) -> Non
 def test_a_missing_serial_is_named_with_what_there_is_and_the_remedy() -> None:
     calibration = make_calibration(newton_tile("T01"), newton_tile("T02"))
     with pytest.raises(CalibrationError) as caught:
-        calibration.get_tile_or_preset("T07")
+        calibration.get_tile_or_wildcard("T07")
     text = str(caught.value)
     assert "it covers T01, T02, but not T07" in text
     serials = [f"T0{number}" for number in range(1, 10)]
@@ -219,13 +219,13 @@ def test_monotony_is_judged_at_both_ends_and_in_between(
 
 
 def test_the_papers_preset_is_zero_at_zero_and_30_n_at_15_kpa() -> None:
-    tile = PRESETS["paper-eq2-shape"]().get_tile_or_preset("any serial at all")
+    tile = PRESETS["paper-eq2-shape"]().get_tile_or_wildcard("any serial at all")
     assert force_n(tile, 0.0) == 0.0
     assert force_n(tile, 15.0) == pytest.approx(30.0, abs=1e-12)
 
 
 def test_the_papers_preset_has_the_papers_shape_at_41_45_n_per_unit() -> None:
-    tile = make_paper_shape_preset().get_tile_or_preset("T01")
+    tile = make_paper_shape_preset().get_tile_or_wildcard("T01")
     assert tile.f_scale_n == pytest.approx(41.45, abs=0.005)
     for gauge_kpa in np.linspace(0.0, 15.0, 61).tolist():
         p = gauge_kpa / 15.0
@@ -234,7 +234,7 @@ def test_the_papers_preset_has_the_papers_shape_at_41_45_n_per_unit() -> None:
 
 
 def test_the_papers_preset_says_that_its_scale_is_assumed_and_doubts_it_by_a_tenth() -> None:
-    tile = make_paper_shape_preset().get_tile_or_preset("T01")
+    tile = make_paper_shape_preset().get_tile_or_wildcard("T01")
     assert tile.absolute_scale == "assumed"
     assert tile.relative_misfit == 0.1
     assert tile.monotonic

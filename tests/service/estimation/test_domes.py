@@ -12,7 +12,7 @@ from service.estimation.domes import (
     VYTAFLEX_60,
     Dome,
     compute_ambient_transmission,
-    compute_fast_to_slow_load_ratio,
+    compute_fast_to_slow_saturation_load_ratio,
     compute_saturation_load,
     compute_volume_ratio,
     compute_wall_compliance_per_kpa,
@@ -27,7 +27,7 @@ def test_a_slow_load_takes_thirteen_percent_of_the_volume_to_115_kpa() -> None:
 
 def test_a_fast_load_is_at_full_scale_earlier() -> None:
     assert compute_volume_ratio(exponent=ADIABATIC) == pytest.approx(0.9050, abs=5e-5)
-    assert compute_fast_to_slow_load_ratio() == pytest.approx(0.095 / 0.1304, abs=0.001)
+    assert compute_fast_to_slow_saturation_load_ratio() == pytest.approx(0.095 / 0.1304, abs=0.001)
 
 
 def test_a_polytropic_load_lies_between_slow_and_fast() -> None:

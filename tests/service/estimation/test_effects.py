@@ -96,8 +96,8 @@ def test_the_limits_themselves_are_accepted() -> None:
 def test_effects_survive_a_calibration_file_to_the_bit() -> None:
     effects = make_effects(refused={"ambient": "for a test"})
     calibration = make_calibration(newton_tile("T01", effects=effects))
-    again = Calibration.from_json_marking_unproven(calibration.to_json(), where="a file")
-    assert again.get_tile_or_preset("T01").effects == effects
+    again = Calibration.from_json_verifying_id(calibration.to_json(), where="a file")
+    assert again.get_tile_or_wildcard("T01").effects == effects
     assert again.id == calibration.id
 
 
@@ -105,6 +105,6 @@ def test_a_branch_that_flows_survives_a_calibration_file() -> None:
     flow = FlowEffect(part=p(0.08), stress_n=p(0.2), power=p(4.0))
     loop = HysteresisEffect(part=(p(0.1), p(0.1), p(0.1)), flow=flow)
     calibration = make_calibration(newton_tile("T01", effects=make_effects(hysteresis=loop)))
-    again = Calibration.from_json_marking_unproven(calibration.to_json(), where="a file")
-    assert again.get_tile_or_preset("T01").effects.hysteresis == loop
+    again = Calibration.from_json_verifying_id(calibration.to_json(), where="a file")
+    assert again.get_tile_or_wildcard("T01").effects.hysteresis == loop
     assert again.id == calibration.id

@@ -65,7 +65,7 @@ def test_an_edit_is_refused_until_the_user_says_that_it_is_meant(path: Path) -> 
     path.write_text(edited)
     meant = read_calibration(path)
     assert meant.name == f"{CALIBRATION.name}, unproven"
-    assert meant.get_tile_or_preset("T01").repeats == 5
+    assert meant.get_tile_or_wildcard("T01").repeats == 5
     write_calibration(path, meant)  # what is carried on still says so
     assert read_calibration(path) == meant
 

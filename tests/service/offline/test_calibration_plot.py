@@ -40,7 +40,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
 def test_a_release_and_a_tap_are_replayed_better_with_effects_than_without(bench: Bench) -> None:
     calibration, recordings = bench
     found = simulate_release_and_tap_pressure(
-        recordings["T01"], calibration.get_tile_or_preset("T01")
+        recordings["T01"], calibration.get_tile_or_wildcard("T01")
     )
     assert set(found) == {"release", "tap"}
     for replay in found.values():
@@ -63,7 +63,8 @@ def test_a_recording_without_fast_loads_has_nothing_to_replay(bench: Bench) -> N
     }
     only_slow = replace(recording, **columns)
     assert (
-        simulate_release_and_tap_pressure([only_slow], calibration.get_tile_or_preset("T01")) == {}
+        simulate_release_and_tap_pressure([only_slow], calibration.get_tile_or_wildcard("T01"))
+        == {}
     )
 
 
@@ -79,7 +80,7 @@ def test_a_soak_in_a_file_of_its_own_tells_the_same_of_warmth(bench: Bench) -> N
             }
         )
 
-    tile = calibration.get_tile_or_preset("T01")
+    tile = calibration.get_tile_or_wildcard("T01")
     without = fit_determined_effects([part(~soaks)], tile)
     assert without.temperature is None
     apart = fit_determined_effects([part(~soaks), part(soaks)], tile)
@@ -96,7 +97,7 @@ def test_a_picture_holds_any_number_of_tiles(bench: Bench, tiles: int) -> None:
     from service.offline.calibration_plot import plot_calibration
 
     calibration, recordings = bench
-    entry = calibration.get_tile_or_preset("T01")
+    entry = calibration.get_tile_or_wildcard("T01")
     serials = [f"T{i:02}" for i in range(tiles)]
     many = calibration.model_copy(
         update={"tiles": tuple(entry.model_copy(update={"serial": s}) for s in serials)}

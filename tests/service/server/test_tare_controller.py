@@ -124,7 +124,7 @@ class Foot:
 
     @property
     def offset_counts(self) -> list[float]:
-        tare = self.node.estimator.live.usable_tare
+        tare = self.node.estimator.live.tare_in_use_unless_lost
         assert tare is not None
         return list((tare.baseline_kpa - UNLOADED_KPA) / COUNT_KPA)
 
@@ -161,16 +161,16 @@ def test_a_lead_that_comes_after_what_followed_it_is_tared_all_the_same(foot_of:
     foot.live(2.0, 20.0)
     assert foot.history == []
     assert (
-        foot.node.estimator.tare_controller.problem
+        foot.node.estimator.tare_controller.missing_tare_reason
         == "not tared: lift the foot, hold it still, and tare"
     )
     foot.send(lead.slice_rows(0, 50))
     assert foot.history == []
     foot.send(lead.slice_rows(50, 100))
     assert foot.history == [("lead", False)]
-    assert foot.node.estimator.live.tare.frames == 100
+    assert foot.node.estimator.live.tare_in_use_unless_lost.frames == 100
     assert foot.offset_counts == pytest.approx([1.0, 1.0], abs=0.4)
-    assert foot.node.estimator.tare_controller.problem is None
+    assert foot.node.estimator.tare_controller.missing_tare_reason is None
 
 
 def test_a_lead_of_which_a_part_never_comes_is_tared_from_the_rest(foot_of: Any) -> None:
@@ -182,7 +182,7 @@ def test_a_lead_of_which_a_part_never_comes_is_tared_from_the_rest(foot_of: Any)
     assert foot.history == []
     foot.live(2.0, 20.0)
     assert foot.history == [("lead", False)]
-    assert foot.node.estimator.live.tare.frames == 75
+    assert foot.node.estimator.live.tare_in_use_unless_lost.frames == 75
 
 
 def test_a_server_that_is_restarted_in_the_lead_tares_from_all_of_it_and_not_twice(
@@ -194,11 +194,11 @@ def test_a_server_that_is_restarted_in_the_lead_tares_from_all_of_it_and_not_twi
     foot.live(0.5, lead=True)
     foot.live(1.0, 20.0)
     assert foot.history == [("lead", False)]
-    assert foot.node.estimator.live.tare.frames == 100
+    assert foot.node.estimator.live.tare_in_use_unless_lost.frames == 100
     foot.restart()
     foot.live(1.0, 20.0)
     assert foot.history == [("lead", False)]
-    assert foot.node.estimator.live.tare is not None
+    assert foot.node.estimator.live.tare_in_use_unless_lost is not None
 
 
 def test_a_lead_that_is_no_tare_is_said_with_its_reason(foot_of: Any) -> None:
@@ -206,7 +206,7 @@ def test_a_lead_that_is_no_tare_is_said_with_its_reason(foot_of: Any) -> None:
     foot.live(1.0, lead=True, silent=1)
     foot.live(1.0, 20.0)
     assert foot.history == []
-    problem = foot.node.estimator.tare_controller.problem
+    problem = foot.node.estimator.tare_controller.missing_tare_reason
     assert "the lead gave no tare (tile T02 has 0 readable frames" in problem
     assert "lift the foot" in problem
 
@@ -214,7 +214,7 @@ def test_a_lead_that_is_no_tare_is_said_with_its_reason(foot_of: Any) -> None:
 def test_without_a_lead_that_could_be_used_the_tare_of_before_stays_and_that_is_said(
     foot: Foot,
 ) -> None:
-    before = foot.node.estimator.live.usable_tare
+    before = foot.node.estimator.live.tare_in_use_unless_lost
     again = {"stream_id": "1" * 32}
     info = foot.hello.array_info.model_copy(update=again)
     foot.hello = foot.hello.model_copy(update={"array_info": info})
@@ -222,9 +222,9 @@ def test_without_a_lead_that_could_be_used_the_tare_of_before_stays_and_that_is_
     foot.seq = 0
     foot.live(1.0, lead=True, silent=0)
     foot.live(1.0)
-    assert foot.node.estimator.live.usable_tare is not None
+    assert foot.node.estimator.live.tare_in_use_unless_lost is not None
     assert before is not None
-    assert foot.node.estimator.live.usable_tare.t_ns == before.t_ns
+    assert foot.node.estimator.live.tare_in_use_unless_lost.t_ns == before.t_ns
     assert "tile T01 has 0 readable frames" in str(
         foot.node.estimator.tare_controller.missing_tare_reason
     )
@@ -240,12 +240,12 @@ def test_a_lead_whose_tare_cannot_be_kept_is_a_storage_problem_and_tried_again(
         foot.live(1.0)
         assert "No space left" in foot.node.storage_problem
         assert foot.history == []
-        assert foot.node.estimator.live.tare is None
+        assert foot.node.estimator.live.tare_in_use_unless_lost is None
         foot.live(1.0)
     foot.node.storage_problem = None  # as the server does once it can write again
     foot.live(1.0)
     assert foot.history == [("lead", False)]
-    assert foot.node.estimator.live.tare is not None
+    assert foot.node.estimator.live.tare_in_use_unless_lost is not None
 
 
 # --- in flight ------------------------------------------------------------------------------------
@@ -257,7 +257,7 @@ def test_a_foot_whose_lead_failed_is_tared_as_soon_as_it_steps(foot_of: Any) -> 
     foot.step(4, rest=2.0)
     assert foot.history == [("flight", False)]
     assert foot.offset_counts == pytest.approx([2.0, 2.0], abs=0.6)
-    assert foot.node.estimator.tare_controller.problem is None
+    assert foot.node.estimator.tare_controller.missing_tare_reason is None
     assert "between two steps" in foot.node.estimator.tare_history.all_tares_with_undone[0].reason
 
 
@@ -266,7 +266,7 @@ def test_a_foot_that_stands_from_the_beginning_is_never_tared_unasked(foot_of: A
     foot.live(1.0, lead=True, silent=1)
     foot.live(60.0, 8.0)
     assert foot.history == []
-    assert foot.node.estimator.tare_controller.problem is not None
+    assert foot.node.estimator.tare_controller.missing_tare_reason is not None
 
 
 def test_a_dome_that_warms_is_followed_between_steps_and_each_time_is_in_the_history(
@@ -360,11 +360,11 @@ def test_an_automatic_tare_that_is_undone_does_not_come_back_until_somebody_tare
 def test_an_automatic_tare_that_cannot_be_kept_is_not_in_force(
     foot: Foot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before = foot.node.estimator.live.usable_tare
+    before = foot.node.estimator.live.tare_in_use_unless_lost
     monkeypatch.setattr("service.sessions.tares.write_tares", refusing(StorageError, "full"))
     foot.live(70.0, 0.9)
     assert foot.history == [("lead", False)]
-    assert foot.node.estimator.live.usable_tare is before
+    assert foot.node.estimator.live.tare_in_use_unless_lost is before
     assert foot.node.storage_problem == "full"
 
 

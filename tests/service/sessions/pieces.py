@@ -37,7 +37,7 @@ def options(**changes: Any) -> EstimateOptions:
         "calibration": calibration(),
         "models": ("unwrap", "static"),
         "lag_ms": 10.0,
-        "exact": True,
+        "unquantized": True,
     }
     return EstimateOptions(**chosen | changes)
 

@@ -31,7 +31,7 @@ from storage.formats.slice import Slice
 from storage.formats.writers.registry import FORMATS
 from storage.journal.journal import Journal
 from storage.sessions.folder import Part, Session
-from storage.sessions.pyramid import PreviewBins, required_frame_columns, shift_bins_to_axis
+from storage.sessions.pyramid import PreviewBins, bin_source_columns, shift_bins_to_axis
 from tests.builders.arrays import PERIOD_NS
 from tests.builders.frames import make_frames
 from tests.service.sessions.pieces import array, calibration, hopping
@@ -197,7 +197,7 @@ def assert_the_overview_is_as_in_one_go(so_far: SessionPreview, sources: Session
     raw = iterate_raw_frames_with_part(sources)
     wanted = PreviewBins()
     for frames, columns in raw if stream is None else stream.estimate_batches(raw, is_final=False):
-        names = required_frame_columns(has_estimates=stream is not None)
+        names = bin_source_columns(has_estimates=stream is not None)
         own = {name: getattr(frames, name) for name in names if name not in columns}
         wanted.add_frames(
             {**own, **{name: columns[name] for name in (*names, "part") if name in columns}}

@@ -47,7 +47,7 @@ def written(folder: Path, count: int = len(TAKEN)) -> Path:
         tare = make_tare(2, baseline_kpa=100.0 + t_ns / 7, t_ns=t_ns, source=source)
         recorded = tares.store_and_apply_tare(tare, info)
         if undone:
-            tares.undo_tare(recorded.id)
+            tares.undo_any_tare_and_pause_automatic(recorded.id)
     return path
 
 
@@ -189,7 +189,7 @@ def test_a_tare_after_the_lost_one_puts_all_right_again_and_so_it_stays(tmp_path
             (75, True),
             (90, False),
         ]
-    found.undo_tare(mine.id)
+    found.undo_any_tare_and_pause_automatic(mine.id)
     assert found.is_tare_lost(INFO), "none that is older takes its place"
 
 

@@ -37,13 +37,13 @@ def test_the_newest_is_in_force_and_undone_the_one_before(tmp_path: Path) -> Non
     tares = history(tmp_path)
     one, two, three = (tares.store_and_apply_tare(tare(t), INFO) for t in (1, 2, 3))
     assert tares.tare_in_force_unless_lost(INFO) is three
-    tares.undo_tare(three.id)
+    tares.undo_any_tare_and_pause_automatic(three.id)
     same_as_two = tares.tare_in_force_unless_lost(INFO)
     assert same_as_two is not None
     same(same_as_two, two)
-    tares.undo_tare(one.id)  # one that is not in force, too
+    tares.undo_any_tare_and_pause_automatic(one.id)  # one that is not in force, too
     assert [recorded.undone for recorded in tares.all_tares_with_undone] == [True, False, True]
-    tares.undo_tare(two.id)
+    tares.undo_any_tare_and_pause_automatic(two.id)
     assert tares.tare_in_force_unless_lost(INFO) is None
     again = tares.store_and_apply_tare(tare(4), INFO)
     assert tares.tare_in_force_unless_lost(INFO) is again
@@ -52,10 +52,10 @@ def test_the_newest_is_in_force_and_undone_the_one_before(tmp_path: Path) -> Non
 def test_only_what_is_there_and_in_force_can_be_undone(tmp_path: Path) -> None:
     tares = history(tmp_path, 1)
     recorded = tares.all_tares_with_undone[0]
-    tares.undo_tare(recorded.id)
+    tares.undo_any_tare_and_pause_automatic(recorded.id)
     for tare_id in (recorded.id, "", "nothing", recorded.id[:-1]):
         with pytest.raises(UnknownError, match="could be undone"):
-            tares.undo_tare(tare_id)
+            tares.undo_any_tare_and_pause_automatic(tare_id)
     assert len(tares.all_tares_with_undone) == 1
 
 
@@ -109,7 +109,7 @@ def test_during_an_interval_are_those_that_were_in_force_at_some_time_of_it(
     tares = history(tmp_path_factory.mktemp("during"), *(t for t, _ in taken))
     for recorded, (_, undone) in zip(tares.all_tares_with_undone, taken, strict=True):
         if undone:
-            tares.undo_tare(recorded.id)
+            tares.undo_any_tare_and_pause_automatic(recorded.id)
     valid = [t for t, undone in taken if not undone]
     in_force = set[int]()
     for instant in range(begin, begin + length + 1):
@@ -143,7 +143,7 @@ def test_an_undone_tare_pauses_automatic_ones_until_somebody_tares(tmp_path: Pat
     one = tares.store_and_apply_tare(tare(2, source="flight"), INFO)
     two = tares.store_and_apply_tare(tare(3, source="flight"), INFO)
     assert not tares.is_automatic_paused(INFO)
-    tares.undo_tare(two.id)
+    tares.undo_any_tare_and_pause_automatic(two.id)
     in_force = tares.tare_in_force_unless_lost(INFO)
     assert in_force is not None
     assert in_force.id == one.id
@@ -152,7 +152,9 @@ def test_an_undone_tare_pauses_automatic_ones_until_somebody_tares(tmp_path: Pat
     assert not tares.is_automatic_paused(OTHERS[0]), "not for other tiles"
     by_hand = tares.store_and_apply_tare(tare(4), INFO)
     assert not tares.is_automatic_paused(INFO)
-    tares.undo_tare(by_hand.id)  # else the next automatic one would replace the one restored
+    tares.undo_any_tare_and_pause_automatic(
+        by_hand.id
+    )  # else the next automatic one would replace the one restored
     assert tares.is_automatic_paused(INFO)
 
 
@@ -167,7 +169,7 @@ def test_automatic_tares_are_held_against_the_last_one_by_hand_or_the_oldest(
     by_hand = tares.store_and_apply_tare(tare(3), INFO)
     tares.store_and_apply_tare(tare(4, source="flight"), INFO)
     assert tares.last_not_in_flight_or_oldest(INFO) is by_hand
-    tares.undo_tare(by_hand.id)
+    tares.undo_any_tare_and_pause_automatic(by_hand.id)
     anchor = tares.last_not_in_flight_or_oldest(INFO)
     assert anchor is not None
     assert anchor.id == first.id
@@ -200,7 +202,7 @@ def test_automatic_tares_never_push_out_one_that_was_taken_by_hand(
 def test_the_history_survives_a_restart_bit_by_bit(tmp_path: Path) -> None:
     tares = history(tmp_path, 1, 2**62)
     tares.store_and_apply_tare(tare(5, tiles=1), array("Ü"))
-    tares.undo_tare(tares.all_tares_with_undone[1].id)
+    tares.undo_any_tare_and_pause_automatic(tares.all_tares_with_undone[1].id)
     again = history(tmp_path)
     assert len(again.all_tares_with_undone) == 3
     for one, other in zip(tares.all_tares_with_undone, again.all_tares_with_undone, strict=True):
@@ -208,7 +210,7 @@ def test_the_history_survives_a_restart_bit_by_bit(tmp_path: Path) -> None:
     in_force = again.tare_in_force_unless_lost(INFO)
     assert in_force is not None
     assert in_force.tare.t_ns == 1
-    again.undo_tare(in_force.id)
+    again.undo_any_tare_and_pause_automatic(in_force.id)
     assert history(tmp_path).tare_in_force_unless_lost(INFO) is None
 
 
@@ -236,7 +238,7 @@ def test_a_disk_that_cannot_be_written_leaves_the_history_as_it_was(
         with pytest.raises(StorageError, match="No space left"):
             tares.store_and_apply_tare(tare(3), INFO)
         with pytest.raises(StorageError, match="No space left"):
-            tares.undo_tare(before[0].id)
+            tares.undo_any_tare_and_pause_automatic(before[0].id)
     assert tares.all_tares_with_undone == before
     assert tares.tare_in_force_unless_lost(INFO) is before[1]
     assert instants([recorded.tare for recorded in history(tmp_path).all_tares_with_undone]) == [

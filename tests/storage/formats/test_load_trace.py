@@ -13,7 +13,7 @@ import pytest
 
 from devices.emulation.ground.load_trace import LoadTrace
 from devices.errors import LoadTraceError
-from storage.formats.load_trace import read_load_trace
+from storage.formats.load_trace import read_load_to_emulate
 from storage.formats.reference import ReferenceOptions
 from tests.builders.c3d import c3d_bytes, force_plate
 
@@ -33,7 +33,7 @@ def read(tmp_path: Path) -> Read:
     def reader(content: str | bytes) -> LoadTrace:
         path = tmp_path / "trace.csv"
         path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        return read_load_trace(path)
+        return read_load_to_emulate(path)
 
     return reader
 
@@ -45,7 +45,7 @@ def read_parquet(tmp_path: Path) -> Callable[..., LoadTrace]:
     def reader(**columns: object) -> LoadTrace:
         path = tmp_path / "trace.parquet"
         pq.write_table(pa.table(columns), path)
-        return read_load_trace(path)
+        return read_load_to_emulate(path)
 
     return reader
 
@@ -133,10 +133,10 @@ def test_a_plate_a_little_below_zero_in_flight_is_not_upside_down(read: Read) ->
 @pytest.mark.parametrize("suffix", ["", ".csv", ".parquet"])
 def test_a_folder_and_a_missing_file_are_refused_by_name(tmp_path: Path, suffix: str) -> None:
     with pytest.raises(LoadTraceError, match=rf"nothing{suffix}.*cannot be read"):
-        read_load_trace(tmp_path / f"nothing{suffix or '.csv'}")
+        read_load_to_emulate(tmp_path / f"nothing{suffix or '.csv'}")
     (tmp_path / f"folder{suffix}").mkdir()
     with pytest.raises(LoadTraceError, match="folder"):
-        read_load_trace(tmp_path / f"folder{suffix}")
+        read_load_to_emulate(tmp_path / f"folder{suffix}")
 
 
 @pytest.mark.parametrize(
@@ -156,7 +156,7 @@ def test_a_csv_that_is_called_parquet_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "trace.parquet"
     path.write_text(GOOD)
     with pytest.raises(LoadTraceError, match=r"trace\.parquet.*expected a Parquet file"):
-        read_load_trace(path)
+        read_load_to_emulate(path)
 
 
 # --- columns --------------------------------------------------------------------------------------
@@ -283,7 +283,7 @@ def test_too_many_rows_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(pq.ParquetFile, "read", read_anyway)
     with pytest.raises(LoadTraceError, match=r"16000000 rows of 2 columns"):
-        read_load_trace(path)
+        read_load_to_emulate(path)
 
 
 def test_a_text_that_is_too_long_is_refused_before_it_is_read(tmp_path: Path) -> None:
@@ -291,7 +291,7 @@ def test_a_text_that_is_too_long_is_refused_before_it_is_read(tmp_path: Path) ->
     with path.open("wb") as file:
         file.truncate(300 << 20)  # a hole: it takes no room
     with pytest.raises(LoadTraceError, match="314572800 bytes"):
-        read_load_trace(path)
+        read_load_to_emulate(path)
 
 
 def test_a_plate_of_several_is_named_and_its_unit_stated(tmp_path: Path) -> None:
@@ -310,11 +310,11 @@ def test_a_plate_of_several_is_named_and_its_unit_stated(tmp_path: Path) -> None
     path = tmp_path / "gait.c3d"
     path.write_bytes(c3d_bytes(content, np.stack([*[nothing] * 6, *wrench], axis=1)))
     with pytest.raises(LoadTraceError, match=r"plate2_fz.*--map time_s=COLUMN,grf_n=COLUMN"):
-        read_load_trace(path)
+        read_load_to_emulate(path)
     columns = {"grf_n": "plate2_fz", "cop_x_m": "plate2_cop_x", "cop_y_m": "-plate2_cop_y"}
     with pytest.raises(LoadTraceError, match=r"not stated.*--units grf="):
-        read_load_trace(path, ReferenceOptions(columns))
-    trace = read_load_trace(path, ReferenceOptions(columns, {"grf": "N", "cop": "mm"}))
+        read_load_to_emulate(path, ReferenceOptions(columns))
+    trace = read_load_to_emulate(path, ReferenceOptions(columns, {"grf": "N", "cop": "mm"}))
     assert trace.fz_n is not None
     assert trace.cop_m is not None
     np.testing.assert_allclose(trace.fz_n, load_n, atol=1e-4)
@@ -326,7 +326,7 @@ def test_names_units_and_sign_of_a_table_are_stated(tmp_path: Path) -> None:
     path.write_text("Time,Fz,Px,Py\n0,0,,\n10,-0.2,4,-5\n20,-0.3,5,-6\n")
     columns = {"time_s": "Time", "grf_n": "Fz", "cop_x_m": "Px", "cop_y_m": "Py"}
     stated = ReferenceOptions(columns, {"time": "ms", "grf": "kN", "cop": "mm"}, "-")
-    trace = read_load_trace(path, stated)
+    trace = read_load_to_emulate(path, stated)
     np.testing.assert_allclose(trace.time_s, [0.0, 0.01, 0.02])
     assert trace.fz_n is not None
     assert trace.cop_m is not None

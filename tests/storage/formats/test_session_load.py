@@ -13,7 +13,7 @@ import pytest
 from devices.emulation.ground.load_trace import LoadTrace
 from devices.errors import LoadTraceError
 from storage.formats.export import make_one_pass_frame_source
-from storage.formats.load_trace import read_load_trace
+from storage.formats.load_trace import read_load_to_emulate
 from storage.formats.readers.registry import read_table
 from storage.formats.slice import FormatOptions, Slice
 from storage.schema import Array
@@ -65,7 +65,7 @@ def cells(trace: LoadTrace) -> Array:
 
 
 def test_a_sealed_session_presses_its_estimates_on_loaded_tiles(tmp_path: Path) -> None:
-    trace = read_load_trace(written(tmp_path / "s.parquet", ESTIMATES))
+    trace = read_load_to_emulate(written(tmp_path / "s.parquet", ESTIMATES))
     np.testing.assert_array_equal(cells(trace), ESTIMATE_N[2:, [0, 2]])  # from the first angle on
     np.testing.assert_allclose(trace.time_s, np.arange(2, ROWS) * PERIOD_NS * 1e-9, rtol=1e-12)
     assert trace.angle_rad is not None
@@ -74,7 +74,7 @@ def test_a_sealed_session_presses_its_estimates_on_loaded_tiles(tmp_path: Path) 
 
 @pytest.mark.parametrize("to", ["parquet", "csv"])
 def test_true_forces_go_before_estimates(tmp_path: Path, to: str) -> None:
-    trace = read_load_trace(exported(tmp_path, to, ESTIMATES | TRUTH))
+    trace = read_load_to_emulate(exported(tmp_path, to, ESTIMATES | TRUTH))
     np.testing.assert_allclose(cells(trace), TRUE_N[:, [0, 2]], rtol=1e-15)
     assert trace.angle_rad is not None
     np.testing.assert_allclose(trace.angle_rad, 0.2)
@@ -84,7 +84,7 @@ def test_true_forces_go_before_estimates(tmp_path: Path, to: str) -> None:
 @pytest.mark.parametrize("to", ["parquet", "csv"])
 def test_a_grf_with_its_cop_is_a_load(tmp_path: Path, to: str) -> None:
     names = ("t_ns", "grf_n", "cop_x_m", "cop_y_m")
-    trace = read_load_trace(exported(tmp_path, to, ESTIMATES, *names))
+    trace = read_load_to_emulate(exported(tmp_path, to, ESTIMATES, *names))
     assert trace.cells_n is None
     assert trace.fz_n is not None
     assert trace.cop_m is not None
@@ -96,11 +96,13 @@ def test_a_grf_with_its_cop_is_a_load(tmp_path: Path, to: str) -> None:
 def test_a_grf_of_one_row_of_tiles_has_a_constant_across_it(tmp_path: Path, to: str) -> None:
     names = ("t_ns", "grf_n", "cop_x_m", "cop_y_m")
     row = ESTIMATES | {"cop_y_m": np.full(ROWS, np.nan)}
-    trace = read_load_trace(exported(tmp_path, to, row, *names))
+    trace = read_load_to_emulate(exported(tmp_path, to, row, *names))
     assert trace.cop_m is not None
     np.testing.assert_array_equal(np.isnan(trace.cop_m[:, 0]), np.arange(ROWS) % 4 == 0)
     np.testing.assert_array_equal(trace.cop_m[:, 1], 0.0)
-    neither = read_load_trace(exported(tmp_path, to, row | {"cop_x_m": row["cop_y_m"]}, *names))
+    neither = read_load_to_emulate(
+        exported(tmp_path, to, row | {"cop_x_m": row["cop_y_m"]}, *names)
+    )
     assert neither.cop_m is not None
     assert np.isnan(neither.cop_m).all()
 
@@ -109,28 +111,28 @@ def test_rows_without_forces_are_left_out_at_the_ends_only(tmp_path: Path) -> No
     columns = {"force_n": ESTIMATE_N.copy()}
     columns["force_n"][:3, 0] = np.nan
     columns["force_n"][-2:, 2] = np.nan
-    trace = read_load_trace(written(tmp_path / "s.parquet", columns))
+    trace = read_load_to_emulate(written(tmp_path / "s.parquet", columns))
     np.testing.assert_array_equal(cells(trace), ESTIMATE_N[3:-2, [0, 2]])
     columns["force_n"][10, 0] = np.nan
     with pytest.raises(LoadTraceError, match=r"cell1_n is nan at row 8"):
-        read_load_trace(written(tmp_path / "s.parquet", columns))
+        read_load_to_emulate(written(tmp_path / "s.parquet", columns))
 
 
 def test_raw_frames_are_refused_with_what_to_do(tmp_path: Path) -> None:
     with pytest.raises(LoadTraceError, match=re.escape("Estimate it first")):
-        read_load_trace(written(tmp_path / "s.parquet", {}))
+        read_load_to_emulate(written(tmp_path / "s.parquet", {}))
 
 
 def test_a_session_without_known_forces_is_refused(tmp_path: Path) -> None:
     nothing = {"force_n": np.full((ROWS, 3), np.nan)}
     with pytest.raises(LoadTraceError, match="no row of it has a load"):
-        read_load_trace(written(tmp_path / "s.parquet", nothing))
+        read_load_to_emulate(written(tmp_path / "s.parquet", nothing))
 
 
 def test_forces_of_some_tiles_only_are_refused(tmp_path: Path) -> None:
     path = exported(tmp_path, "csv", ESTIMATES, "t_ns", "force_n_2")
     with pytest.raises(LoadTraceError, match=re.escape("forces of tiles 2 only")):
-        read_load_trace(path)
+        read_load_to_emulate(path)
 
 
 def test_an_export_for_excel_is_read_again_with_its_umlauts(tmp_path: Path) -> None:
@@ -151,9 +153,9 @@ def test_a_session_rewritten_by_another_program_is_refused(tmp_path: Path) -> No
     path = written(tmp_path / "s.parquet", ESTIMATES)
     pq.write_table(pq.read_table(path), path)
     with pytest.raises(LoadTraceError, match="another program has rewritten it"):
-        read_load_trace(path)
+        read_load_to_emulate(path)
 
 
 def test_an_arrow_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(LoadTraceError, match=r"ends in \.parquet"):
-        read_load_trace(exported(tmp_path, "arrow", ESTIMATES))
+        read_load_to_emulate(exported(tmp_path, "arrow", ESTIMATES))

@@ -28,12 +28,12 @@ def test_messages_of_any_size_in_any_order_are_judged_without_a_look_at_the_disk
     for begin, end in spans:
         frames = make_frames(np.arange(begin, end))
         before, after = stored.nearest_outside(begin, end - 1)
-        assert instants.describe_time_reversal(frames, stored) == ""
+        assert instants.describe_reversal_against_stored(frames, stored) == ""
         for neighbour, side in ((before, -1), (after, 1)):
             if neighbour is not None:
                 leap_ns = (neighbour - begin + side * len(spans) * 5) * PERIOD_NS
                 moved = with_columns(frames, t_ns=frames.t_ns + leap_ns)
-                assert "time runs back" in instants.describe_time_reversal(moved, stored)
+                assert "time runs back" in instants.describe_reversal_against_stored(moved, stored)
         stored.add(begin, end - 1)
         instants.register_message(EncodedBatch.from_frames_and_payload(frames, b""), stored)
 
@@ -49,5 +49,7 @@ def test_when_something_is_not_held_any_more_the_disk_is_asked_once() -> None:
     instants.register_message(EncodedBatch.from_frames_and_payload(make_frames(10), b""), stored)
     instants.clear()
     for _ in range(3):
-        assert instants.describe_time_reversal(make_frames(np.arange(10, 12)), stored) == ""
+        assert (
+            instants.describe_reversal_against_stored(make_frames(np.arange(10, 12)), stored) == ""
+        )
     assert asked == [(9, True)]

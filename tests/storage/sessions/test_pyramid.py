@@ -24,10 +24,10 @@ from storage.sessions.pyramid import (
     PreviewBins,
     PyramidBuilder,
     bin_column_types,
+    bin_source_columns,
     build_levels,
     make_single_frame_bins,
     merge_bins,
-    required_frame_columns,
     select_and_downsample_bins,
 )
 
@@ -177,7 +177,7 @@ def test_unread_counts_are_no_extremes() -> None:
     columns = {
         name: values
         for name, values in frames(n).items()
-        if name in required_frame_columns(has_estimates=False)
+        if name in bin_source_columns(has_estimates=False)
     }
     columns["pressure_raw"] = np.tile(np.array([500, 400], dtype=np.uint16), (n, 1))
     columns["pressure_raw"][3:5, 0] = NOT_READ, 510
@@ -202,9 +202,7 @@ def test_without_a_frame_there_is_nothing() -> None:
 def test_every_column_of_a_bin_has_its_type(estimated: bool) -> None:
     columns = dict(frames(200))
     if not estimated:
-        columns = {
-            n: columns[n] for n in required_frame_columns(has_estimates=False) if n in columns
-        }
+        columns = {n: columns[n] for n in bin_source_columns(has_estimates=False) if n in columns}
         columns["pressure_raw"] = np.full((200, TILES), 500, dtype=np.uint16)
     found = gathered(columns).get_finest_level()
     assert found is not None

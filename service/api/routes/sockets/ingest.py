@@ -224,7 +224,7 @@ async def _receive_messages(socket: WebSocket, server: Server, link: NodeLink) -
         await asyncio.sleep(0)
         message = await _receive_message(socket)
         if isinstance(message, bytes):
-            tare_before = node.estimator.live.usable_tare
+            tare_before = node.estimator.live.tare_in_use_unless_lost
             try:
                 due = node.receive_frames(link.stream, _verify_frames(message), server_utc_ns())
             except LinkError as error:
@@ -232,7 +232,7 @@ async def _receive_messages(socket: WebSocket, server: Server, link: NodeLink) -
             server.broadcaster.add_to_history_and_updates(node, due)
             server.live_feeds.add_to_existing_buffer(node, due)
             server.weighings.feed_frames(node, due)
-            if node.estimator.live.usable_tare is not tare_before:
+            if node.estimator.live.tare_in_use_unless_lost is not tare_before:
                 server.notify_node_changed(node)
             continue
         parsed = _parse_message(message)

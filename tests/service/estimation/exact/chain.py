@@ -31,7 +31,7 @@ def sampled_ns(frames: FrameBatch) -> list[list[int]]:
 
 def effects_of(plan: EstimationPlan) -> list[Any]:
     """Of every dome."""
-    return [plan.calibration.get_tile_or_preset(plan.info.tiles[i].serial).effects for i in DOMES]
+    return [plan.calibration.get_tile_or_wildcard(plan.info.tiles[i].serial).effects for i in DOMES]
 
 
 def felt_by(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
@@ -93,7 +93,7 @@ def felt_by(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
             )
         gauge[i] = [None if p is None else p - base[i] for p in dry]
         hot = effects[i].gas
-        entry = plan.calibration.get_tile_or_preset(plan.info.tiles[i].serial)
+        entry = plan.calibration.get_tile_or_wildcard(plan.info.tiles[i].serial)
         # What was read beyond the chip's end is a guess; the least and the most may have been.
         high = mpf(entry.range_kpa[1])
         end = max(mpf(115), base[i] + high)

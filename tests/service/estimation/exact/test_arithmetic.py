@@ -104,7 +104,7 @@ def reference(plan: EstimationPlan, frames: FrameBatch, row: int) -> Reference:
             forces.append(None)
             sigmas.append(None)
             continue
-        entry = plan.calibration.get_tile_or_preset(tile.serial)
+        entry = plan.calibration.get_tile_or_wildcard(tile.serial)
         force, slope, curve_sigma = tile_force(entry, gauge)
         reading = mpf(float(plan.tare.noise_kpa[i])) ** 2
         reading += mpf(float(plan.tare.baseline_sigma_kpa[i])) ** 2

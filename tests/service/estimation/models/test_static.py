@@ -148,7 +148,7 @@ def test_every_tile_has_its_own_curve() -> None:
     curves = StaticCurves(
         [
             newton_tile("T01", **CURVE),
-            make_paper_shape_preset().get_tile_or_preset("T02"),
+            make_paper_shape_preset().get_tile_or_wildcard("T02"),
             newton_tile("T03"),
         ]
     )

@@ -130,7 +130,7 @@ def test_the_mount_calibration_is_part_of_the_id() -> None:
         }
     )
     assert mounted.id != calibration.id
-    assert Calibration.from_json_marking_unproven(mounted.to_json(), where="here") == mounted
+    assert Calibration.from_json_verifying_id(mounted.to_json(), where="here") == mounted
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,11 @@ from devices.arrays import Floats
 from devices.jit import jit_cached
 from service.estimation.models import denoise
 from service.estimation.pipeline.params import KernelParams, make_kernel_params
-from service.estimation.pipeline.smoothing_stage import TILE_FORCE, TileForce, denoise_forces
+from service.estimation.pipeline.smoothing_stage import (
+    TILE_FORCE,
+    TileForce,
+    denoise_forces_and_scale_noise,
+)
 from service.estimation.pipeline.state import FrameBuffer, make_frame_buffer
 from service.estimation.records import RecordArray
 from tests.builders.arrays import array_at
@@ -48,7 +52,7 @@ def _average_all(params: KernelParams, buffer: FrameBuffer, out: Floats) -> None
         )
         for j in range(len(forces)):
             forces[j].force_n, forces[j].noise_n = buffer.usable_n[i, j], buffer.noise_n[i, j]
-        denoise_forces(params, buffer, i, rows, windows, forces)
+        denoise_forces_and_scale_noise(params, buffer, i, rows, windows, forces)
         for j in range(len(forces)):
             out[i, j] = forces[j].force_n
 

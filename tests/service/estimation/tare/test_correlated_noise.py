@@ -18,7 +18,7 @@ from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded_windows import (
     compute_recording_tare,
     compute_variance_inflation,
-    fit_correlated_noise,
+    fit_correlated_variance_fraction_and_decay,
 )
 from tests.builders.arrays import COUNT_KPA, PERIOD_NS, make_array
 from tests.builders.calibrations import make_calibration, newton_tile
@@ -46,14 +46,14 @@ def test_white_noise_lasts_in_no_more_than_two_tares_of_a_thousand(
     n: int, count_kpa: float
 ) -> None:
     kpa = readings_of(n, part=0.0, readings=1.0, seed=n, tiles=2000, count_kpa=count_kpa)
-    part = fit_correlated_noise(kpa).fraction
+    part = fit_correlated_variance_fraction_and_decay(kpa).fraction
     assert (part > 0.0).mean() <= 2e-3
 
 
 @pytest.mark.parametrize(("part", "readings"), [(1.0, 5.5), (0.5, 5.5), (0.5, 20.0), (0.3, 10.0)])
 def test_the_variance_of_a_mean_is_found_from_half_a_second(part: float, readings: float) -> None:
     kpa = readings_of(300, part=part, readings=readings, seed=3, tiles=400, count_kpa=0.1)
-    found = compute_variance_inflation(*fit_correlated_noise(kpa), 16)
+    found = compute_variance_inflation(*fit_correlated_variance_fraction_and_decay(kpa), 16)
     true = float(compute_variance_inflation(np.array([part]), np.array([readings]), 16)[0])
     assert np.median(found) == pytest.approx(true, rel=0.12)
     assert (found == 1.0).mean() < 0.1  # taken for white
@@ -84,18 +84,20 @@ def test_a_tile_that_says_nothing_or_the_same_or_too_little_has_white_noise() ->
     kpa = readings_of(300, part=1.0, readings=8.0, seed=1, tiles=3)
     kpa[:, 0] = np.nan
     kpa[:, 1] = 100.0
-    part, readings = fit_correlated_noise(kpa)
+    part, readings = fit_correlated_variance_fraction_and_decay(kpa)
     assert part[:2].tolist() == readings[:2].tolist() == [0.0, 0.0]
     assert part[2] > 0.5
-    assert fit_correlated_noise(kpa[:31]).fraction.tolist() == [0.0, 0.0, 0.0]
+    assert fit_correlated_variance_fraction_and_decay(kpa[:31]).fraction.tolist() == [0.0, 0.0, 0.0]
 
 
 def test_readings_that_are_missing_change_little() -> None:
     kpa = readings_of(1000, part=0.8, readings=6.0, seed=2)
     holes = kpa.copy()
     holes[np.random.default_rng(0).random(1000) < 0.05] = np.nan
-    assert compute_variance_inflation(*fit_correlated_noise(holes), 16) == pytest.approx(
-        compute_variance_inflation(*fit_correlated_noise(kpa), 16), rel=0.2
+    assert compute_variance_inflation(
+        *fit_correlated_variance_fraction_and_decay(holes), 16
+    ) == pytest.approx(
+        compute_variance_inflation(*fit_correlated_variance_fraction_and_decay(kpa), 16), rel=0.2
     )
 
 

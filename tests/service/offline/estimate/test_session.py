@@ -35,19 +35,21 @@ def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def estimated(source: Path, out: Path, *, exact: bool = False) -> SealedFileReader:
-    estimate_session(source, out, request(exact=exact), on_remark=lambda _: None)
+def estimated(source: Path, out: Path, *, unquantized: bool = False) -> SealedFileReader:
+    estimate_session(source, out, request(unquantized=unquantized), on_remark=lambda _: None)
     return SealedFileReader(out)
 
 
-def request(*, exact: bool = False, tare_s: tuple[float, float] | None = None) -> EstimateRequest:
+def request(
+    *, unquantized: bool = False, tare_s: tuple[float, float] | None = None
+) -> EstimateRequest:
     return EstimateRequest(
         calibration=None,
         models=("static", "denoise"),
         lag_ms=100.0,
         scene=None,
         tare_s=tare_s,
-        exact=exact,
+        unquantized=unquantized,
     )
 
 
@@ -67,7 +69,7 @@ def test_estimated_again_from_its_own_file_a_session_has_the_same_content(
         with estimated(tmp_path / "once.parquet", tmp_path / "twice.parquet") as twice:
             assert once.content_sha256 == twice.content_sha256
             assert once.content_sha256 is not None
-        with estimated(raw, tmp_path / "exact.parquet", exact=True) as exact:
+        with estimated(raw, tmp_path / "exact.parquet", unquantized=True) as exact:
             assert exact.notes["rounded_to"] == {}
             assert bits(estimates_of(exact)) != bits(estimates_of(once))
         with estimated(tmp_path / "exact.parquet", tmp_path / "rounded.parquet") as rounded:
@@ -98,9 +100,9 @@ def test_what_is_in_the_file_is_what_was_computed_rounded_to_the_steps_it_states
 
 @pytest.mark.parametrize("exact", [False, True])
 def test_a_session_estimated_in_its_folder_has_its_stances_beside_it(
-    raw: Path, tmp_path: Path, exact: bool
+    raw: Path, tmp_path: Path, unquantized: bool
 ) -> None:
-    with estimated(raw, tmp_path / "frames.parquet", exact=exact):
+    with estimated(raw, tmp_path / "frames.parquet", unquantized=unquantized):
         pass
     path = tmp_path / "stances.parquet"
     written = path.read_bytes()
@@ -130,7 +132,7 @@ def test_exports_say_to_what_their_columns_were_rounded(raw: Path, tmp_path: Pat
 
 def test_rounded_estimates_take_less_than_half_of_the_bytes(raw: Path, tmp_path: Path) -> None:
     estimated(raw, tmp_path / "s.parquet").close()
-    estimated(raw, tmp_path / "exact.parquet", exact=True).close()
+    estimated(raw, tmp_path / "exact.parquet", unquantized=True).close()
     rounded, exact = (_page_bytes(tmp_path / name) for name in ("s.parquet", "exact.parquet"))
     assert rounded < 0.5 * exact
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError, LoadTraceError, UsageError
-from storage.formats.load_trace import read_load_trace
+from storage.formats.load_trace import read_load_to_emulate
 from storage.formats.readers.registry import read_table
 from storage.formats.readers.table import ForceTable
 from storage.formats.readers.text_options import TextOptions
@@ -297,7 +297,9 @@ def test_text_options_are_for_texts_only(tmp_path: Path) -> None:
         with pytest.raises(UsageError, match="apply only to text tables"):
             table_of(tmp_path, PLAIN, name, TextOptions(decimal="."))
     with pytest.raises(LoadTraceError, match="apply only to text tables"):
-        read_load_trace(tmp_path / "plate.c3d", ReferenceOptions(text=TextOptions(skip_rows=1)))
+        read_load_to_emulate(
+            tmp_path / "plate.c3d", ReferenceOptions(text=TextOptions(skip_rows=1))
+        )
 
 
 def test_a_stated_layout_overrules_the_head_of_a_program(tmp_path: Path) -> None:
@@ -310,6 +312,6 @@ def test_a_stated_layout_overrules_the_head_of_a_program(tmp_path: Path) -> None
 def test_a_load_is_read_with_text_options(tmp_path: Path) -> None:
     path = tmp_path / "load.csv"
     path.write_text("a;b\n1;2\ntime_s;fz_n;cop_x_m;cop_y_m\n0;1,000;;\n1;1,500;;\n")
-    found = read_load_trace(path, ReferenceOptions(text=TextOptions(skip_rows=2, decimal=",")))
+    found = read_load_to_emulate(path, ReferenceOptions(text=TextOptions(skip_rows=2, decimal=",")))
     assert found.fz_n is not None
     assert found.fz_n.tolist() == [1.0, 1.5]

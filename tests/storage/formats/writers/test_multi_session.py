@@ -159,7 +159,7 @@ def written(to: str, exports: Sequence[Export], options: FormatOptions = NO_OPTI
 
 
 def test_formats_of_one_session_name_those_of_several() -> None:
-    several = {name for name, known in FORMATS.items() if known.holds_several}
+    several = {name for name, known in FORMATS.items() if known.can_hold_several_sessions}
     assert {to for to, _ in READERS} == several
     for name in set(FORMATS) - several:
         with pytest.raises(UsageError, match=f"{name} holds one.*c3d, opensim, mcap, mat, xdf"):
