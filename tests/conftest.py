@@ -1,4 +1,4 @@
-"""What all tests share: one emulated bench, and hypothesis with neither stopwatch nor dice."""
+"""Shared by all tests: a cache of the emulated rig, reproducible examples, and tests in turn."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from hypothesis import settings
 from tests.tokens import SHARED_TOKEN
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    # As of what a shell runs behind: processes of the tests would not hear Ctrl-C, either.
+    # A shell's background jobs ignore SIGINT; processes of the tests must not inherit that.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 TURN = os.environ.get("FOOTTILE_TURN")
-"""A number that every run of continuous integration has to itself."""
+"""Number of the run of continuous integration; None: all tests are run."""
 PARTS = 4
-"""Into so many parts, by file, go tests that are `in_turn`: a run plays one of them."""
+"""Number of parts of the tests marked `in_turn`; a run plays one part."""
 
-# What a builder asserts is explained as in a test.
+# Failed assertions of builders show their values, as those of tests do.
 pytest.register_assert_rewrite("tests.builders")
 
-# Beside other tests on the same cores the time that an example takes says nothing. A run tells of
-# the change that it tests, so its examples are the same each time; chance has a run of its own.
+# Other tests run on the same cores, so no example has a deadline. Examples are the same in each
+# run, so that a failure is due to the change; the profile `chance` draws new ones.
 settings.register_profile("chance", deadline=None)
 settings.register_profile("foottile", deadline=None, derandomize=True)
 settings.load_profile("foottile")
@@ -34,8 +34,7 @@ settings.load_profile("foottile")
 
 @pytest.fixture(scope="session", autouse=True)
 def _user(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Commands, and programs that use `foottile`, have the token that tests share, and leave no
-    record of a server in the home of whoever runs the tests."""
+    """Give commands and clients the shared token, and keep records of servers out of the home."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("FOOTTILE_TOKEN", SHARED_TOKEN)
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
@@ -44,7 +43,7 @@ def _user(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def bench_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A user's cache folder for all tests: to press a tile on the emulated bench takes seconds."""
+    """User's cache folder of all tests: a calibration on the emulated rig takes seconds."""
     given = os.environ.get("FOOTTILE_TEST_CACHE")
     return Path(given) if given else tmp_path_factory.mktemp("cache")
 
@@ -54,8 +53,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def is_of_this_run(item: pytest.Item) -> bool:
-    """Return whether this run plays a test marked `in_turn`. Without a turn it plays all."""
-    return TURN is None or zlib.crc32(item.path.name.encode()) % PARTS == int(TURN) % PARTS
+    """Return whether this run plays a test marked `in_turn`. Without a turn it plays all.
+
+    A run plays a quarter of the files, and of files marked `in_turn(each=True)` a quarter of the
+    tests.
+    """
+    mark = item.get_closest_marker("in_turn")
+    name = item.name if mark is not None and mark.kwargs.get("each") else item.path.name
+    return TURN is None or zlib.crc32(name.encode()) % PARTS == int(TURN) % PARTS
 
 
 def pytest_report_header() -> str | None:

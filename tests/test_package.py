@@ -137,6 +137,7 @@ def test_a_wheel_holds_every_file_of_the_packages_and_the_page_and_no_more(
     }
 
 
+@pytest.mark.in_turn(each=True)
 @pytest.mark.parametrize("source", ["checkout", "sdist", "image"])
 def test_a_wheel_alone_runs_its_command(
     source: str, wheels: dict[str, Path], tmp_path: Path
@@ -217,6 +218,7 @@ def container_commands(folder: Path) -> list[list[str]]:
     ]
 
 
+@pytest.mark.in_turn(each=True)
 def test_containers_run_commands_that_there_are(tmp_path: Path) -> None:
     commands = container_commands(tmp_path)
     assert [words[0] for words in commands] == ["serve", "serve", "--help", "node"]
@@ -230,6 +232,7 @@ def test_containers_run_commands_that_there_are(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.in_turn(each=True)
 def test_an_installed_wheel_and_a_checkout_both_find_the_page(
     wheels: dict[str, Path], tmp_path: Path
 ) -> None:

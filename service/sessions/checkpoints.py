@@ -17,8 +17,9 @@ import numpy as np
 
 from devices.errors import FootTileError, StorageError
 from service.estimation import LIVE_LAG_MS
+from service.sessions.frames import Columns
 from service.sessions.inputs import SessionInputs
-from service.sessions.pipeline import Columns, EstimateOptions, EstimateStream
+from service.sessions.pipeline import EstimateOptions, EstimateStream
 from storage.durable_files import ScratchBlock, ScratchFile
 from storage.schema import Array
 

@@ -51,8 +51,6 @@ STORIES = {
     "full node": ("full_disk_of_node",),
     "away": ("black_hole", "stop_while_away_and_kill_node"),
 }
-IN_EVERY_RUN = ("kills", "power", "flipped bits", "full node", "away", "alone, power")
-"""The others, and kills at every call, are played with `--soak`."""
 STORIES_ALONE = {
     "alone, kills": ("kill_node", "kill_acquisition", "kill_node_parent", "restart_node_twice"),
     "alone, power": ("power_node", "clock_of_node", "slow_fsync"),
@@ -87,13 +85,8 @@ def test_a_seed_is_a_story_and_nobody_is_asked_to_fill_a_disk_who_may_not() -> N
 
 
 @pytest.mark.real_time
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=() if name in IN_EVERY_RUN else pytest.mark.soak)
-        for name in (*STORIES, *STORIES_ALONE)
-    ],
-)
+@pytest.mark.in_turn(each=True)
+@pytest.mark.parametrize("name", [*STORIES, *STORIES_ALONE])
 def test_a_chosen_round_is_good(name: str, tmp_path: Path, journal: Product) -> None:
     if name.startswith("full") and os.geteuid() != 0:
         pytest.skip("to mount a small disk one has to be root")
@@ -210,6 +203,7 @@ def test_a_server_killed_at_syncs_of_its_journal_keeps_what_it_has_promised(stag
 
 
 @pytest.mark.real_time
+@pytest.mark.in_turn(each=True)
 def test_a_server_without_power_at_syncs_of_its_journal_keeps_what_it_has_promised(
     stage: Stage, journal: Product
 ) -> None:
@@ -223,6 +217,7 @@ def test_a_server_without_power_at_syncs_of_its_journal_keeps_what_it_has_promis
 
 
 @pytest.mark.real_time
+@pytest.mark.in_turn(each=True)
 @pytest.mark.parametrize("how", [pytest.param("killed", marks=pytest.mark.soak), "power"])
 def test_a_node_killed_at_syncs_of_its_journal_loses_no_more_than_it_says(
     stage: Stage, journal: Product, how: str

@@ -108,6 +108,7 @@ def _settled(true_n: Floats, force_n: float) -> npt.NDArray[np.intp]:
     return rows[len(rows) // 2 :]
 
 
+@pytest.mark.in_turn(each=True)
 def test_the_command_guides_through_the_weights_and_writes_what_is_accepted(
     run: Run, running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
