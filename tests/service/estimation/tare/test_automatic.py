@@ -177,7 +177,7 @@ def test_a_bare_tile_follows_the_weather_and_prevents_no_tare(weather_counts: fl
     ("counts", "kelvin", "reason"),
     [
         ([0.0, 3.0], 0.0, r"tile T02 reads \+0\.4.*tare by hand"),
-        # 1 K explains 0.34 kPa, half of it is uncertain: 0.5 kPa more are a load.
+        # 1 K explains 0.34 kPa, half is uncertain: 0.5 kPa more are a load.
         ([COUNTS_PER_K + 4.0] * 2, 1.0, "explain 0.3"),
     ],
 )
