@@ -1,4 +1,4 @@
-"""The warm-up compiles everything that a stream will need: not a frame waits for a compiler."""
+"""The warm-up compiles all kernels of a stream: no frame waits for a compiler."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from tests.builders.calibrations import make_tare
 from tests.builders.frames import with_columns
 
 
-def compiled_for() -> dict[str, int]:
-    """Of every compiled function, for how many kinds of arguments it is."""
+def count_signatures() -> dict[str, int]:
+    """Count the compiled signatures of every kernel."""
     found = {}
     for module in pkgutil.walk_packages(service.estimation.__path__, "service.estimation."):
         for name, value in vars(importlib.import_module(module.name)).items():
@@ -44,7 +44,7 @@ def test_nothing_is_compiled_after_the_warm_up(
 
     monkeypatch.setattr(compilation, "make_plan", noted)
     compilation.compile_models()
-    before = compiled_for()
+    before = count_signatures()
     assert before["service.estimation.estimate._step"] == 1
     assert before["service.estimation.estimate._finish"] == 1
     info, calibration, _ = made[0]
@@ -54,7 +54,7 @@ def test_nothing_is_compiled_after_the_warm_up(
     plan = make_plan(info, calibration, tare, models=models, lag_ms=10.0)
     estimator = Estimator(plan)
     first = compilation._frames()
-    for number in range(6):  # as they come over the wire: views of what was received, read-only
+    for number in range(6):  # as from the wire: read-only views of the message
         later = with_columns(
             first,
             seq=first.seq + np.uint64(number * len(first)),
@@ -63,4 +63,4 @@ def test_nothing_is_compiled_after_the_warm_up(
         schema = wire_schema(info)
         estimator.process_frames(decode_message(bytes(encode_frames(later, schema)), schema))
     estimator.finish()
-    assert compiled_for() == before
+    assert count_signatures() == before

@@ -1,4 +1,4 @@
-"""Effects of a dome: intervals, and values that could not be undone are refused."""
+"""Effects of a dome: intervals, limits and their file."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ def temperature(*, kpa_per_k: float = 0.3, lag_s: float = 3.0) -> TemperatureEff
     return TemperatureEffect(kpa_per_k=p(kpa_per_k), lag_s=p(lag_s), wall_per_kpa=p(0.002))
 
 
-def test_nineteen_of_twenty_lie_within_two_sigma() -> None:
+def test_the_95_percent_interval_is_1_96_sigma() -> None:
     assert Parameter(value=5.0, sigma=0.5).interval_95 == pytest.approx((4.02, 5.98))
 
 
-def test_the_walls_give_is_that_of_the_soak_or_of_the_material() -> None:
+def test_the_wall_compliance_is_of_the_soak_or_of_the_material() -> None:
     assert Effects(temperature=temperature()).wall_compliance_or_default_per_kpa == 0.002
     assert Effects().wall_compliance_or_default_per_kpa == WALL_PER_KPA == 0.00124
 
@@ -79,7 +79,7 @@ def test_the_walls_give_is_that_of_the_soak_or_of_the_material() -> None:
         lambda: Parameter(value=1.0, sigma=-1.0),
     ],
 )
-def test_what_could_not_be_undone_is_refused(make: Callable[[], Any]) -> None:
+def test_an_effect_that_cannot_be_compensated_is_refused(make: Callable[[], Any]) -> None:
     with pytest.raises(ValidationError):
         make()
 
@@ -94,17 +94,13 @@ def test_the_limits_themselves_are_accepted() -> None:
 
 
 def test_effects_survive_a_calibration_file_to_the_bit() -> None:
-    effects = make_effects(refused={"ambient": "for a test"})
-    calibration = make_calibration(newton_tile("T01", effects=effects))
-    again = Calibration.from_json_verifying_id(calibration.to_json(), where="a file")
-    assert again.get_tile_or_wildcard("T01").effects == effects
-    assert again.id == calibration.id
-
-
-def test_a_branch_that_flows_survives_a_calibration_file() -> None:
     flow = FlowEffect(part=p(0.08), stress_n=p(0.2), power=p(4.0))
     loop = HysteresisEffect(part=(p(0.1), p(0.1), p(0.1)), flow=flow)
-    calibration = make_calibration(newton_tile("T01", effects=make_effects(hysteresis=loop)))
-    again = Calibration.from_json_verifying_id(calibration.to_json(), where="a file")
-    assert again.get_tile_or_wildcard("T01").effects.hysteresis == loop
-    assert again.id == calibration.id
+    for effects in (
+        make_effects(refused={"ambient": "for a test"}),
+        make_effects(hysteresis=loop),
+    ):
+        calibration = make_calibration(newton_tile("T01", effects=effects))
+        again = Calibration.from_json_verifying_id(calibration.to_json(), where="a file")
+        assert again.get_tile_or_wildcard("T01").effects == effects
+        assert again.id == calibration.id

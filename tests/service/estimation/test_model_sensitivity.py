@@ -1,4 +1,4 @@
-"""What a recording asks for: models that are offered and not named, with their newtons."""
+"""Effects of models that a calibration offers and a recording omits, in newtons."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ def calibration(**effects: Any) -> Any:
     return make_calibration(*(newton_tile(serial, effects=known) for serial in INFO.serials))
 
 
-def hops(top_n: float = 40.0, rows: int = 600) -> FrameBatch:
-    """Half sines of 0.1 s, a frame each 2 ms."""
+def make_hops(top_n: float = 40.0, rows: int = 600) -> FrameBatch:
+    """Make half sines of 0.1 s, a frame each 2 ms."""
     at = np.arange(rows) % 100
     n = np.where(at < 50, top_n * np.sin(np.pi * np.minimum(at, 50) / 50), 0.0)
     return loaded_frames(np.repeat(n[:, None], 2, axis=1))
 
 
-def asked(models: tuple[str, ...], *batches: FrameBatch, **effects: Any) -> dict[str, float]:
-    asking = OmittedModelEffect(INFO, calibration(**effects), models)
+def find_omitted(models: tuple[str, ...], *batches: FrameBatch, **effects: Any) -> dict[str, float]:
+    omitted = OmittedModelEffect(INFO, calibration(**effects), models)
     for frames in batches:
-        asking.add_frames(TARE, frames, frames.pressure_raw[:, 0] < 498)
-    return asking.compute_notable_mean_grf_effects_by_model_n()
+        omitted.add_frames(TARE, frames, frames.pressure_raw[:, 0] < 498)
+    return omitted.compute_notable_mean_grf_effects_by_model_n()
 
 
-def test_it_expects_what_the_model_would_change_under_load() -> None:
-    frames = hops()
+def test_an_omitted_model_has_its_mean_effect_under_load() -> None:
+    frames = make_hops()
     known = calibration()
     grf_n = {
         name: estimate(make_plan(INFO, known, TARE, models=models), frames).grf_n
@@ -54,73 +54,74 @@ def test_it_expects_what_the_model_would_change_under_load() -> None:
         }.items()
     }
     loaded = frames.pressure_raw[:, 0] < 498
-    found = asked(BARE, frames)
+    found = find_omitted(BARE, frames)
     for name in ("gas", "rubber"):
         expected_n = np.abs(grf_n[name] - grf_n["every"])[loaded].mean()
         assert found[name] == pytest.approx(expected_n, abs=1e-8)
         assert expected_n > 1.0
 
 
-def test_the_greatest_comes_first() -> None:
-    newtons = list(asked(BARE, hops()).values())
+def test_the_greatest_effect_is_first() -> None:
+    newtons = list(find_omitted(BARE, make_hops()).values())
     assert len(newtons) == 3
     assert newtons == sorted(newtons, reverse=True)
 
 
-def test_who_names_all_that_is_offered_is_asked_for_nothing() -> None:
-    assert asked(WHOLE, hops()) == {}
+NO_EFFECTS = dict.fromkeys(("gas", "rubber", "hysteresis", "temperature"))
 
 
-def test_a_model_that_is_named_is_not_asked_for() -> None:
-    assert set(asked(("unwrap", "gas", "static", "rubber"), hops())) == {"hysteresis"}
+@pytest.mark.parametrize(
+    ("models", "top_n", "effects", "omitted"),
+    [
+        (BARE, 40.0, {}, {"gas", "rubber", "hysteresis"}),
+        (WHOLE, 40.0, {}, set()),
+        (("unwrap", "gas", "static", "rubber"), 40.0, {}, {"hysteresis"}),
+        (BARE, 40.0, {"rubber": None}, {"gas", "hysteresis"}),
+        (BARE, 40.0, NO_EFFECTS, set()),
+        (BARE, 0.4, {}, set()),
+        (BARE, 0.0, {}, set()),
+    ],
+    ids=["none named", "all named", "two named", "no rubber", "no effects", "0.4 N", "0 N"],
+)
+def test_only_offered_models_with_an_effect_are_omitted(
+    models: tuple[str, ...], top_n: float, effects: dict[str, Any], omitted: set[str]
+) -> None:
+    assert set(find_omitted(models, make_hops(top_n), **effects)) == omitted
 
 
-def test_what_the_calibration_does_not_offer_is_not_asked_for() -> None:
-    assert "rubber" not in asked(BARE, hops(), rubber=None)
-    assert asked(BARE, hops(), gas=None, rubber=None, hysteresis=None, temperature=None) == {}
-
-
-def test_a_foot_that_bears_next_to_nothing_asks_for_nothing() -> None:
-    assert asked(BARE, hops(top_n=0.4)) == {}
-    assert asked(BARE, hops(top_n=0.0)) == {}
-
-
-def test_a_slow_load_does_not_ask_for_gas() -> None:
+def test_a_slow_load_needs_no_gas() -> None:
     n = 40.0 * np.sin(np.pi * np.arange(5000) / 5000)  # ten seconds
-    found = asked(BARE, loaded_frames(np.repeat(n[:, None], 2, axis=1)))
+    found = find_omitted(BARE, loaded_frames(np.repeat(n[:, None], 2, axis=1)))
     assert "gas" not in found
     assert {"rubber", "hysteresis"} <= set(found)
 
 
-@pytest.mark.parametrize(("counts", "asks"), [(0, False), (-11, True)])
-def test_chips_that_have_warmed_by_two_kelvin_ask_for_temperature(counts: int, asks: bool) -> None:
-    frames = hops(rows=6000)
+@pytest.mark.parametrize(("counts", "is_needed"), [(0, False), (-11, True)])
+def test_chips_warmer_by_two_kelvin_need_temperature(counts: int, is_needed: bool) -> None:
+    frames = make_hops(rows=6000)
     warmed = with_columns(frames, temperature_raw=480 + counts)
-    found = asked(("unwrap", "gas", "static", "hysteresis", "rubber"), warmed)
-    assert ("temperature" in found) is asks
+    found = find_omitted(("unwrap", "gas", "static", "hysteresis", "rubber"), warmed)
+    assert ("temperature" in found) is is_needed
     # 0.3 kPa/K, 2.06 K, two tiles of 7.85 N/kPa; less at the beginning, as the gas is behind.
-    assert not asks or EFFECT_MIN_N < found["temperature"] < 15.0
+    assert not is_needed or EFFECT_MIN_N < found["temperature"] < 15.0
 
 
-def test_another_tare_begins_anew_without_the_warmth_of_before() -> None:
-    frames = with_columns(hops(), temperature_raw=469)
-    asking = OmittedModelEffect(
-        INFO, calibration(), ("unwrap", "gas", "static", "hysteresis", "rubber")
-    )
-    for tare in (
-        make_tare(2, temperature_raw_counts=469.0),
-        make_tare(2, temperature_raw_counts=469.0),
-    ):
-        asking.add_frames(tare, frames, frames.pressure_raw[:, 0] < 498)
-    assert asking.compute_notable_mean_grf_effects_by_model_n() == {}
+def test_another_tare_starts_without_the_warmth_before_it() -> None:
+    frames = with_columns(make_hops(), temperature_raw=469)
+    models = ("unwrap", "gas", "static", "hysteresis", "rubber")
+    omitted = OmittedModelEffect(INFO, calibration(), models)
+    for _ in range(2):
+        tare = make_tare(2, temperature_raw_counts=469.0)
+        omitted.add_frames(tare, frames, frames.pressure_raw[:, 0] < 498)
+    assert omitted.compute_notable_mean_grf_effects_by_model_n() == {}
 
 
-def test_a_node_that_was_switched_on_again_begins_anew() -> None:
-    frames = hops()
-    assert asked(BARE, frames, frames) == pytest.approx(asked(BARE, frames), rel=1e-9)
+def test_a_restarted_node_starts_anew() -> None:
+    frames = make_hops()
+    assert find_omitted(BARE, frames, frames) == pytest.approx(find_omitted(BARE, frames), rel=1e-9)
 
 
 @settings(max_examples=10)
 @given(cuts=st.sets(st.integers(1, 599), max_size=4))
-def test_cut_anywhere_it_asks_for_the_same_newtons(cuts: set[int]) -> None:
-    assert asked(BARE, *cut_up(hops(), cuts)) == asked(BARE, hops())
+def test_any_batches_give_the_same_effects(cuts: set[int]) -> None:
+    assert find_omitted(BARE, *cut_up(make_hops(), cuts)) == find_omitted(BARE, make_hops())

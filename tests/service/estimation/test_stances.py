@@ -1,14 +1,15 @@
-"""Stances: where a contact begins and ends, its peak and its impulse."""
+"""Stances: their edges, peak, impulse and COP range."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.flags import EstimateFlag
@@ -22,7 +23,7 @@ SATURATED = int(EstimateFlag.SATURATED)
 Columns = dict[str, npt.NDArray[Any]]
 
 
-def recording(
+def make_recording(
     grf_n: list[float],
     contact: list[int],
     *,
@@ -32,7 +33,7 @@ def recording(
     estimate_flags: list[int] | None = None,
     cop_x_m: list[float] | None = None,
 ) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.int64], Columns]:
-    """Frames 2 ms apart, numbered from 100, unless said otherwise; sigma is a tenth of the GRF."""
+    """Make frames 2 ms apart, numbered from 100; sigma is a tenth of the GRF."""
     n = len(grf_n)
     numbers = np.array(seq if seq is not None else range(100, 100 + n), dtype=np.uint64)
     t_ns = (numbers.astype(np.int64) - 100) * STEP_NS
@@ -53,7 +54,7 @@ def recording(
 
 def test_a_stance_has_peak_impulse_and_travel_of_its_frames() -> None:
     (one,) = compute_stances(
-        *recording(
+        *make_recording(
             [0, 1, 5, 3, 1, 0],
             [0, 1, 1, 1, 1, 0],
             cop_x_m=[NAN, -0.01, 0.0, 0.02, 0.015, NAN],
@@ -73,9 +74,9 @@ def test_a_stance_has_peak_impulse_and_travel_of_its_frames() -> None:
     assert one.is_whole
 
 
-def test_a_doubtful_frame_may_have_gone_furthest() -> None:
+def test_an_uncertain_cop_widens_the_range() -> None:
     x_m = [NAN, 0, 10, 9, NAN]
-    numbers, t_ns, columns = recording([0, 5, 5, 5, 0], [0, 1, 1, 1, 0], cop_x_m=x_m)
+    numbers, t_ns, columns = make_recording([0, 5, 5, 5, 0], [0, 1, 1, 1, 0], cop_x_m=x_m)
     columns["cop_sigma_x_m"] = np.array([NAN, 0.0, 0.5, 2.0, NAN])
     (one,) = compute_stances(numbers, t_ns, columns)
     assert one.cop_x_range_m == 10.0
@@ -85,7 +86,7 @@ def test_a_doubtful_frame_may_have_gone_furthest() -> None:
 
 def test_the_cop_range_is_a_lower_bound_where_a_fifth_of_the_frames_has_no_cop() -> None:
     def sigma_m(x_m: list[float]) -> float:
-        (one,) = compute_stances(*recording([0, *[5] * 10, 0], [0, *[1] * 10, 0], cop_x_m=x_m))
+        (one,) = compute_stances(*make_recording([0, *[5] * 10, 0], [0, *[1] * 10, 0], cop_x_m=x_m))
         assert one.cop_x_range_m == pytest.approx(0.009)
         return one.cop_x_range_sigma_m
 
@@ -95,8 +96,10 @@ def test_the_cop_range_is_a_lower_bound_where_a_fifth_of_the_frames_has_no_cop()
     assert np.isnan(sigma_m([*x_m[:4], NAN, NAN, NAN, *x_m[7:]]))
 
 
-def test_the_trapezoids_are_as_wide_as_the_frames_are_apart() -> None:
-    (one,) = compute_stances(*recording([0, 2, 2, 4, 0], [0, 1, 1, 1, 0], t_ms=[0, 2, 12, 14, 16]))
+def test_an_impulse_has_trapezoids_between_frames() -> None:
+    (one,) = compute_stances(
+        *make_recording([0, 2, 2, 4, 0], [0, 1, 1, 1, 0], t_ms=[0, 2, 12, 14, 16])
+    )
     assert one.impulse_n_s == pytest.approx(2 * 0.010 + 3 * 0.002, rel=1e-15)
     assert one.is_whole
 
@@ -104,9 +107,9 @@ def test_the_trapezoids_are_as_wide_as_the_frames_are_apart() -> None:
 RAMP_N = [0.0, *(10.0 * k for k in range(1, 11)), *(10.0 * k for k in range(10, 0, -1)), 0.0]
 
 
-def test_a_duration_is_as_uncertain_as_its_two_gaps_and_the_force_at_its_edges() -> None:
+def test_a_duration_is_uncertain_by_its_gaps_and_the_force_at_its_edges() -> None:
     t_ms = [0.0, *(6.0 + 2 * k for k in range(20)), 48.0]
-    (one,) = compute_stances(*recording(RAMP_N, [0, *[1] * 20, 0], t_ms=t_ms))
+    (one,) = compute_stances(*make_recording(RAMP_N, [0, *[1] * 20, 0], t_ms=t_ms))
     # 6 ms before it and 4 ms behind it, and 1 N of sigma at 10 N. From the frame beside it to 10 ms
     # within, 60 N come in 16 ms and go in 14 ms.
     missing_s, spread_s = 0.5 * (6e-3 + 4e-3), np.hypot(6e-3, 4e-3) / np.sqrt(12.0)
@@ -119,50 +122,58 @@ def test_a_duration_is_as_uncertain_as_its_two_gaps_and_the_force_at_its_edges()
     "contact",
     [[1, 1, *[1] * 19, 0], [CONTACT_UNKNOWN, *[1] * 20, 0], [0, *[1] * 20, CONTACT_UNKNOWN]],
 )
-def test_of_an_edge_that_was_not_seen_no_uncertainty_is_stated(contact: list[int]) -> None:
-    (one,) = compute_stances(*recording(RAMP_N, contact))
+def test_a_stance_with_an_unseen_edge_has_no_uncertainty_of_its_duration(
+    contact: list[int],
+) -> None:
+    (one,) = compute_stances(*make_recording(RAMP_N, contact))
     assert np.isnan(one.duration_sigma_s)
 
 
-def test_of_a_force_that_rises_too_slowly_no_uncertainty_is_stated() -> None:
+def test_a_slowly_rising_force_has_no_uncertainty_of_its_duration() -> None:
     slowly_n = [9.0, *(10.0 + 0.1 * k for k in range(20)), *RAMP_N[11:]]
-    (one,) = compute_stances(*recording(slowly_n, [0, *[1] * (len(slowly_n) - 2), 0]))
+    (one,) = compute_stances(*make_recording(slowly_n, [0, *[1] * (len(slowly_n) - 2), 0]))
     assert np.isnan(one.duration_sigma_s)
 
 
-def test_errors_of_the_force_that_are_the_same_in_all_frames_add_up_in_the_impulse() -> None:
-    (one,) = compute_stances(*recording(RAMP_N, [0, *[1] * 20, 0]))
+def test_an_impulse_is_uncertain_by_shared_errors_and_its_edges() -> None:
+    (one,) = compute_stances(*make_recording(RAMP_N, [0, *[1] * 20, 0]))
     edges_n_s = 0.5 * (10.0 + 10.0) * 2e-3  # 10 N first and last, 2 ms before and behind
     assert one.impulse_sigma_n_s == pytest.approx(np.hypot(one.impulse_n_s / 10, edges_n_s))
-    (cut,) = compute_stances(*recording(RAMP_N[1:-1], [1] * 20))
-    assert cut.impulse_sigma_n_s == pytest.approx(cut.impulse_n_s / 10)  # of what is there
-    gone = compute_stances(*recording(RAMP_N, [0, *[1] * 20, 0], seq=[*range(15), *range(16, 23)]))
+    (cut,) = compute_stances(*make_recording(RAMP_N[1:-1], [1] * 20))
+    assert cut.impulse_sigma_n_s == pytest.approx(cut.impulse_n_s / 10)  # of the known frames
+    gone = compute_stances(
+        *make_recording(RAMP_N, [0, *[1] * 20, 0], seq=[*range(15), *range(16, 23)])
+    )
     assert np.isnan(gone[0].impulse_sigma_n_s)
 
 
-def test_stances_at_the_ends_of_a_recording_say_that_they_are_cut() -> None:
-    first, last = compute_stances(*recording([4, 4, 0, 4, 4], [1, 1, 0, 1, 1]))
+def test_stances_at_the_ends_of_a_recording_are_not_whole() -> None:
+    first, last = compute_stances(*make_recording([4, 4, 0, 4, 4], [1, 1, 0, 1, 1]))
     assert (first.number, first.begun, first.ended, first.is_whole) == (1, False, True, False)
     assert (last.number, last.begun, last.ended, last.is_whole) == (2, True, False, False)
 
 
-def test_no_line_is_drawn_across_frames_without_a_force() -> None:
-    contact = [0, 1, CONTACT_UNKNOWN, CONTACT_UNKNOWN, 1, 0]
-    (one,) = compute_stances(
-        *recording([0, 2, NAN, NAN, 8, 0], contact, estimate_flags=[0, 0, 32, 32, 0, 0])
-    )
-    assert (one.frames, one.unknown_frames, one.missing_frames) == (4, 2, 0)
-    assert np.isnan(one.impulse_n_s)
-    assert one.peak_grf_n == 8.0
-    assert one.estimate_flags == 32
-    assert (one.begun, one.ended, one.is_whole) == (True, True, False)
-
-
-def test_frames_that_are_missing_are_counted_and_leave_no_impulse() -> None:
-    frames = recording([0, 2, 3, 8, 0], [0, 1, 1, 1, 0], seq=[100, 101, 102, 106, 107])
+@pytest.mark.parametrize(
+    ("grf_n", "contact", "seq", "unknown", "missing"),
+    [
+        ([0, 2, NAN, NAN, 8, 0], [0, 1, CONTACT_UNKNOWN, CONTACT_UNKNOWN, 1, 0], range(6), 2, 0),
+        ([0, 2, 3, 8, 0], [0, 1, 1, 1, 0], [0, 1, 2, 6, 7], 0, 3),
+    ],
+    ids=["frames without a force", "missing frames"],
+)
+def test_a_stance_with_a_gap_has_a_peak_and_no_impulse(
+    grf_n: list[float], contact: list[int], seq: Sequence[int], unknown: int, missing: int
+) -> None:
+    flags = [32 if np.isnan(force) else 0 for force in grf_n]
+    frames = make_recording(grf_n, contact, seq=list(seq), estimate_flags=flags)
     (one,) = compute_stances(*frames)
-    assert (one.frames, one.missing_frames, one.unknown_frames) == (3, 3, 0)
+    assert (one.frames, one.unknown_frames, one.missing_frames) == (
+        sum(c > 0 for c in contact),
+        unknown,
+        missing,
+    )
     assert np.isnan(one.impulse_n_s)
+    assert (one.peak_grf_n, one.estimate_flags) == (8.0, max(flags))
     assert (one.begun, one.ended, one.is_whole) == (True, True, False)
 
 
@@ -175,16 +186,16 @@ def test_frames_that_are_missing_are_counted_and_leave_no_impulse() -> None:
         ([0, 1, 1, CONTACT_UNKNOWN], [100, 101, 102, 103], True, False),
     ],
 )
-def test_an_edge_that_was_not_seen_is_no_beginning_and_no_end(
+def test_an_edge_beside_missing_frames_is_unseen(
     contact: list[int], seq: list[int], begun: bool, ended: bool
 ) -> None:
-    (one,) = compute_stances(*recording([0, 5, 5, 0], contact, seq=seq))
+    (one,) = compute_stances(*make_recording([0, 5, 5, 0], contact, seq=seq))
     assert (one.frames, one.missing_frames) == (2, 0)
     assert (one.begun, one.ended, one.is_whole) == (begun, ended, False)
 
 
 def test_frames_of_unknown_contact_at_an_edge_belong_to_no_stance() -> None:
-    frames = recording(
+    frames = make_recording(
         [NAN, 5, 5, NAN, 0],
         [CONTACT_UNKNOWN, 1, 1, CONTACT_UNKNOWN, 0],
         estimate_flags=[32, 0, 0, 32, 0],
@@ -196,12 +207,10 @@ def test_frames_of_unknown_contact_at_an_edge_belong_to_no_stance() -> None:
 
 
 @pytest.mark.parametrize(("t_ms", "expected"), [(54.0, 1), (54.001, 2)])
-def test_a_foot_that_was_not_seen_for_longer_than_50_ms_may_have_been_lifted(
-    t_ms: float, expected: int
-) -> None:
-    # Known at 4 ms and at t_ms; what is in between, or missing, does not tell.
+def test_a_foot_unseen_for_more_than_50_ms_may_have_been_lifted(t_ms: float, expected: int) -> None:
+    # Known at 4 ms and at t_ms.
     contact, grf_n = [0, 1, 1, CONTACT_UNKNOWN, 1, 0], [0, 5, 5, NAN, 7, 0]
-    found = compute_stances(*recording(grf_n, contact, t_ms=[0, 2, 4, 6, t_ms, t_ms + 2]))
+    found = compute_stances(*make_recording(grf_n, contact, t_ms=[0, 2, 4, 6, t_ms, t_ms + 2]))
     assert len(found) == expected
     assert [s.number for s in found] == list(range(1, expected + 1))
     assert found[0].begun
@@ -209,9 +218,9 @@ def test_a_foot_that_was_not_seen_for_longer_than_50_ms_may_have_been_lifted(
     assert not any(s.is_whole for s in found)
 
 
-def test_a_stance_does_not_go_on_across_a_restart_of_the_node() -> None:
+def test_a_restart_of_the_node_ends_a_stance() -> None:
     before, after = compute_stances(
-        *recording(
+        *make_recording(
             [0, 5, 5, 6, 6, 0],
             [0, 1, 1, 1, 1, 0],
             seq=[7, 8, 9, 10, 11, 12],
@@ -222,18 +231,16 @@ def test_a_stance_does_not_go_on_across_a_restart_of_the_node() -> None:
     assert (after.part, after.begun, after.ended) == (1, False, True)
 
 
-def test_a_stance_of_which_no_force_is_known_has_no_peak() -> None:
-    (one,) = compute_stances(*recording([0, NAN, 0], [0, 1, 0]))
+def test_a_stance_without_a_known_force_has_no_peak() -> None:
+    (one,) = compute_stances(*make_recording([0, NAN, 0], [0, 1, 0]))
     assert np.isnan([one.peak_grf_n, one.peak_sigma_n, one.impulse_n_s, one.cop_x_range_m]).all()
     assert (one.peak_t_ns, one.is_whole) == (None, False)
 
 
-def test_a_stance_in_which_a_tile_was_saturated_has_neither_peak_nor_impulse_and_the_next_has() -> (
-    None
-):
+def test_a_saturated_stance_has_neither_peak_nor_impulse() -> None:
     grf_n, contact = [0, 3, NAN, 4, 0, 5, 0], [0, 1, 1, 1, 0, 1, 0]
     hidden, whole = compute_stances(
-        *recording(grf_n, contact, estimate_flags=[0, 0, SATURATED, 0, 0, 0, 0])
+        *make_recording(grf_n, contact, estimate_flags=[0, 0, SATURATED, 0, 0, 0, 0])
     )
     assert np.isnan([hidden.peak_grf_n, hidden.impulse_n_s]).all()
     assert (hidden.peak_t_ns, hidden.unknown_frames) == (None, 1)
@@ -241,22 +248,22 @@ def test_a_stance_in_which_a_tile_was_saturated_has_neither_peak_nor_impulse_and
 
 
 def test_a_foot_in_the_air_has_no_stance() -> None:
-    assert compute_stances(*recording([0.0] * 5, [0] * 5)) == []
-    assert compute_stances(*recording([], [])) == []
-    assert compute_stances(*recording([NAN] * 3, [CONTACT_UNKNOWN] * 3)) == []
+    assert compute_stances(*make_recording([0.0] * 5, [0] * 5)) == []
+    assert compute_stances(*make_recording([], [])) == []
+    assert compute_stances(*make_recording([NAN] * 3, [CONTACT_UNKNOWN] * 3)) == []
 
 
-def test_a_stance_is_told_as_soon_as_it_is_over() -> None:
-    seq, t_ns, columns = recording([0, 4, 0, 0], [0, 1, 0, 0])
-    gathered = StanceDetector()
-    fed = [
-        gathered.add_frames(
+def test_a_stance_is_reported_as_soon_as_it_is_over() -> None:
+    seq, t_ns, columns = make_recording([0, 4, 0, 0], [0, 1, 0, 0])
+    detector = StanceDetector()
+    found = [
+        detector.add_frames(
             seq[i : i + 1], t_ns[i : i + 1], {k: v[i : i + 1] for k, v in columns.items()}
         )
         for i in range(4)
     ]
-    assert [len(over) for over in fed] == [0, 0, 1, 0]
-    assert gathered.finish() == []
+    assert [len(over) for over in found] == [0, 0, 1, 0]
+    assert detector.finish() == []
 
 
 @st.composite
@@ -271,26 +278,28 @@ def recordings(draw: st.DrawFn) -> tuple[Any, ...]:
     cop_x_m = [float(x) for x in np.where(rng.random(n) < 0.3, NAN, rng.normal(0, 0.02, n))]
     seq = [100 + int(s) for s in np.cumsum(steps)]
     parts = [int(p) for p in part]
-    return recording(
+    return make_recording(
         forces, contact, seq=seq, part=parts, estimate_flags=estimate_flags, cop_x_m=cop_x_m
     )
 
 
+@settings(max_examples=50, deadline=None)
 @given(frames=recordings(), cuts=st.sets(st.integers(0, 40), max_size=6))
 def test_any_batches_give_the_same_stances(frames: Any, cuts: set[int]) -> None:
     seq, t_ns, columns = frames
-    gathered, found = StanceDetector(), list[Stance]()
+    detector, found = StanceDetector(), list[Stance]()
     for rows in np.split(np.arange(len(seq)), sorted(c for c in cuts if c <= len(seq))):
-        found += gathered.add_frames(
+        found += detector.add_frames(
             seq[rows], t_ns[rows], {k: v[rows] for k, v in columns.items()}
         )
-    found += gathered.finish()
+    found += detector.finish()
     # By its digits: NaN is not equal to itself.
     assert repr(found) == repr(compute_stances(seq, t_ns, columns))
 
 
+@settings(max_examples=50, deadline=None)
 @given(frames=recordings())
-def test_stances_do_not_overlap_and_hold_every_frame_of_contact_once(frames: Any) -> None:
+def test_every_frame_of_contact_is_in_one_stance(frames: Any) -> None:
     seq, t_ns, columns = frames
     found = compute_stances(seq, t_ns, columns)
     assert [s.number for s in found] == list(range(1, len(found) + 1))

@@ -1,6 +1,6 @@
-"""The full ladder at fifty digits, all the way from counts to forces, with what is uncertain.
+"""The full ladder at fifty digits, from counts to forces with their uncertainty.
 
-Windows are chosen by this reference itself. Three domes and a bare tile.
+This reference chooses windows itself. Three domes and a bare tile.
 """
 
 from __future__ import annotations
@@ -21,53 +21,53 @@ from tests.service.estimation.exact.digits import Exact
 DOMES = range(3)
 
 
-def sampled_ns(frames: FrameBatch) -> list[list[int]]:
-    """Instants of every tile's readings."""
+def list_sampled_ns(frames: FrameBatch) -> list[list[int]]:
+    """List the instants of every tile's readings."""
     return [
         [int(t) + 1000 * int(o) for t, o in zip(frames.t_mono_ns, offsets, strict=True)]
         for offsets in frames.sample_offset_us.T
     ]
 
 
-def effects_of(plan: EstimationPlan) -> list[Any]:
-    """Of every dome."""
+def list_effects(plan: EstimationPlan) -> list[Any]:
+    """List the effects of every dome."""
     return [plan.calibration.get_tile_or_wildcard(plan.info.tiles[i].serial).effects for i in DOMES]
 
 
-def felt_by(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
-    """The lower part: gauge pressures of all tiles, and what every dome felt, over frames."""
+def compute_sample_stage(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
+    """Compute gauge pressures of all tiles, and apparent forces of every dome, over frames."""
     n = len(frames)
     tare = plan.tare
     base = [mpf(float(p)) for p in tare.baseline_kpa]
     noise = [mpf(float(p)) for p in tare.noise_kpa]
-    t_ns, frame_ns = sampled_ns(frames), [int(t) for t in frames.t_mono_ns]
+    t_ns, frame_ns = list_sampled_ns(frames), [int(t) for t in frames.t_mono_ns]
     temperature_raw, kpa = [], []
     for i in range(4):
         counts = [None if c == NOT_READ else int(c) for c in frames.temperature_raw[:, i]]
-        held = [next(c for c in reversed(counts[: k + 1]) if c is not None) for k in range(n)]
+        last = [next(c for c in reversed(counts[: k + 1]) if c is not None) for k in range(n)]
         words = plan.info.tiles[i].coefficient_words
-        temperature_raw.append(held)
+        temperature_raw.append(last)
         kpa.append(
             [
                 None if status else sample_stage.pressure_kpa(words, int(p), c)
                 for p, c, status in zip(
-                    frames.pressure_raw[:, i], held, frames.tile_flags[:, i], strict=True
+                    frames.pressure_raw[:, i], last, frames.tile_flags[:, i], strict=True
                 )
             ]
         )
     for i in range(4):
         kpa[i] = [
-            _without_spike(kpa[i], k, run, mpf(OUTLIER_SIGMAS) * mp.sqrt(mpf(1.5)) * noise[i])
+            _replace_spike(kpa[i], k, run, mpf(OUTLIER_SIGMAS) * mp.sqrt(mpf(1.5)) * noise[i])
             for k in range(n)
         ]
     gauge: list[list[Exact]] = [
         [None if p is None else p - base[i] for p in kpa[i]] for i in range(4)
     ]
     around = sample_stage.smoothed(gauge[3], frame_ns)
-    effects = effects_of(plan)
+    effects = list_effects(plan)
     walls = [e.temperature.wall_per_kpa for e in effects]
     doubt = max(mpf(w.sigma) / mpf(w.value) for w in walls)
-    felt = []
+    domes = []
     for i in DOMES:
         warm = effects[i].temperature
         counts = [mpf(c) for c in temperature_raw[i]]
@@ -94,12 +94,12 @@ def felt_by(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
         gauge[i] = [None if p is None else p - base[i] for p in dry]
         hot = effects[i].gas
         entry = plan.calibration.get_tile_or_wildcard(plan.info.tiles[i].serial)
-        # What was read beyond the chip's end is a guess; the least and the most may have been.
+        # A reading beyond the chip's end is a guess between the least and the most.
         high = mpf(entry.range_kpa[1])
         end = max(mpf(115), base[i] + high)
         hidden = [p is not None and p > end for p in kpa[i]]
         heats = mpf(hot.gamma.value), mpf(hot.tau_s.value), wall, base[i]
-        end_n, end_slope, _ = _static(entry, high)
+        end_n, end_slope, _ = _compute_settled_force(entry, high)
         most_n = 2 * (end_n + end_slope * (end - base[i] - high))
         most_hot, end_hot = (
             base[i] * (1 + gauge / base[i]) ** mpf(hot.gamma.value)
@@ -108,7 +108,7 @@ def felt_by(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
         least = [dry[k] - (kpa[i][k] - end) if hidden[k] else None for k in range(n)]
         taken = [min(p, most_hot) if h else p for p, h in zip(dry, hidden, strict=True)]
         other = [
-            _farthest(p, low, most_hot) if low is not None else p
+            _select_farthest(p, low, most_hot) if low is not None else p
             for p, low in zip(taken, least, strict=True)
         ]
         guess = sample_stage.gas(taken, t_ns[i], *heats)
@@ -133,45 +133,47 @@ def felt_by(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
                 beyond.append(False)
                 own.append(None)
                 continue
-            force, slope, fit = _static(entry, p - base[i])
+            force, slope, fit = _compute_settled_force(entry, p - base[i])
             apparent.append(force)
             single.append(abs(slope) * noise[i])
             beyond.append(p - base[i] > high or hidden[k])
             if beyond[k]:
                 above = max(guess[k] - base[i] - high, mpf(0))
-                guess_n[k] = min(_static(entry, guess[k] - base[i])[0] + end_slope * above, most_n)
+                guess_n[k] = min(
+                    _compute_settled_force(entry, guess[k] - base[i])[0] + end_slope * above, most_n
+                )
             heat_n[k] = slope * mpf(hot.misfit) * (guess[k] - dry[k])
             unseen_heat_n[k] = 0 if hidden[k] else slope * (elsewise[k] - guess[k]) / mp.sqrt(3)
             own.append(slope**2 * variance[k] + fit)
-        felt.append(
+        domes.append(
             SimpleNamespace(
                 apparent=apparent, single=single, beyond=beyond, own=own, heat_n=heat_n,
                 unseen_heat_n=unseen_heat_n, guess_n=guess_n, most_n=most_n, end_n=end_n,
             )
         )  # fmt: skip
-    return gauge, felt
+    return gauge, domes
 
 
-def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
-    """Everything at fifty digits: lists over tiles of lists over frames."""
-    n, effects = len(frames), effects_of(plan)
-    t_ns, frame_ns = sampled_ns(frames), [int(t) for t in frames.t_mono_ns]
-    gauge, felt = felt_by(plan, frames, run)
+def compute_chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
+    """Compute the full ladder: lists over tiles of lists over frames."""
+    n, effects = len(frames), list_effects(plan)
+    t_ns, frame_ns = list_sampled_ns(frames), [int(t) for t in frames.t_mono_ns]
+    gauge, domes = compute_sample_stage(plan, frames, run)
     forces, stated, bounds, errors = [], [], [], []
     bends: list[list[Exact]] = []
     of_bends: list[list[Exact]] = []
     usable = [
-        [None if b else f for f, b in zip(of.apparent, of.beyond, strict=True)] for of in felt
+        [None if b else f for f, b in zip(of.apparent, of.beyond, strict=True)] for of in domes
     ]
 
-    def of_all(columns: list[list[Exact]]) -> list[Any]:
-        """By frame; None where a tile has none."""
+    def transpose(columns: list[list[Exact]]) -> list[Any]:
+        """List values by frame; None where a tile has none."""
         return [None if None in row else list(row) for row in zip(*columns, strict=True)]
 
-    sampled = [sum(row) // len(felt) for row in zip(*t_ns[: len(DOMES)], strict=True)]
+    sampled = [sum(row) // len(domes) for row in zip(*t_ns[: len(DOMES)], strict=True)]
     together: list[Any] = smoothing_stage.denoised(
-        [None if row is None else mp.fsum(row) for row in of_all(usable)],
-        [None if row is None else mp.norm(row) for row in of_all([of.single for of in felt])],
+        [None if row is None else mp.fsum(row) for row in transpose(usable)],
+        [None if row is None else mp.norm(row) for row in transpose([of.single for of in domes])],
         sampled,
         frame_ns,
         frame_ns,
@@ -181,7 +183,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
     )
     within = [None if each is None else each[4] for each in together]
     for i in DOMES:
-        of, curve = felt[i], effects[i].rubber
+        of, curve = domes[i], effects[i].rubber
         apparent, single, beyond, own = of.apparent, of.single, of.beyond, of.own
         heat_n, unseen_heat_n, guess_n = of.heat_n, of.unseen_heat_n, of.guess_n
         most_n, end_n = of.most_n, of.end_n
@@ -204,14 +206,14 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
         sprung = smoothing_stage.flow(smooth, frame_ns, *branch, guess_n)
         unlooped = smoothing_stage.hysteresis(sprung, loop, guess_n)
         force_n = smoothing_stage.rubber(unlooped, frame_ns, parts, taus_s, guess_n)
-        borne = [
-            None if g is None else _farthest(g, f, most_n)
+        loads = [
+            None if g is None else _select_farthest(g, f, most_n)
             for f, g in zip(apparent, guess_n, strict=True)
         ]
-        sprung = smoothing_stage.flow(smooth, frame_ns, *branch, borne, end_n)
-        unlooped = smoothing_stage.hysteresis(sprung, loop, borne)
-        else_n = smoothing_stage.rubber(unlooped, frame_ns, parts, taus_s, borne, end_n)
-        crept_n: list[Exact] = [
+        sprung = smoothing_stage.flow(smooth, frame_ns, *branch, loads, end_n)
+        unlooped = smoothing_stage.hysteresis(sprung, loop, loads)
+        else_n = smoothing_stage.rubber(unlooped, frame_ns, parts, taus_s, loads, end_n)
+        unseen_creep_n: list[Exact] = [
             None if f is None else 0 if b else (other_n - f) / mp.sqrt(3)
             for f, other_n, b in zip(force_n, else_n, beyond, strict=True)
         ]
@@ -229,14 +231,16 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
             left = mpf(1) if beyond[k] else averaged[k][1]
             own_n[k] = mp.sqrt(single[k] ** 2 * left + own[k])
             if beyond[k]:
-                common = [each[k] ** 2 for each in (heat_n, rubber_n, unseen_heat_n, crept_n)]
+                common = [
+                    each[k] ** 2 for each in (heat_n, rubber_n, unseen_heat_n, unseen_creep_n)
+                ]
                 sigma = mp.sqrt(own_n[k] ** 2 + mp.fsum(common))
                 force_n[k] = min(force_n[k], else_n[k])
                 stated_n[k] = force_n[k] - mpf(BOUND_SIGMAS) * sigma
         forces.append(force_n)
         stated.append(stated_n)
         bounds.append(beyond)
-        errors.append([own_n, heat_n, rubber_n, unseen_heat_n, crept_n])
+        errors.append([own_n, heat_n, rubber_n, unseen_heat_n, unseen_creep_n])
         bends.append([None if a is None else a[2] for a in averaged])
         of_bends.append(
             [
@@ -251,18 +255,18 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
     )
 
 
-def sigma_of(errors: list[Any], k: int, weights: list[Exact]) -> Exact:
-    """Of a weighted sum over tiles: what is a tile's own adds as squares, the rest as is."""
+def compute_sigma(errors: list[Any], k: int, weights: list[Exact]) -> Exact:
+    """Compute sigma of a weighted sum, in which only own errors of tiles are independent."""
     own = mp.fsum((w * e[0][k]) ** 2 for w, e in zip(weights, errors, strict=True))
     shared = [mp.fdot(weights, [e[part][k] for e in errors]) for part in (1, 2, 3, 4, 5)]
     return mp.sqrt(own + mp.fsum(each**2 for each in shared))
 
 
-def _farthest(of: Exact, *values: Exact) -> Exact:
+def _select_farthest(of: Exact, *values: Exact) -> Exact:
     return max(values, key=lambda value: abs(value - of))
 
 
-def _without_spike(kpa: list[Exact], k: int, run: list[int], far: Exact) -> Exact:
+def _replace_spike(kpa: list[Exact], k: int, run: list[int], far: Exact) -> Exact:
     whole = 0 < k < len(kpa) - 1 and run[k - 1] == run[k] == run[k + 1]
     if not whole or None in kpa[k - 1 : k + 2]:
         return kpa[k]
@@ -271,23 +275,13 @@ def _without_spike(kpa: list[Exact], k: int, run: list[int], far: Exact) -> Exac
     return mean if off > far and abs(kpa[k + 1] - kpa[k - 1]) < off else kpa[k]
 
 
-def _static(entry: TileCalibration, gauge: Exact) -> tuple[Exact, Exact, Exact]:
-    """Force, slope and variance of the curve of forces that have lasted."""
+def _compute_settled_force(entry: TileCalibration, gauge: Exact) -> tuple[Exact, Exact, Exact]:
+    """Compute force, slope and variance of the settled curve."""
     curve = entry.effects.rubber
     assert curve is not None
-    c = [mpf(x) for x in curve.coefficients]
-    offset, scale, gain = mpf(entry.p_offset_kpa), mpf(entry.p_scale_kpa), mpf(entry.f_scale_n)
-    inside = min(max(gauge, mpf(0)), mpf(entry.range_kpa[1]))
-    u, u0 = (inside - offset) / scale, -offset / scale
-
-    def slope_at(u: Exact) -> Exact:
-        return gain * (c[1] + 2 * c[2] * u + 3 * c[3] * u**2) / scale
-
-    basis = [gain * (u**k - u0**k) for k in (1, 2, 3)]
-    force = mp.fdot(c[1:], basis) + min(gauge, mpf(0)) * slope_at(u0)
-    variance = sum(
-        mpf(curve.covariance[i][j]) * basis[i] * basis[j] for i in range(3) for j in range(3)
-    )
+    settled = {"coefficients": curve.coefficients, "covariance": curve.covariance}
+    force, slope, variance = sample_stage.static(entry.model_copy(update=settled), gauge)
     variance += (mpf(curve.curve_misfit_n) * abs(force) / (abs(force) + mpf(0.2))) ** 2
-    variance += (mpf(curve.scatter) * slope_at(u) * inside) ** 2
-    return force, slope_at(u), variance
+    inside = min(max(gauge, mpf(0)), mpf(entry.range_kpa[1]))
+    variance += (mpf(curve.scatter) * slope * inside) ** 2
+    return force, slope, variance

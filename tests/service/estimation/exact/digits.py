@@ -1,4 +1,4 @@
-"""Numbers of fifty digits, which are mpmath's, and None where there is none."""
+"""Numbers of fifty digits by mpmath; None is missing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def exact(values: Any) -> list[Exact]:
 
 
 def apart(estimated: Any, expected: list[Exact]) -> float:
-    """Greatest distance; undefined must meet undefined."""
+    """Return the greatest distance; NaN must meet None."""
     worst = 0.0
     for e, x in zip(np.ravel(estimated), expected, strict=True):
         assert np.isnan(e) == (x is None)

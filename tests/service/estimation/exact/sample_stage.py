@@ -1,4 +1,4 @@
-"""The lower part of the ladder at fifty digits: pressure, gas, warmth, water, reading by reading.
+"""The sample stage at fifty digits: pressure, gas, temperature, ambient and static curve.
 
 Written from the docstrings of the models and the design, not from the code.
 """
@@ -7,18 +7,19 @@ from __future__ import annotations
 
 from mpmath import mp, mpf
 
+from service.estimation.calibration import TileCalibration
 from service.estimation.models import ambient
 from service.estimation.models import temperature as temperature_model
 from tests.service.estimation.exact.digits import Exact
 
 AWAY_NS = 50_000_000
-"""So long without a reading a tile may have borne anything."""
+"""Time without a reading after which any load may have passed."""
 
 
 def pressure_kpa(words: tuple[int, ...], pressure_raw: int, temperature_raw: int) -> Exact:
-    """Data sheet 8.1 and 8.2; what reads below 50 kPa fell through zero and counts as negative.
+    """Compute data sheet 8.1 and 8.2; counts below 50 kPa have fallen through zero.
 
-    None if it is below the chip's range even so: then it is no pressure at all.
+    None if it is below the chip's range even so: then it is no pressure.
     """
     a0, b1, b2, c12 = (word - 65536 if word >= 32768 else word for word in words)
 
@@ -72,7 +73,7 @@ def gas(
 def temperature(
     counts: list[Exact], t_ns: list[int], lag_s: Exact
 ) -> tuple[list[Exact], list[Exact]]:
-    """Counts of the gas, and their rise in counts a second.
+    """Compute counts of the gas, and their rise in counts a second.
 
     `S x' = chip - x` with the chip linear between readings, and `S y' = x - y` with x as linear;
     for half a second plain means. The gas is x of the time S = lag, where that is 0.1 s or more;
@@ -112,7 +113,7 @@ def temperature(
 
 
 def smoothed(kpa: list[Exact], t_ns: list[int]) -> list[Exact]:
-    """A low-pass of 30 ms that holds for a while where there is no reading."""
+    """Compute a low-pass of 30 ms, which stays for a while without a reading."""
     out: list[Exact] = []
     value, last_ns = None, 0
     for p, now_ns in zip(kpa, t_ns, strict=True):
@@ -123,6 +124,23 @@ def smoothed(kpa: list[Exact], t_ns: list[int]) -> list[Exact]:
                 passed = max(mpf(0), mpf(now_ns - last_ns) / 10**9)
                 value += (1 - mp.exp(-passed / mpf(ambient.SMOOTHING_S))) * (p - value)
             last_ns = now_ns
-        held = now_ns - last_ns <= ambient.HELD_S * 1e9
-        out.append(value if held else None)
+        is_recent = now_ns - last_ns <= ambient.HELD_S * 1e9
+        out.append(value if is_recent else None)
     return out
+
+
+def static(entry: TileCalibration, gauge: Exact) -> tuple[Exact, Exact, Exact]:
+    """Compute force above zero pressure, slope and the variance of the static curve."""
+    c = [mpf(x) for x in entry.coefficients]
+    offset, scale, gain = mpf(entry.p_offset_kpa), mpf(entry.p_scale_kpa), mpf(entry.f_scale_n)
+    inside = min(max(gauge, mpf(0)), mpf(entry.range_kpa[1]))
+    u, u0 = (inside - offset) / scale, -offset / scale
+
+    def slope_at(u: Exact) -> Exact:
+        return gain * (c[1] + 2 * c[2] * u + 3 * c[3] * u**2) / scale
+
+    basis = [gain * (u**k - u0**k) for k in (1, 2, 3)]
+    force = mp.fdot(c[1:], basis) + min(gauge, mpf(0)) * slope_at(u0)
+    covariance = mp.matrix([[mpf(x) for x in row] for row in entry.covariance])
+    variance = (mp.matrix([basis]) * covariance * mp.matrix(basis))[0]
+    return force, slope_at(u), variance

@@ -1,4 +1,4 @@
-"""The upper part of the ladder at fifty digits: averages, the branch that flows, loop and creep.
+"""The smoothing stage at fifty digits: averages, the flowing branch, loop and creep.
 
 Written from the docstrings of the models and the design, not from the code.
 """
@@ -21,13 +21,13 @@ def rubber(
     t_ns: list[int],
     parts: list[Exact],
     taus_s: list[Exact],
-    borne: list[Exact] | None = None,
+    loads: list[Exact] | None = None,
     away: Exact = None,
 ) -> list[Exact]:
     """`apparent = F - sum g (F - z)`, `tau z' = F - z`, F linear between readings, 0 at first.
 
-    The dome creeps under what it has `borne` where that is not None. While nothing was read it bore
-    `away`, or nothing, the farther one, until just now.
+    The dome creeps under `loads` where they are not None. In a gap its load was `away`, or nothing,
+    the farther one, until the gap's end.
     """
     z = [mpf(0) for _ in parts]
     before, before_ns = mpf(0), None
@@ -37,28 +37,28 @@ def rubber(
             out.append(None)
             continue
         passed = mpf(max(0, now_ns - before_ns)) / 10**9 if before_ns is not None else mpf(0)
-        # z after the step is held + share F, linear in the F that is looked for.
-        held, share = [], []
+        # z after the step is decayed + share F, linear in the unknown F.
+        decayed, share = [], []
         absent = away is not None and passed * 10**9 > AWAY_NS
         for m, tau in enumerate(taus_s if not absent else ()):
             h = passed / tau
             decay = mp.exp(-h)
             mean = (1 - decay) / h if h != 0 else mpf(1)
-            held.append(decay * z[m] + (mean - decay) * before)
+            decayed.append(decay * z[m] + (mean - decay) * before)
             share.append(1 - mean)
         if absent:
             load = max((away, mpf(0)), key=lambda f: abs(f - (before + value) / 2))
-            held = [
+            decayed = [
                 x * mp.exp(-passed / tau) + load * (1 - mp.exp(-passed / tau))
                 for x, tau in zip(z, taus_s, strict=True)
             ]
             share = [mpf(0) for _ in taus_s]
         left = 1 - sum(g * (1 - s) for g, s in zip(parts, share, strict=True))
-        force = (value - sum(g * x for g, x in zip(parts, held, strict=True))) / left
+        force = (value - sum(g * x for g, x in zip(parts, decayed, strict=True))) / left
         out.append(force)
-        if borne is not None and borne[len(out) - 1] is not None:
-            force = borne[len(out) - 1]
-        z = [x + s * force for x, s in zip(held, share, strict=True)]
+        if loads is not None and loads[len(out) - 1] is not None:
+            force = loads[len(out) - 1]
+        z = [x + s * force for x, s in zip(decayed, share, strict=True)]
         before, before_ns = force, now_ns
     return out
 
@@ -69,13 +69,13 @@ def flow(
     part: Exact,
     stress: Exact,
     power: Exact,
-    borne: list[Exact] | None = None,
+    loads: list[Exact] | None = None,
     away: Exact = None,
 ) -> list[Exact]:
     """`apparent = F - s`, `s' = g F' - 10 g |s/S|^n sign(s)`: the flow between two half changes.
 
-    The branch flows under what was `borne` where that is not None. While nothing was read it bore
-    `away`, or nothing, the farther one, until just now: long enough for the branch to be at rest.
+    The branch flows under `loads` where they are not None. In a gap its load was `away` or
+    nothing, the farther one, until the gap's end: long enough for the branch to be at rest.
     """
     s, before, before_ns = mpf(0), mpf(0), None
     out: list[Exact] = []
@@ -99,7 +99,7 @@ def flow(
                 between = mp.sign(between) * grown ** (-1 / more)
             return between + half
 
-        # What is added to the apparent force hardly changes with it: that comes to rest.
+        # The addition hardly changes with the force, so iteration converges.
         force = value
         for _ in range(400):
             better = value + after(force)
@@ -107,18 +107,18 @@ def flow(
                 break
             force = better
         out.append(force)
-        if borne is not None and borne[len(out) - 1] is not None:
-            force = borne[len(out) - 1]
+        if loads is not None and loads[len(out) - 1] is not None:
+            force = loads[len(out) - 1]
         s, before, before_ns = after(force), force, now_ns
     return out
 
 
 def hysteresis(
-    apparent: list[Exact], parts: list[Exact], borne: list[Exact] | None = None
+    apparent: list[Exact], parts: list[Exact], loads: list[Exact] | None = None
 ) -> list[Exact]:
     """`apparent = F + sum w (y - F)` solved on the pieces of the broken line that it is.
 
-    Plays follow what was `borne` where that is not None.
+    Plays follow `loads` where they are not None.
     """
     opens, widths = mpf(LOOP_OPENING), [mpf(float(w)) for w in WIDTHS_N]
 
@@ -146,20 +146,20 @@ def hysteresis(
         slope = (lagging(b) - lagging(a)) / (b - a)
         force = a + (value - lagging(a)) / slope
         out.append(force)
-        if borne is not None and borne[len(out) - 1] is not None:
-            force = borne[len(out) - 1]
+        if loads is not None and loads[len(out) - 1] is not None:
+            force = loads[len(out) - 1]
         plays = [play(force, w, y) for w, y in zip(widths, plays, strict=True)]
     return out
 
 
 def curve_at_zero(x: list[Exact], y: list[Exact], degree: int) -> tuple[Exact, Exact] | None:
-    """Value at 0 of the curve fitted to points, and its variance; None if they do not tell."""
+    """Fit a curve; return its value at 0 and the variance, or None without enough points."""
     if len(x) < degree + 2:
         return None
-    # Orthogonal polynomials (Gram-Schmidt), so that nothing of normal equations is shared.
+    # Orthogonal polynomials (Gram-Schmidt), so that normal equations are not shared.
     basis: list[list[Exact]] = []
     at_zero: list[Exact] = []
-    told = mpf(1)
+    determinant = mpf(1)
     for k in range(degree + 1):
         column, zero = [v**k for v in x], mpf(1 if k == 0 else 0)
         for q, q0 in zip(basis, at_zero, strict=True):
@@ -167,8 +167,8 @@ def curve_at_zero(x: list[Exact], y: list[Exact], degree: int) -> tuple[Exact, E
             column = [a - share * b for a, b in zip(column, q, strict=True)]
             zero -= share * q0
         norm = mp.fsum(v ** (2 * k) for v in x)
-        told *= mp.fdot(column, column) / norm if norm != 0 else 0
-        if told <= mpf(denoise.DETERMINANT_MIN):
+        determinant *= mp.fdot(column, column) / norm if norm != 0 else 0
+        if determinant <= mpf(denoise.DETERMINANT_MIN):
             return None
         basis.append(column)
         at_zero.append(zero)
@@ -178,14 +178,14 @@ def curve_at_zero(x: list[Exact], y: list[Exact], degree: int) -> tuple[Exact, E
 
 
 def _between(table: Floats, at: Any) -> Any:
-    """Linearly interpolated."""
+    """Interpolate linearly."""
     below = min(int(mp.floor(at)), len(table) - 2)
     first, second = mpf(table[below]), mpf(table[below + 1])
     return first + (at - below) * (second - first)
 
 
 def _agree(value: Any, variance: Any, degree: int, shorter: list[Any], sigma: Exact) -> bool:
-    """With each of the shorter windows' (value, variance, degree)."""
+    """Return whether a window agrees with each shorter one (value, variance, degree)."""
     for before, of_before, degree_before in shorter:
         nested = degree <= degree_before
         less = max(of_before - variance, mpf(denoise.VARIANCE_REDUCTION_MIN) * of_before)
@@ -208,9 +208,9 @@ def denoised(
 ) -> list[Any]:
     """Windows that grow on either side, a parabola and a line in each, as long as they agree.
 
-    Of each value: it, its variance, what half the window differs by, the variance of that, and the
-    rows of the longest window that a line described, and of the longest: they are the `within` of
-    others, beyond which these take no line, and do not grow.
+    Returns of each value: average, variance, difference to half the window, variance of that, and
+    the rows of the longest straight window and of the longest: `within` such rows other columns
+    take lines and grow.
     """
     out: list[Any] = []
     for i, own in enumerate(values):
@@ -278,7 +278,7 @@ def denoised(
 
 
 def shared_bend(bends_n: list[list[Exact]], noises_n: list[list[Exact]]) -> list[list[Exact]]:
-    """Of each tile's bends what is more than noise in the sum over tiles; None: there is none."""
+    """Compute the part of each tile's bends beyond noise in the sum over tiles; None is missing."""
     out = [[mpf(0)] * len(bends_n[0]) for _ in bends_n]
     for k in range(len(bends_n[0])):
         there = [i for i, bends in enumerate(bends_n) if bends[k] is not None]

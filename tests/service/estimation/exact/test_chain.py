@@ -1,7 +1,7 @@
-"""The full ladder, from counts to GRF and centre of pressure, against fifty digits all the way.
+"""The full ladder, from counts to GRF and centre of pressure, against fifty digits.
 
-Three domes and a bare tile, 70 frames in which everything happens: a step, a spike, a gap of a
-minute, a silent tile, a saturated one, warmth, water.
+Three domes and a bare tile; 70 frames with a step, a spike, a gap of a minute, a silent tile, a
+saturated one, warmth and water.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tests.builders.calibrations import make_calibration, make_effects, make_tar
 from tests.builders.estimates import estimate
 from tests.builders.frames import loaded_frames
 from tests.service.estimation.exact import digits
-from tests.service.estimation.exact.chain import chain, sigma_of
+from tests.service.estimation.exact.chain import compute_chain, compute_sigma
 
 PARTS = [DATA_SHEET_CHIP, FORUM_CHIP] * 2
 UNLOADED_COUNTS = (380, 287, 369, 302)
@@ -32,7 +32,7 @@ ROWS = 70
 
 @pytest.fixture(scope="module")
 def plan() -> EstimationPlan:
-    """Every dome with effects of its own; nothing is a round number."""
+    """Plan in which every dome has its own effects, without round numbers."""
     info = array_at(POSITIONS_M, references=[3], chips=PARTS)
     known = make_effects()
     assert known.gas is not None
@@ -71,8 +71,8 @@ def plan() -> EstimationPlan:
     return make_plan(info, make_calibration(*tiles), tare, models=MODEL_NAMES, lag_ms=LAG_MS)
 
 
-def eventful(seed: int) -> tuple[FrameBatch, list[int]]:
-    """The recording, and the number of the unbroken run that each frame is in."""
+def make_eventful_frames(seed: int) -> tuple[FrameBatch, list[int]]:
+    """Make the recording, and the number of the unbroken run of each frame."""
     rng = np.random.default_rng(seed)
     load = np.zeros((ROWS, 4))
     load[8:, :3] = [60, 45, 70]
@@ -103,18 +103,18 @@ def eventful(seed: int) -> tuple[FrameBatch, list[int]]:
     return frames, [int(row >= 38) for row in range(ROWS)]
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_the_full_ladder_is_within_a_nanonewton(plan: EstimationPlan, seed: int) -> None:
-    frames, run = eventful(seed)
+    frames, run = make_eventful_frames(seed)
     e = estimate(plan, *(frames.slice_rows(i, i + 11) for i in range(0, ROWS, 11)))
-    exact = chain(plan, frames, run)
+    exact = compute_chain(plan, frames, run)
     for i in range(4):
         assert digits.apart(e.gauge_kpa[:, i], exact.gauge_kpa[i]) < 1e-10
     one = [mpf(1)]
     for i in range(3):
         assert digits.apart(e.force_n[:, i], exact.stated_n[i]) < 1e-9
         sigma_n = [
-            None if f is None or b else sigma_of(exact.errors[i : i + 1], k, one)
+            None if f is None or b else compute_sigma(exact.errors[i : i + 1], k, one)
             for k, (f, b) in enumerate(zip(exact.force_n[i], exact.is_bound[i], strict=True))
         ]
         assert digits.apart(e.force_sigma_n[:, i], sigma_n) < 1e-9
@@ -122,13 +122,15 @@ def test_the_full_ladder_is_within_a_nanonewton(plan: EstimationPlan, seed: int)
     bound = [any(row) for row in zip(*exact.is_bound, strict=True)]
     grf = [None if None in row or b else sum(row) for row, b in zip(by_frame, bound, strict=True)]
     assert digits.apart(e.grf_n, grf) < 1e-9
-    sigma_n = [None if f is None else sigma_of(exact.errors, k, 3 * one) for k, f in enumerate(grf)]
+    sigma_n = [
+        None if f is None else compute_sigma(exact.errors, k, 3 * one) for k, f in enumerate(grf)
+    ]
     assert digits.apart(e.grf_sigma_n, sigma_n) < 1e-9
     least = []
     for k, row in enumerate(by_frame):
         known = [i for i, force in enumerate(row) if force is not None]
         total = mp.fsum(row[i] for i in known)
-        doubt = sigma_of([exact.errors[i] for i in known], k, one * len(known))
+        doubt = compute_sigma([exact.errors[i] for i in known], k, one * len(known))
         least.append(total - mpf(BOUND_SIGMAS) * doubt)
     assert digits.apart(e.grf_lower_bound_n, least) < 1e-9
     assert None in grf
@@ -139,7 +141,7 @@ def test_the_full_ladder_is_within_a_nanonewton(plan: EstimationPlan, seed: int)
         centre = [mp.fdot(by_frame[k], places) / grf[k] for k in stated]
         assert digits.apart(getattr(e, f"cop_{name}_m")[stated], centre) < 1e-11
         sigma_m = [
-            sigma_of(exact.errors, k, [(place - at) / grf[k] for place in places])
+            compute_sigma(exact.errors, k, [(place - at) / grf[k] for place in places])
             for k, at in zip(stated, centre, strict=True)
         ]
         assert digits.apart(getattr(e, f"cop_sigma_{name}_m")[stated], sigma_m) < 1e-11

@@ -1,4 +1,4 @@
-"""Every model of the ladder against its equations at fifty digits, in the hard cases.
+"""Every model of the ladder against its equations at fifty digits, in hard cases.
 
 The same float64 readings go in. Goal of the design: less than 1e-9 N apart.
 """
@@ -22,13 +22,13 @@ NAN = float("nan")
 STEPS_NS = [2_000_000] * 8 + [0, 1, 1000, 17_000_000, 200_000_000, 60 * 10**9, -3_000_000]
 
 
-def wild_instants(rng: np.random.Generator, n: int) -> np.ndarray:
-    """With gaps of a minute, steps of nothing and of a nanosecond, and some backwards."""
+def draw_instants(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Draw instants with gaps of a minute, steps of 0 and 1 ns, and some backwards."""
     return np.cumsum(rng.choice(STEPS_NS, n)).astype(np.int64)
 
 
-def with_holes(rng: np.random.Generator, values: np.ndarray) -> np.ndarray:
-    """Some are NaN, some infinite, as from a bad file."""
+def damage(rng: np.random.Generator, values: np.ndarray) -> np.ndarray:
+    """Replace a tenth of the values by NaN or infinity, as from a bad file."""
     return np.where(rng.random(values.shape) < 0.1, rng.choice([NAN, np.inf, -np.inf]), values)
 
 
@@ -43,8 +43,8 @@ seeds = st.integers(0, 2**32 - 1)
 )
 def test_gas_is_within_a_micropascal(gamma: float, tau_s: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    kpa = with_holes(rng, 100.0 + np.cumsum(rng.normal(0, 2.0, 40)))
-    t_ns = wild_instants(rng, 40)
+    kpa = damage(rng, 100.0 + np.cumsum(rng.normal(0, 2.0, 40)))
+    t_ns = draw_instants(rng, 40)
     model = gas.GasModel(*(np.array([x]) for x in (gamma, tau_s, 0.00124, 100.1)))
     found = through(
         gas.compute_isothermal_pressure, model.to_records(), gas.initial_state(1), kpa, t_ns, NAN
@@ -64,8 +64,8 @@ def test_rubber_is_within_a_nanonewton(
     parts: tuple[float, float], taus_s: tuple[float, float], seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    apparent_n = with_holes(rng, 15.0 + np.cumsum(rng.normal(0, 2.0, 40)))
-    t_ns = wild_instants(rng, 40)
+    apparent_n = damage(rng, 15.0 + np.cumsum(rng.normal(0, 2.0, 40)))
+    t_ns = draw_instants(rng, 40)
     model = rubber.CreepModel(np.array([parts]), np.array([taus_s]))
     seen = apparent_n, t_ns, NAN, NAN
     found = through(rubber.compensate_creep, model.to_records(), rubber.initial_state(1), *seen)
@@ -90,8 +90,8 @@ def test_flow_is_within_a_nanonewton(
     part: float, stress_n: float, power: float, swing_n: float, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    apparent_n = with_holes(rng, 3.0 + np.cumsum(rng.normal(0, swing_n, 40)))
-    t_ns = wild_instants(rng, 40)
+    apparent_n = damage(rng, 3.0 + np.cumsum(rng.normal(0, swing_n, 40)))
+    t_ns = draw_instants(rng, 40)
     model = flow.FlowModel(np.array([part]), np.array([stress_n]), np.array([power]))
     seen = apparent_n, t_ns, NAN, NAN
     found = through(flow.compensate_flow, model.to_records(), flow.initial_state(1), *seen)
@@ -111,9 +111,7 @@ def test_hysteresis_is_within_a_nanonewton(
     parts: tuple[float, float, float], swing_n: float, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    apparent_n = with_holes(
-        rng, rng.choice([0.0, 3.0, 20.0]) + np.cumsum(rng.normal(0, swing_n, 40))
-    )
+    apparent_n = damage(rng, rng.choice([0.0, 3.0, 20.0]) + np.cumsum(rng.normal(0, swing_n, 40)))
     model = hysteresis.HysteresisModel(np.array([parts], dtype=float))
     state = hysteresis.initial_state(1)
     found = through(hysteresis.compensate_hysteresis, model.to_records(), state, apparent_n, NAN)
@@ -125,8 +123,8 @@ def test_hysteresis_is_within_a_nanonewton(
 @given(lag_s=st.sampled_from([-30.0, -2.0, -0.3, 0.0, 1e-9, 0.3, 3.3, 30.0, 1e9]), seed=seeds)
 def test_temperature_is_within_a_billionth_of_a_count(lag_s: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    temperature_raw = with_holes(rng, 480.0 - rng.integers(0, 40, 60))
-    t_ns = wild_instants(rng, 60)
+    temperature_raw = damage(rng, 480.0 - rng.integers(0, 40, 60))
+    t_ns = draw_instants(rng, 60)
     found = temperature.compute_gas_temperatures(
         temperature_raw[:, None], t_ns[:, None], np.array([lag_s])
     )
@@ -139,14 +137,14 @@ def test_temperature_is_within_a_billionth_of_a_count(lag_s: float, seed: int) -
 @given(seed=seeds)
 def test_ambient_is_within_a_micropascal(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    kpa = with_holes(rng, rng.normal(0, 1.0, 60))
-    t_ns = wild_instants(rng, 60)
+    kpa = damage(rng, rng.normal(0, 1.0, 60))
+    t_ns = draw_instants(rng, 60)
     found = through(ambient.low_pass_ambient_kpa, None, ambient.initial_state(), kpa, t_ns)
     expected = sample_stage.smoothed(digits.exact(kpa), t_ns.tolist())
     assert digits.apart(found[:, None], expected) < GOAL
 
 
-@pytest.mark.parametrize("look_ms", [0, 3, 10, 100])
+@pytest.mark.parametrize("look_ms", [0, 10, 100])
 @pytest.mark.parametrize("kind", ["still", "moving", "uneven", "few", "crowded"])
 @pytest.mark.parametrize("lasts", [0.0, 0.6])
 def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str, lasts: float) -> None:

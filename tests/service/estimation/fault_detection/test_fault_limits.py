@@ -1,4 +1,4 @@
-"""What the watch makes of an estimate: flags, forces and uncertainties, in any batches."""
+"""Fault detection in an estimate: flags, forces and uncertainties, in any batches."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.service.estimation.feet import SQUARE
 RATE_HZ = 1e9 / PERIOD_NS
 NO_AMBIENT = tuple(name for name in MODEL_NAMES if name != "ambient")
 NOT_WARMED = tuple(name for name in NO_AMBIENT if name != "temperature")
-JUDGED = EstimateFlag.STUCK | EstimateFlag.CLIPPED | EstimateFlag.BASELINE_LOST
+FAULTS = EstimateFlag.STUCK | EstimateFlag.CLIPPED | EstimateFlag.BASELINE_LOST
 
 
 def plan_with(*models: str, lag_ms: float = 10.0) -> EstimationPlan:
@@ -33,8 +33,8 @@ def plan_with(*models: str, lag_ms: float = 10.0) -> EstimationPlan:
     return newton_plan(info, sigma_n=1.2, models=models, tiles=tiles, lag_ms=lag_ms)
 
 
-def forces(seconds: float, *, seed: int = 0) -> Floats:
-    """Steps of 0.5 s, as long apart, each as heavy as it likes, with noise of a count."""
+def draw_forces(seconds: float, *, seed: int = 0) -> Floats:
+    """Draw steps of 0.5 s, as long apart, of 40 to 60 N, with noise of a count."""
     t_s = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
     rng = np.random.default_rng(seed)
     tops_n = rng.uniform(40.0, 60.0, (int(seconds) + 1, 4))[t_s.astype(int)]
@@ -47,25 +47,20 @@ def frames_of(forces_n: Floats, **columns: object) -> FrameBatch:
     return loaded_frames(forces_n, **{"temperature_raw": temperature_raw} | columns)
 
 
-def flagged(plan: EstimationPlan, frames: FrameBatch, bit: EstimateFlag) -> Floats:
-    status = estimate(plan, frames).estimate_flags
-    return np.flatnonzero(status & bit) / RATE_HZ
+each_ladder = pytest.mark.parametrize("models", [("unwrap", "static"), NO_AMBIENT, NOT_WARMED])
 
 
-everything = pytest.mark.parametrize("models", [("unwrap", "static"), NO_AMBIENT, NOT_WARMED])
+@each_ladder
+def test_a_healthy_foot_has_no_fault_flag(models: tuple[str, ...]) -> None:
+    flags = estimate(plan_with(*models), frames_of(draw_forces(30.0))).estimate_flags
+    assert not (flags & FAULTS).any()
 
 
-@everything
-def test_a_healthy_foot_has_none_of_these_flags(models: tuple[str, ...]) -> None:
-    status = estimate(plan_with(*models), frames_of(forces(30.0))).estimate_flags
-    assert not (status & JUDGED).any()
-
-
-@everything
-def test_of_a_tile_that_repeats_itself_nothing_is_known_and_a_flag_says_so(
+@each_ladder
+def test_a_stuck_tile_is_missing_and_flagged(
     models: tuple[str, ...],
 ) -> None:
-    forces_n = forces(6.0)
+    forces_n = draw_forces(6.0)
     begin = round(3.7 * RATE_HZ)
     forces_n[begin : begin + round(RATE_HZ), 2] = forces_n[begin, 2]
     e = estimate(plan_with(*models), frames_of(forces_n))
@@ -78,11 +73,11 @@ def test_of_a_tile_that_repeats_itself_nothing_is_known_and_a_flag_says_so(
     assert (e.estimate_flags[stuck] & EstimateFlag.TILE_MISSING).all()
 
 
-@everything
-def test_behind_a_clip_forces_are_lower_bounds_and_a_flag_says_so(
+@each_ladder
+def test_clipped_forces_are_lower_bounds_and_flagged(
     models: tuple[str, ...],
 ) -> None:
-    forces_n = forces(20.0)
+    forces_n = draw_forces(20.0)
     noise_n = np.random.default_rng(1).normal(0.0, 1.0, len(forces_n))
     clipped_n = forces_n.copy()
     clipped_n[:, 1] = np.minimum(forces_n[:, 1], 30.0) + noise_n
@@ -95,8 +90,8 @@ def test_behind_a_clip_forces_are_lower_bounds_and_a_flag_says_so(
     assert np.isnan(e.grf_sigma_n[clipped]).all()
 
 
-def test_a_baseline_that_lies_lower_is_lost_and_sigma_says_by_how_much() -> None:
-    forces_n = forces(12.0)
+def test_the_error_of_a_lost_baseline_is_in_sigma() -> None:
+    forces_n = draw_forces(12.0)
     forces_n[round(5 * RATE_HZ) :, 3] -= 10.0
     e = estimate(plan_with("unwrap", "static"), frames_of(forces_n))
     lost = np.flatnonzero(e.estimate_flags & EstimateFlag.BASELINE_LOST)
@@ -107,8 +102,8 @@ def test_a_baseline_that_lies_lower_is_lost_and_sigma_says_by_how_much() -> None
 
 
 @pytest.mark.parametrize("kelvin", [-4.0, 4.0])
-def test_warmth_that_no_model_corrects_is_in_sigma_and_common_to_all_tiles(kelvin: float) -> None:
-    forces_n = forces(6.0)
+def test_uncorrected_warmth_is_in_sigma_and_common_to_all_tiles(kelvin: float) -> None:
+    forces_n = draw_forces(6.0)
     temperature_raw = frames_of(forces_n).temperature_raw.astype(np.float64)
     temperature_raw[round(3 * RATE_HZ) :] += round(TADC_PER_KELVIN * kelvin)
     frames = frames_of(forces_n, temperature_raw=temperature_raw)
@@ -122,11 +117,11 @@ def test_warmth_that_no_model_corrects_is_in_sigma_and_common_to_all_tiles(kelvi
     assert corrected.force_sigma_n[-1].max() < 0.5 * expected_n
 
 
-def test_a_bare_tile_that_repeats_itself_says_nothing_of_what_is_around() -> None:
+def test_a_stuck_bare_tile_gives_no_ambient_pressure() -> None:
     info = array_at(SQUARE, references=[3])
     tiles = [newton_tile(serial, effects=make_effects()) for serial in info.serials]
     plan = newton_plan(info, sigma_n=1.2, models=MODEL_NAMES, tiles=tiles)
-    forces_n = forces(4.0)
+    forces_n = draw_forces(4.0)
     forces_n[:, 3] = np.random.default_rng(2).normal(0.0, 1.0, len(forces_n))
     forces_n[round(2 * RATE_HZ) :, 3] = 0.0
     e = estimate(plan, frames_of(forces_n))
@@ -134,13 +129,12 @@ def test_a_bare_tile_that_repeats_itself_says_nothing_of_what_is_around() -> Non
     assert np.isnan(e.grf_n[-1])
 
 
-def wild(seed: int) -> FrameBatch:
-    """A foot with everything wrong that is watched, and readings that are missing."""
+def draw_faulty_frames(seed: int) -> FrameBatch:
+    """Draw frames of a foot with every fault, and missing readings."""
     rng = np.random.default_rng(seed)
-    forces_n = forces(14.0, seed=seed)
+    forces_n = draw_forces(14.0, seed=seed)
     n = len(forces_n)
-    clip_n = np.minimum(forces_n[:, 0], 30.0) + rng.normal(0.0, 1.0, n)
-    forces_n[:, 0] = clip_n
+    forces_n[:, 0] = np.minimum(forces_n[:, 0], 30.0) + rng.normal(0.0, 1.0, n)
     begin = rng.integers(0, n - 500)
     forces_n[begin : begin + 300, 1] = forces_n[begin, 1]
     forces_n[rng.integers(n // 2, n) :, 2] -= 9.0
@@ -154,22 +148,22 @@ def wild(seed: int) -> FrameBatch:
     )
 
 
-@everything
+@each_ladder
 @settings(max_examples=6, deadline=None)
 @given(seed=st.integers(0, 20), cuts=st.lists(st.integers(1, 6999), max_size=30))
 def test_any_batches_give_the_same_bits(
     models: tuple[str, ...], seed: int, cuts: list[int]
 ) -> None:
-    plan, frames = plan_with(*models), wild(seed)
+    plan, frames = plan_with(*models), draw_faulty_frames(seed)
     whole = estimate(plan, frames)
-    assert (whole.estimate_flags & JUDGED).any()
+    assert (whole.estimate_flags & FAULTS).any()
     assert_same_bits(whole, estimate(plan, *cut_up(frames, cuts)))
 
 
-def test_frame_by_frame_is_the_same_as_at_once() -> None:
-    plan, frames = plan_with(*NO_AMBIENT), wild(54)
+def test_single_frames_give_the_same_bits() -> None:
+    plan, frames = plan_with(*NO_AMBIENT), draw_faulty_frames(54)
     begin, end = 4200, 4760
     whole = estimate(plan, frames)
-    assert not whole.estimate_flags[begin] & JUDGED
-    assert np.bitwise_or.reduce(whole.estimate_flags[begin:end]) & JUDGED == JUDGED
+    assert not whole.estimate_flags[begin] & FAULTS
+    assert np.bitwise_or.reduce(whole.estimate_flags[begin:end]) & FAULTS == FAULTS
     assert_same_bits(whole, estimate(plan, *cut_up(frames, range(begin, end))))

@@ -1,4 +1,4 @@
-"""How often a healthy tile repeats itself, and when it does so too often."""
+"""Stuck tiles: equal counts in a row that noise does not explain."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 import pytest
-from scipy.signal import lfilter
 
 from devices.arrays import Bools, Floats, Ints
 from devices.jit import jit_cached
@@ -22,23 +21,22 @@ from service.estimation.fault_detection.stuck import (
     update_stuck_and_toggles,
 )
 from service.estimation.records import KernelRecord, RecordArray
+from tests.builders.noise import draw_lasting_noise
 
 RATE_HZ = 447.0
 COUNT_KPA = 0.15
-UNLOADED = 4.0
 
 
-def noise(n: int, tiles: int, counts: float, correlated_s: float = 0.0, seed: int = 0) -> Floats:
-    """Gaussian noise of so many counts."""
-    x = np.random.default_rng(seed).standard_normal((n, tiles))
-    if correlated_s:
-        kept = np.exp(-1.0 / (RATE_HZ * correlated_s))
-        x = lfilter([np.sqrt(1.0 - kept**2)], [1.0, -kept], x, axis=0)
-    return np.asarray(counts * x)
+def draw_noise(
+    n: int, tiles: int, counts: float, correlated_s: float = 0.0, seed: int = 0
+) -> Floats:
+    """Draw noise of so many counts."""
+    readings = max(RATE_HZ * correlated_s, 0.01)
+    return counts * draw_lasting_noise(n, tiles, part=1.0, readings=readings, seed=seed)
 
 
-def limits_of(counts: float, tiles: int) -> StuckLimits:
-    # What a tare finds: rounding is in it, and outliers.
+def make_limits(counts: float, tiles: int) -> StuckLimits:
+    # The noise of a tare has rounding and outliers.
     tared = 1.25 * np.hypot(counts, np.sqrt(1.0 / 12.0))
     return make_stuck_limits(np.full(tiles, tared), RATE_HZ)
 
@@ -50,14 +48,14 @@ class LimitTables(KernelRecord):
     run_max_by_double_step: Annotated[Ints, (SHARE_STEPS + 1,)]
 
 
-def judge(
+def find_repeats(
     limits: StuckLimits,
     states: RecordArray[StuckState],
     pressure_raw: npt.NDArray[np.uint16],
     kpa: Floats,
     unloaded_kpa: float,
 ) -> npt.NDArray[np.bool_]:
-    """Return which readings (n, tiles) are repeats that noise does not explain."""
+    """Find readings (n, tiles) that repeat more than noise explains."""
     tables = LimitTables.array(
         1,
         run_max_by_equal=limits.run_max_by_equal,
@@ -65,12 +63,12 @@ def judge(
     )
     out = np.empty(kpa.shape, dtype=bool)
     counts = pressure_raw.astype(np.int64)
-    _judge(tables, limits.to_records(), states, counts, kpa, unloaded_kpa, out)
+    _update_all(tables, limits.to_records(), states, counts, kpa, unloaded_kpa, out)
     return out
 
 
 @jit_cached
-def _judge(
+def _update_all(
     limits: RecordArray[LimitTables],
     params: RecordArray[StuckParams],
     states: RecordArray[StuckState],
@@ -89,76 +87,78 @@ def _judge(
             )  # fmt: skip
 
 
-def found(level: Floats, counts: float, *, n_lead: int = 447) -> npt.NDArray[np.bool_]:
-    """Judged readings of these levels in counts, after a second without load."""
+def find_stuck(level: Floats, counts: float) -> npt.NDArray[np.bool_]:
+    """Find stuck readings of these levels in counts, after a second without load."""
     tiles = level.shape[1]
-    lead = noise(n_lead, tiles, counts, seed=99)
+    lead = draw_noise(447, tiles, counts, seed=99)
     pressure_raw = np.rint(400.0 - np.concatenate([lead, level])).astype(np.uint16)
     kpa = COUNT_KPA * (400.0 - pressure_raw.astype(np.float64))
-    unloaded_kpa = UNLOADED * COUNT_KPA * np.hypot(counts, 0.3)
-    judged = judge(limits_of(counts, tiles), initial_state(tiles), pressure_raw, kpa, unloaded_kpa)
-    assert not judged[:n_lead].any()
-    return judged[n_lead:]
+    unloaded_kpa = 4.0 * COUNT_KPA * np.hypot(counts, 0.3)
+    stuck = find_repeats(
+        make_limits(counts, tiles), initial_state(tiles), pressure_raw, kpa, unloaded_kpa
+    )
+    assert not stuck[:447].any()
+    return stuck[447:]
 
 
 @pytest.mark.parametrize("counts", [0.05, 0.1, 0.2, 0.3, 0.5, 0.85, 1.3])
-@pytest.mark.parametrize("correlated_s", [0.0, 0.01, 0.03])
-def test_a_healthy_tile_is_not_called_stuck_wherever_between_two_counts_it_lies(
+@pytest.mark.parametrize("correlated_s", [0.0, 0.03])
+def test_a_healthy_tile_between_any_two_counts_is_not_stuck(
     counts: float, correlated_s: float
 ) -> None:
-    # Eight places between two counts, learnt in one and judged in another, 13 minutes of tiles.
+    # Eight places between two counts, learnt in one and checked in another, 13 minutes of tiles.
     n = 44_700
-    level = noise(n, 8, counts, correlated_s) + np.linspace(0.0, 1.0, 8)
+    level = draw_noise(n, 8, counts, correlated_s) + np.linspace(0.0, 1.0, 8)
     level[n // 2 :] += 30.5
-    assert not found(level, counts).any()
+    assert not find_stuck(level, counts).any()
 
 
-def test_a_tile_that_stands_still_is_found_within_a_tenth_of_a_second() -> None:
-    level = noise(2000, 4, 0.85, seed=1)
+def test_a_stuck_tile_is_found_within_a_tenth_of_a_second() -> None:
+    level = draw_noise(2000, 4, 0.85, seed=1)
     level[1000:, 2] = 30.0
-    judged = found(level, 0.85)
-    assert not judged[:, [0, 1, 3]].any()
-    first = int(np.flatnonzero(judged[:, 2])[0])
+    stuck = find_stuck(level, 0.85)
+    assert not stuck[:, [0, 1, 3]].any()
+    first = int(np.flatnonzero(stuck[:, 2])[0])
     assert 1020 <= first < 1000 + 0.1 * RATE_HZ
-    assert judged[first:, 2].all()
+    assert stuck[first:, 2].all()
 
 
-def test_one_that_moves_again_is_believed_at_once() -> None:
-    level = noise(2000, 2, 0.85, seed=2)
+def test_a_tile_that_moves_again_is_valid_at_once() -> None:
+    level = draw_noise(2000, 2, 0.85, seed=2)
     level[500:1000, 0] = 7.0
-    judged = found(level, 0.85)
-    assert judged[999, 0]
-    assert not judged[1003:].any()
+    stuck = find_stuck(level, 0.85)
+    assert stuck[999, 0]
+    assert not stuck[1003:].any()
 
 
-def test_a_quiet_tile_that_keeps_a_load_while_the_others_come_and_go_is_stuck() -> None:
+def test_a_quiet_tile_that_keeps_a_load_beside_changing_ones_is_stuck() -> None:
     loads = np.where(np.arange(9000) // 300 % 2, 40.0, 0.0)[:, None]
     level = np.repeat(loads, 3, axis=1)
     level[450:, 1] = 40.0  # it never comes back
-    judged = found(level, 0.0)
-    assert not judged[:, [0, 2]].any()
-    first = int(np.flatnonzero(judged[:, 1])[0])
+    stuck = find_stuck(level, 0.0)
+    assert not stuck[:, [0, 2]].any()
+    first = int(np.flatnonzero(stuck[:, 1])[0])
     assert 450 + 2 * 5 * 300 - 300 <= first <= 450 + 2 * 5 * 300 + 300
 
 
-def test_a_quiet_tile_that_bears_nothing_may_stand_still_for_ever() -> None:
+def test_a_quiet_unloaded_tile_is_never_stuck() -> None:
     loads = np.where(np.arange(9000) // 300 % 2, 40.0, 0.0)[:, None]
     level = np.repeat(loads, 3, axis=1)
     level[:, 1] = 0.0
-    assert not found(level, 0.0).any()
+    assert not find_stuck(level, 0.0).any()
 
 
-def test_readings_that_cannot_be_read_say_nothing() -> None:
+def test_unreadable_counts_are_not_stuck() -> None:
     pressure_raw = np.full((500, 1), 65535, dtype=np.uint16)
     state = initial_state(1)
-    judged = judge(limits_of(0.85, 1), state, pressure_raw, np.full((500, 1), np.nan), 1.0)
-    assert not judged.any()
+    stuck = find_repeats(make_limits(0.85, 1), state, pressure_raw, np.full((500, 1), np.nan), 1.0)
+    assert not stuck.any()
     assert state["unloaded_pairs"].tolist() == [0]
 
 
 @pytest.mark.parametrize("step", [0.05, 0.3, 1.0, 3.0])
 @pytest.mark.parametrize("counts", [0, 1, 2])
-def test_shares_of_neighbours_are_what_rounding_makes_of_them(step: float, counts: int) -> None:
+def test_the_share_of_a_step_follows_from_rounding(step: float, counts: int) -> None:
     rng = np.random.default_rng(5)
     begin = rng.uniform(0.0, 1.0, 400_000)
     moved = np.rint(begin + step * rng.standard_normal(len(begin))) - np.rint(begin)

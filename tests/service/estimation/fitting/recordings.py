@@ -1,4 +1,4 @@
-"""Bench recordings of a tile whose parameters are known, and what is found in them.
+"""Rig recordings of a tile with known parameters, and the effects fitted to them.
 
 They are made by the estimator's own forward model, unless another dome is given.
 """
@@ -6,15 +6,19 @@ They are made by the estimator's own forward model, unless another dome is given
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from service.estimation.effects import WALL_PER_KPA, Effects
-from service.estimation.fitting.dome_model import DomeModel, compute_dome_response
+from service.estimation.fitting.dome_model import DomeModel
 from service.estimation.fitting.effects_fit import fit_determined_effects
 from service.estimation.fitting.rig.indentation import Indentation
 from service.estimation.fitting.static_fit import fit_static_curve
-from service.estimation.models.hysteresis import WIDTHS_N
+
+Press = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Pressures under forces at instants."""
 
 STEP_S = 0.00184
 FULL_N, SCALE_KPA, BASE_KPA = 30.0, 16.0, 100.3
@@ -25,49 +29,32 @@ FLOW_PART, FLOW_N, FLOW_POWER = 0.07, 0.35, 5.0
 NOISE_KPA = 0.165
 
 
-def programme(
+def list_steps(
     *, strokes: int, holds: int, taps: int, soak_s: float
 ) -> list[tuple[float, float, str]]:
-    """What the spindle does: until when, up to which force, and what that is called."""
-    steps = [(1.0, 0.0, "rest")]
-    for _ in range(strokes):
-        steps += [(0.3, 0.0, "rest"), (1.5, FULL_N, "load"), (1.5, 0.0, "unload")]
-    for _ in range(holds):
-        held_n = 0.7 * FULL_N
-        steps += [(0.4, 0.0, "rest"), (0.4, held_n, "load"), (0.5, held_n, "hold")]
-        steps += [(0.005, 0.0, "release")]
-    steps += [(0.4, 0.0, "rest")]
-    for _ in range(taps):
-        steps += [(0.005, part * 0.5 * FULL_N, "tap") for part in (0.5, 1.0, 0.5, 0.0)]
-        steps += [(0.1, 0.0, "rest")]
-    if soak_s:
-        steps += [(soak_s, 0.0, "soak")]
-    ends = np.cumsum([seconds for seconds, _, _ in steps])
-    return [(float(end), force, phase) for end, (_, force, phase) in zip(ends, steps, strict=True)]
+    """List the steps of the spindle: seconds, force at their end, and phase."""
+    stroke = [(0.3, 0.0, "rest"), (1.5, FULL_N, "load"), (1.5, 0.0, "unload")]
+    top_n = 0.7 * FULL_N
+    hold = [(0.4, 0.0, "rest"), (0.4, top_n, "load"), (0.5, top_n, "hold"), (0.005, 0.0, "release")]
+    tap = [(0.005, part * 0.5 * FULL_N, "tap") for part in (0.5, 1.0, 0.5, 0.0)]
+    steps = [(1.0, 0.0, "rest"), *strokes * stroke, *holds * hold, (0.4, 0.0, "rest")]
+    return [
+        *steps,
+        *taps * [*tap, (0.1, 0.0, "rest")],
+        *([(soak_s, 0.0, "soak")] if soak_s else []),
+    ]
 
 
-def pressed_by_model(t_s: np.ndarray, force_n: np.ndarray) -> np.ndarray:
-    """Pressures whose parameters are those above."""
+def make_dome(**changes: Any) -> Press:
+    """Make a dome with the parameters above, or others; return its pressures under a force."""
     part, creep_s, loop = (np.array(values) for values in (PART, CREEP_S, LOOP))
-    response = compute_dome_response(
-        t_s, force_n, CURVE, SCALE_KPA, BASE_KPA, GAMMA, TAU_S, WALL_PER_KPA, part, creep_s, loop,
-        WIDTHS_N, 0.0, 1.0, 4.0,
-    )  # fmt: skip
-    return response.kpa
+    model = DomeModel(CURVE, SCALE_KPA, BASE_KPA, WALL_PER_KPA, GAMMA, TAU_S, part, creep_s, loop)
+    changed = replace(model, **changes)
+    return lambda t_s, force_n: np.asarray(changed.compute_response(t_s, force_n).kpa)
 
 
-def flowing(t_s: np.ndarray, force_n: np.ndarray) -> np.ndarray:
-    """Pressures of a dome that has a branch that flows as well."""
-    part, creep_s, loop = (np.array(values) for values in (PART, CREEP_S, LOOP))
-    model = DomeModel(
-        CURVE, SCALE_KPA, BASE_KPA, WALL_PER_KPA, GAMMA, TAU_S, part, creep_s, loop, FLOW_PART,
-        FLOW_N, FLOW_POWER,
-    )  # fmt: skip
-    return np.asarray(model.compute_response(t_s, force_n).kpa)
-
-
-def recorded(
-    press: Callable[[np.ndarray, np.ndarray], np.ndarray] = pressed_by_model,
+def record(
+    press: Press | None = None,
     *,
     seed: int = 0,
     scatter: float = 0.02,
@@ -77,13 +64,13 @@ def recorded(
     soak_s: float = 0.0,
     late_s: float = 0.0,
 ) -> Indentation:
-    """A tile pressed by the mill: white noise, and every loading with a gain of its own.
+    """Record a tile on the mill, with white noise and a gain of every loading.
 
-    Its chip samples so much later than the instants say.
+    Its chip samples `late_s` after the stated instants.
     """
     rng = np.random.default_rng(seed)
-    steps = programme(strokes=strokes, holds=holds, taps=taps, soak_s=soak_s)
-    ends_s = np.array([end for end, _, _ in steps])
+    steps = list_steps(strokes=strokes, holds=holds, taps=taps, soak_s=soak_s)
+    ends_s = np.cumsum([seconds for seconds, _, _ in steps])
     t_s = np.arange(0.0, ends_s[-1], STEP_S)
     turns_s, turns_n = [0.0, *ends_s], [0.0, *(force for _, force, _ in steps)]
     force_n = np.interp(t_s, turns_s, turns_n)
@@ -92,7 +79,7 @@ def recorded(
     active = ~np.isin(phase, ("rest", "soak"))
     loading = np.cumsum(np.diff(active.astype(int), prepend=0) == 1)
     gain = 1.0 + scatter * rng.standard_normal(loading[-1] + 1)
-    kpa = press(t_s, np.interp(t_s + late_s, turns_s, turns_n))
+    kpa = (press or make_dome())(t_s, np.interp(t_s + late_s, turns_s, turns_n))
     return Indentation(
         serial="T01",
         where="here",
@@ -105,5 +92,5 @@ def recorded(
     )
 
 
-def found_in(recording: Indentation) -> Effects:
+def fit_effects(recording: Indentation) -> Effects:
     return fit_determined_effects([recording], fit_static_curve(recording))

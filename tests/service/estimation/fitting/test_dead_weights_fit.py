@@ -1,4 +1,4 @@
-"""A curve from dead weights: what it needs, and that its interval is as wide as weights are few."""
+"""A curve from dead weights: its needs, and its interval."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ FIVE = {"200 g": 1.0, "500 g": 1.0, "1 kg": 1.0, "1500 g": 1.0, "2 kg": 1.0}
 """Each with the gain of its loading."""
 
 
-def kpa_of(force_n: float) -> float:
-    """Pressure of a dome that stiffens, above its baseline."""
+def compute_gauge_kpa(force_n: float) -> float:
+    """Compute the pressure of a stiffening dome above its baseline."""
     return 20.0 * float(np.log1p(force_n / 25.0))
 
 
-def recorded(*steps: tuple[str, float], seconds: float = 4.0) -> Indentation:
-    """A recording in which each step's text and absolute pressure last so long."""
+def record(*steps: tuple[str, float], seconds: float = 4.0) -> Indentation:
+    """Record steps, each with a text and an absolute pressure."""
     rng = np.random.default_rng(5)
     each = round(seconds * RATE_HZ)
     kpa = np.concatenate([np.full(each, level_kpa) for _, level_kpa in steps])
@@ -39,17 +39,20 @@ def recorded(*steps: tuple[str, float], seconds: float = 4.0) -> Indentation:
     )
 
 
-def put_on(weights: dict[str, float], repeats: int = 1) -> Indentation:
-    """Every weight after a rest, with the gain of its loading."""
+def record_weights(weights: dict[str, float], repeats: int = 1) -> Indentation:
+    """Record every weight after a rest, with the gain of its loading."""
     steps = []
     for text, gain in list(weights.items()) * repeats:
         weight = parse_weight(text)
         assert weight is not None
-        steps += [("rest", BASELINE_KPA), (text, BASELINE_KPA + kpa_of(gain * weight.force_n))]
-    return recorded(*steps)
+        steps += [
+            ("rest", BASELINE_KPA),
+            (text, BASELINE_KPA + compute_gauge_kpa(gain * weight.force_n)),
+        ]
+    return record(*steps)
 
 
-def half_width_n(tile: TileCalibration) -> float:
+def read_half_width_n(tile: TileCalibration) -> float:
     assert tile.weights is not None
     return tile.weights.band_95[-1].new_loading_n
 
@@ -73,12 +76,12 @@ def test_a_weight_is_a_force_with_its_uncertainty(
 
 
 @pytest.mark.parametrize("text", ["500", "g", "0 g", "500 lb", "rest", "-5 N", "1e3 g", "9999 kg"])
-def test_what_names_no_weight_is_none(text: str) -> None:
+def test_another_text_is_no_weight(text: str) -> None:
     assert parse_weight(text) is None
 
 
 def test_five_weights_give_the_curve_of_a_tile() -> None:
-    tile = fit_dead_weights([put_on(FIVE)])
+    tile = fit_dead_weights([record_weights(FIVE)])
     assert tile.absolute_scale == "measured"
     assert tile.weights is not None
     assert [step.weight for step in tile.weights.steps] == list(FIVE)
@@ -87,42 +90,43 @@ def test_five_weights_give_the_curve_of_a_tile() -> None:
         assert abs(point.force_n - true_n) < max(0.02 * true_n, 0.05)
 
 
-def test_loadings_that_differ_and_weights_that_are_fewer_widen_the_interval() -> None:
+def test_different_loadings_and_fewer_weights_widen_the_interval() -> None:
     apart = dict(zip(FIVE, (1.04, 0.97, 1.02, 0.95, 1.03), strict=True))
-    alike_n, apart_n = (half_width_n(fit_dead_weights([put_on(each)])) for each in (FIVE, apart))
+    alike_n, apart_n = (
+        read_half_width_n(fit_dead_weights([record_weights(each)])) for each in (FIVE, apart)
+    )
     assert apart_n > 2.0 * alike_n
-    assert half_width_n(fit_dead_weights([put_on(apart, repeats=3)])) < 0.8 * apart_n
+    assert read_half_width_n(fit_dead_weights([record_weights(apart, repeats=3)])) < 0.8 * apart_n
 
 
-def test_the_tolerance_of_the_scale_does_not_average_out() -> None:
+def test_a_tolerance_of_all_weights_does_not_average_out() -> None:
     loose = {f"{text} +-5 %": gain for text, gain in FIVE.items()}
-    tile = fit_dead_weights([put_on(loose, repeats=4)])
-    assert half_width_n(tile) > 1.96 * 0.05 / np.sqrt(3.0) * 2.0 * STANDARD_GRAVITY_M_S2
+    tile = fit_dead_weights([record_weights(loose, repeats=4)])
+    assert read_half_width_n(tile) > 1.96 * 0.05 / np.sqrt(3.0) * 2.0 * STANDARD_GRAVITY_M_S2
+
+
+DRIFTING = [
+    step for i, text in enumerate(FIVE) for step in (("rest", 100.0 + i), (text, 101.0 + 3 * i))
+]
 
 
 @pytest.mark.parametrize(
-    ("recording", "says"),
+    ("recording", "match"),
     [
-        (put_on(dict(list(FIVE.items())[:4])), "4 weights on the tile"),
-        (put_on({"200 g": 1.0, "1 kg": 1.0, "2 kg": 1.0}, repeats=3), "3 of them different"),
-        (put_on(FIVE | {"200 g": 2.2}), "reads like"),
-        (put_on(FIVE | {"2 kg": 0.3}), "a pressure that rises with the weight"),
-        (put_on(dict.fromkeys(FIVE, 0.001)), "kPa at most under"),
-        (recorded(("1 kg", 105.0), ("rest", 100.0)), "no rest before the weight of 1 kg"),
-        (recorded(("rest", 100.0), ("1 kg", 105.0), seconds=1.0), "the rest lasted 1.0 s"),
-        (recorded(("rest", 100.0), ("1 kg", np.inf)), "chip was at its end"),
+        (record_weights(dict(list(FIVE.items())[:4])), "4 weights on the tile"),
         (
-            recorded(
-                *(
-                    step
-                    for i, text in enumerate(FIVE)
-                    for step in (("rest", 100.0 + i), (text, 101.0 + 3 * i))
-                )
-            ),
-            "drifts by 4.0",
+            record_weights({"200 g": 1.0, "1 kg": 1.0, "2 kg": 1.0}, repeats=3),
+            "3 of them different",
         ),
+        (record_weights(FIVE | {"200 g": 2.2}), "reads like"),
+        (record_weights(FIVE | {"2 kg": 0.3}), "a pressure that rises with the weight"),
+        (record_weights(dict.fromkeys(FIVE, 0.001)), "kPa at most under"),
+        (record(("1 kg", 105.0), ("rest", 100.0)), "no rest before the weight of 1 kg"),
+        (record(("rest", 100.0), ("1 kg", 105.0), seconds=1.0), "the rest lasted 1.0 s"),
+        (record(("rest", 100.0), ("1 kg", np.inf)), "chip was at its end"),
+        (record(*DRIFTING), "drifts by 4.0"),
     ],
 )
-def test_weights_that_show_no_curve_are_refused(recording: Indentation, says: str) -> None:
-    with pytest.raises(CalibrationError, match=says):
+def test_weights_that_show_no_curve_are_refused(recording: Indentation, match: str) -> None:
+    with pytest.raises(CalibrationError, match=match):
         fit_dead_weights([recording])

@@ -1,4 +1,4 @@
-"""The bench's forward model against the ladder's inverse: force in, pressure out, force again."""
+"""The rig's forward model against the ladder's inverse: force, pressure and force again."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SCALE_KPA, BASE_KPA, WALL = 16.0, 100.3, 0.00124
 PART, CREEP_S, LOOP = (0.05, 0.04), (0.08, 1.2), (0.03, 0.04, 0.05)
 
 
-def modelled(
+def respond(
     t_ns: np.ndarray,
     force_n: np.ndarray,
     *,
@@ -45,15 +45,15 @@ def modelled(
     )
 
 
-def apparent_n(kpa: np.ndarray) -> np.ndarray:
-    """What the curve says of a pressure."""
+def compute_apparent_n(kpa: np.ndarray) -> np.ndarray:
+    """Compute the curve's force at a pressure."""
     x = (kpa - BASE_KPA) / SCALE_KPA
     c1, c2, c3 = CURVE
     return np.asarray(x * (c1 + x * (c2 + x * c3)))
 
 
-def strides(seed: int, n: int = 120) -> tuple[np.ndarray, np.ndarray]:
-    """Instants at steps of any length, and a load that comes and goes; at first nothing."""
+def draw_load(seed: int, n: int = 120) -> tuple[np.ndarray, np.ndarray]:
+    """Draw instants at any steps, and a load that comes and goes, from 0 on."""
     rng = np.random.default_rng(seed)
     t_ns = np.cumsum(rng.choice([1_838_235, 1_000, 20_000_000, 10**10], n)).astype(np.int64)
     force_n = np.maximum(0.0, 14.0 + 14.0 * np.sin(np.cumsum(rng.normal(0, 0.7, n))))
@@ -63,16 +63,16 @@ def strides(seed: int, n: int = 120) -> tuple[np.ndarray, np.ndarray]:
 
 @settings(max_examples=20)
 @given(seed=st.integers(0, 1000))
-def test_creep_and_loop_come_back_to_a_nanonewton(seed: int) -> None:
-    t_ns, force_n = strides(seed)
+def test_creep_and_loop_are_compensated_to_a_nanonewton(seed: int) -> None:
+    t_ns, force_n = draw_load(seed)
     law = (0.08, 0.3, 4.7)
-    out = modelled(t_ns, force_n, part=PART, loop=LOOP, flow=law)
+    out = respond(t_ns, force_n, part=PART, loop=LOOP, flow=law)
     sprung, loop = (
         flow.FlowModel(*(np.array([x]) for x in law)),
         hysteresis.HysteresisModel(np.array([LOOP])),
     )
     creep, nan = rubber.CreepModel(np.array([PART]), np.array([CREEP_S])), math.nan
-    felt_n = apparent_n(out.kpa)
+    felt_n = compute_apparent_n(out.kpa)
     felt_n = through(
         flow.compensate_flow, sprung.to_records(), flow.initial_state(1), felt_n, t_ns, nan, nan
     )
@@ -87,17 +87,17 @@ def test_creep_and_loop_come_back_to_a_nanonewton(seed: int) -> None:
         rubber.compensate_creep, creep.to_records(), rubber.initial_state(1), felt_n, t_ns, nan, nan
     )
     assert felt_n == pytest.approx(force_n, abs=1e-9)
-    assert out.force_lag_n == pytest.approx(force_n - apparent_n(out.kpa), abs=1e-9)
+    assert out.force_lag_n == pytest.approx(force_n - compute_apparent_n(out.kpa), abs=1e-9)
 
 
 @settings(max_examples=20)
 @given(seed=st.integers(0, 1000), gamma=st.floats(1.01, 1.4))
-def test_the_gas_comes_back_as_exactly_as_the_forward_model_is_solved(
+def test_the_gas_is_compensated_as_exactly_as_the_forward_model_is_solved(
     seed: int, gamma: float
 ) -> None:
-    # Six rounds, each of which leaves less than k = (gamma - 1)/gamma of what was off.
-    t_ns, force_n = strides(seed)
-    out = modelled(t_ns, force_n, gamma=gamma)
+    # Six rounds, each of which leaves less than k = (gamma - 1)/gamma of the error.
+    t_ns, force_n = draw_load(seed)
+    out = respond(t_ns, force_n, gamma=gamma)
     model = gas.GasModel(*(np.array([x]) for x in (gamma, 0.011, WALL, BASE_KPA)))
     settled = through(
         gas.compute_isothermal_pressure,
@@ -115,16 +115,16 @@ def test_the_gas_comes_back_as_exactly_as_the_forward_model_is_solved(
     assert np.median(off_kpa) < 0.01
 
 
-def test_without_effects_it_is_the_curve_turned_round() -> None:
+def test_a_dome_without_effects_inverts_its_curve() -> None:
     force_n = np.linspace(-2.0, 40.0, 100)
-    out = modelled(np.arange(100) * 10**6, force_n)
+    out = respond(np.arange(100) * 10**6, force_n)
     inside = (force_n >= 0.0) & (force_n <= CURVE.sum())
-    assert apparent_n(out.kpa[inside]) == pytest.approx(force_n[inside], abs=1e-9)
+    assert compute_apparent_n(out.kpa[inside]) == pytest.approx(force_n[inside], abs=1e-9)
     assert out.kpa.tolist() == out.isothermal_kpa.tolist()
     assert (np.diff(out.kpa) > 0.0).all()
 
 
-def test_a_trial_curve_that_turns_over_still_has_pressures() -> None:
+def test_a_trial_curve_that_falls_has_finite_pressures() -> None:
     out = compute_dome_response(
         np.linspace(0, 0.098, 50), np.linspace(0, 60, 50), np.array([20.0, -40.0, 5.0]), SCALE_KPA,
         BASE_KPA, 1.3, 0.011, WALL, np.array(PART), np.array(CREEP_S), np.array(LOOP), WIDTHS_N,

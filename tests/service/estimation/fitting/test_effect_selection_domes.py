@@ -1,11 +1,10 @@
-"""What a bench recording determines of an emulated dome: its effects, and none that it lacks.
+"""Effects that a rig recording determines of an emulated dome: its own, and no others.
 
 The emulated dome shares neither equations nor numbers with the model that is fitted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +16,7 @@ from devices.emulation.surroundings import Surroundings
 from devices.scene.emulation_sections import EmulationSection
 from service.estimation.effects import EffectName
 from service.estimation.models.hysteresis import WIDTHS_N
-from tests.service.estimation.fitting.recordings import found_in, recorded
+from tests.service.estimation.fitting.recordings import Press, fit_effects, record
 
 pytestmark = pytest.mark.slow
 soak = pytest.mark.soak
@@ -25,29 +24,24 @@ soak = pytest.mark.soak
 ALL = {"gas": True, "rubber": True, "hysteresis": True}
 
 
-def pressed_by_dome(
-    serial: str, part: DomeProperties | None = None, **effects: bool
-) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Pressures of an emulated dome, drawn or given, in which only these effects are on."""
+def emulate_dome(part: DomeProperties, **effects: bool) -> Press:
+    """Return the pressures of an emulated dome without the effects set to False."""
 
     def press(t_s: np.ndarray, force_n: np.ndarray) -> np.ndarray:
         class Spindle:
             def forces_n(self, at_s: np.ndarray) -> np.ndarray:
                 return np.array(np.interp(at_s, t_s, force_n))[:, None]
 
-        off = {"gas": False, "rubber": False, "hysteresis": False}
-        scene = EmulationSection.model_validate(off | effects)
-        parts = [draw_dome(serial, 0) if part is None else part]
-        domes = Domes(parts, [serial], Spindle(), scene, Surroundings(scene), label="bench")
+        scene = EmulationSection.model_validate(ALL | effects)
+        domes = Domes([part], ["T01"], Spindle(), scene, Surroundings(scene), label="rig")
         return np.array([domes.compute_pressure_kpa(0, float(t)) for t in t_s])
 
     return press
 
 
-def test_of_an_emulated_dome_all_effects_are_found_about_as_great_as_they_are() -> None:
-    part: DomeProperties = draw_dome("T02", 0)
-    press = pressed_by_dome("T02", gas=True, rubber=True, hysteresis=True)
-    effects = found_in(recorded(press, scatter=0.0))
+def test_all_effects_of_a_dome_are_found_in_their_size() -> None:
+    part = draw_dome("T02", 0)
+    effects = fit_effects(record(emulate_dome(part), scatter=0.0))
     assert set(effects.refused) == {"temperature", "ambient"}
     assert effects.gas is not None
     assert 1.1 < effects.gas.gamma.value < 1.4
@@ -63,9 +57,9 @@ def test_of_an_emulated_dome_all_effects_are_found_about_as_great_as_they_are() 
     assert width_n == pytest.approx(part.loop_n, rel=0.35)
 
 
-def test_of_an_emulated_dome_the_flowing_part_of_its_loop_is_found() -> None:
+def test_the_flowing_part_of_a_loop_is_found() -> None:
     part = replace(draw_dome("T02", 0), loop_n=0.1, viscous_n=0.3)
-    effects = found_in(recorded(pressed_by_dome("T02", part, **ALL), scatter=0.0))
+    effects = fit_effects(record(emulate_dome(part), scatter=0.0))
     assert effects.hysteresis is not None
     flow = effects.hysteresis.flow
     assert flow is not None
@@ -78,11 +72,9 @@ def test_of_an_emulated_dome_the_flowing_part_of_its_loop_is_found() -> None:
 @pytest.mark.parametrize(
     "serial", ["T01", *(pytest.param(other, marks=soak) for other in ("T03", "T04", "T05"))]
 )
-def test_a_dome_that_is_sampled_at_another_instant_keeps_its_gas(
-    serial: str, late_s: float
-) -> None:
-    press = pressed_by_dome(serial, gas=True, rubber=True, hysteresis=True)
-    effects = found_in(recorded(press, scatter=0.0, late_s=late_s))
+def test_a_dome_with_a_delay_keeps_its_gas(serial: str, late_s: float) -> None:
+    press = emulate_dome(draw_dome(serial, 0))
+    effects = fit_effects(record(press, scatter=0.0, late_s=late_s))
     assert set(effects.refused) == {"temperature", "ambient"}
     assert effects.gas is not None
     assert effects.gas.gamma.value <= 1.4
@@ -92,7 +84,7 @@ def test_a_dome_that_is_sampled_at_another_instant_keeps_its_gas(
 
 @pytest.mark.parametrize("gamma_tau_s", [0.036, 0.012])
 @pytest.mark.parametrize("seed", [0, *(pytest.param(other, marks=soak) for other in (1, 2))])
-def test_a_gas_that_cools_as_fast_as_the_rubber_creeps_is_not_given_up_for_the_creep(
+def test_a_gas_that_cools_as_fast_as_the_rubber_creeps_is_found(
     gamma_tau_s: float, seed: int
 ) -> None:
     drawn = draw_dome("T01", seed)
@@ -102,8 +94,7 @@ def test_a_gas_that_cools_as_fast_as_the_rubber_creeps_is_not_given_up_for_the_c
         creep_parts=(0.05, 0.03, 0.03),
         creep_s=(0.03, 0.4, 3.0),
     )
-    press = pressed_by_dome("T01", part, **ALL)
-    effects = found_in(recorded(press, scatter=0.02, late_s=233e-6, seed=seed))
+    effects = fit_effects(record(emulate_dome(part), scatter=0.02, late_s=233e-6, seed=seed))
     assert set(effects.refused) == {"temperature", "ambient"}
     assert effects.gas is not None
     assert 1.15 < effects.gas.gamma.value <= 1.4
@@ -112,8 +103,8 @@ def test_a_gas_that_cools_as_fast_as_the_rubber_creeps_is_not_given_up_for_the_c
     assert total == pytest.approx(0.11, rel=0.5)
 
 
-def test_a_gas_that_is_quick_is_kept_beside_rubber_that_flows() -> None:
-    # Its time and gamma make up for one another: neither is known well, and yet it is there.
+def test_a_quick_gas_is_found_beside_flowing_rubber() -> None:
+    # Its time and gamma compensate each other: neither is known well.
     part = replace(
         draw_dome("T01", 0),
         kappa=0.18 / 1.18,
@@ -123,7 +114,7 @@ def test_a_gas_that_is_quick_is_kept_beside_rubber_that_flows() -> None:
         loop_n=0.05,
         viscous_n=0.31,
     )
-    effects = found_in(recorded(pressed_by_dome("T01", part, **ALL), scatter=0.01))
+    effects = fit_effects(record(emulate_dome(part), scatter=0.01))
     assert effects.gas is not None
     assert 1.03 < effects.gas.gamma.value < 1.25
     assert effects.gas.gamma.value - 1.0 < 5.0 * effects.gas.gamma.sigma
@@ -131,14 +122,14 @@ def test_a_gas_that_is_quick_is_kept_beside_rubber_that_flows() -> None:
     assert effects.hysteresis.flow is not None
 
 
-def test_creep_over_seconds_is_not_taken_for_rubber_that_flows() -> None:
+def test_creep_over_seconds_is_no_flow() -> None:
     part = replace(
         draw_dome("T01", 0),
         creep_parts=(0.002, 0.003, 0.019, 0.009),
         creep_s=(0.084, 0.363, 1.078, 3.515),
         loop_n=0.0,
     )
-    effects = found_in(recorded(pressed_by_dome("T01", part, **ALL), scatter=0.01))
+    effects = fit_effects(record(emulate_dome(part), scatter=0.01))
     assert effects.hysteresis is None
     assert effects.rubber is not None
     assert sum(p.value for p in effects.rubber.part) == pytest.approx(0.033, abs=0.015)
@@ -153,15 +144,14 @@ def test_creep_over_seconds_is_not_taken_for_rubber_that_flows() -> None:
         ((0.03, 0.03, 0.04, 0.04), (0.015, 0.1, 0.8, 6.0), {3}),
     ],
 )
-def test_as_many_terms_of_creep_are_found_as_the_bench_can_tell_apart(
+def test_creep_has_as_many_terms_as_the_rig_determines(
     parts: tuple[float, ...], times_s: tuple[float, ...], terms: set[int]
 ) -> None:
     part = replace(draw_dome("T02", 0), creep_parts=parts, creep_s=times_s)
-    press = pressed_by_dome("T02", part, **ALL)
-    effects = found_in(recorded(press, scatter=0.01))
+    effects = fit_effects(record(emulate_dome(part), scatter=0.01))
     assert effects.rubber is not None
     assert len(effects.rubber.part) in terms
-    # What of a force has come after 0.1 s, and after a second, is what matters of it.
+    # Creep after 0.1 s and after a second matters.
     for at_s in (0.1, 1.0):
         found = sum(
             g.value * np.exp(-at_s / tau.value)
@@ -172,13 +162,12 @@ def test_as_many_terms_of_creep_are_found_as_the_bench_can_tell_apart(
 
 
 @pytest.mark.parametrize("missing", ["gas", "rubber", "hysteresis"])
-def test_an_effect_that_an_emulated_dome_does_not_have_is_refused_in_words(
+def test_an_effect_that_a_dome_lacks_is_refused_with_a_reason(
     missing: EffectName,
 ) -> None:
-    on = {name: name != missing for name in ("gas", "rubber", "hysteresis")}
-    press = pressed_by_dome("T02", None, **on)
-    effects = found_in(recorded(press, scatter=0.0, strokes=2, holds=2, taps=6))
+    press = emulate_dome(draw_dome("T02", 0), **{missing: False})
+    effects = fit_effects(record(press, scatter=0.0, strokes=2, holds=2, taps=6))
     assert getattr(effects, missing) is None
     assert effects.refused[missing].endswith(("not determined", " N"))
-    for name in on:
+    for name in ALL:
         assert (getattr(effects, name) is None) == (name == missing), name

@@ -12,10 +12,8 @@ from hypothesis import strategies as st
 
 from service.estimation.models.skew import initial_state, interpolate_to_frame
 
-PERIOD_NS = 2_000_000
 
-
-def lined_up(
+def align(
     values: list[float], t_ns: list[int], frame_t_ns: list[int], broken: Sequence[int] = ()
 ) -> list[float]:
     state = initial_state(1)[0]
@@ -24,35 +22,30 @@ def lined_up(
 
 
 @given(
-    late_ns=st.integers(0, PERIOD_NS),
+    late_ns=st.integers(0, 2_000_000),
     rise_n=st.floats(-10, 10),
-    steps_ns=st.lists(st.integers(PERIOD_NS, 60 * 10**9), min_size=2, max_size=20),
+    steps_ns=st.lists(st.integers(2_000_000, 60 * 10**9), min_size=2, max_size=20),
 )
-def test_on_a_straight_line_it_is_exact(late_ns: int, rise_n: float, steps_ns: list[int]) -> None:
+def test_a_straight_line_is_aligned_exactly(
+    late_ns: int, rise_n: float, steps_ns: list[int]
+) -> None:
     frame_ns = np.cumsum(steps_ns)
     sampled_ns = frame_ns + late_ns
-    out = lined_up((rise_n * sampled_ns * 1e-9).tolist(), sampled_ns.tolist(), frame_ns.tolist())
-    expected = rise_n * frame_ns * 1e-9
-    assert out[1:] == pytest.approx(expected[1:], abs=1e-9)
+    out = align((rise_n * sampled_ns * 1e-9).tolist(), sampled_ns.tolist(), frame_ns.tolist())
+    assert out[1:] == pytest.approx(rise_n * frame_ns[1:] * 1e-9, abs=1e-9)
 
 
-def test_a_tile_sampled_with_its_frame_is_left_as_it_is() -> None:
-    assert lined_up([1.0, 5.0, 2.0], [0, 10, 20], [0, 10, 20]) == [1.0, 5.0, 2.0]
+@pytest.mark.parametrize("t_ns", [[0, 10, 20], [10, 10, 4]], ids=["later", "at once or back"])
+def test_a_tile_sampled_with_its_frame_keeps_its_values(t_ns: list[int]) -> None:
+    assert align([1.0, 5.0, 2.0], t_ns, t_ns) == [1.0, 5.0, 2.0]
 
 
-def test_nothing_is_drawn_across_a_gap_or_from_a_missing_value() -> None:
+def test_no_line_crosses_a_gap_or_a_missing_value() -> None:
     values, t_ns = [0.0, 4.0, 8.0, math.nan, 4.0, 8.0], [5, 15, 25, 35, 45, 55]
-    frame_ns = [t - 5 for t in t_ns]
-    out = lined_up(values, t_ns, frame_ns, broken=[2])
+    out = align(values, t_ns, [t - 5 for t in t_ns], broken=[2])
     assert out == pytest.approx([0.0, 2.0, 8.0, math.nan, 4.0, 6.0], nan_ok=True)
 
 
 @pytest.mark.parametrize("frame_ns", [-1, 4, 21, 10**18])
-def test_an_instant_that_does_not_lie_between_two_samples_is_none_of_its_business(
-    frame_ns: int,
-) -> None:
-    assert lined_up([1.0, 3.0], [5, 20], [0, frame_ns])[1] == 3.0
-
-
-def test_samples_at_one_instant_or_back_in_time_are_left_as_they_are() -> None:
-    assert lined_up([1.0, 2.0, 3.0], [10, 10, 4], [10, 10, 4]) == [1.0, 2.0, 3.0]
+def test_an_instant_outside_two_samples_keeps_the_value(frame_ns: int) -> None:
+    assert align([1.0, 3.0], [5, 20], [0, frame_ns])[1] == 3.0

@@ -1,12 +1,15 @@
-"""Sums and centres of pressure worked out by hand, where there is none, and the ground frame."""
+"""GRF and centre of pressure worked out by hand, masks of the COP, and the ground frame."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from devices.flags import EstimateFlag, FrameFlag
 from devices.frames import NO_SERVO_COUNTS
@@ -15,11 +18,16 @@ from service.estimation.records import Estimates
 from tests.builders.arrays import COUNT_KPA, array_at, make_servo
 from tests.builders.calibrations import newton_tile
 from tests.builders.estimates import estimate, newton_plan
-from tests.builders.frames import loaded_frames
-from tests.service.estimation.feet import COP, SQUARE, held
+from tests.builders.frames import cut_up, loaded_frames
+from tests.service.estimation.feet import (
+    COP,
+    SQUARE,
+    draw_wild_frames,
+    estimate_load,
+    repeat_load,
+)
 
 LINE = [(-0.021, 0.0, -0.15), (-0.007, 0.0, -0.15), (0.007, 0.0, -0.15), (0.021, 0.0, -0.15)]
-
 
 # --- sums and centres -----------------------------------------------------------------------------
 
@@ -30,7 +38,7 @@ def test_the_sum_is_never_clamped() -> None:
     assert grf_n == pytest.approx([3 * k - 1 for k in range(-4, 5)], abs=1e-10)
 
 
-def test_in_flight_the_sum_is_unbiased() -> None:
+def test_the_sum_has_no_bias_in_flight() -> None:
     # The paper's curve, 0.2 N a count, under 1.3 counts of noise: 0.5 N in all, so the mean of
     # 40,000 frames is good to 0.003 N. Clipped at zero it would be 0.4 N.
     noise = np.random.default_rng(5).normal(0, 1.3, (40_000, 4))
@@ -43,236 +51,254 @@ def test_in_flight_the_sum_is_unbiased() -> None:
 
 def test_zero_load_has_no_centre_and_no_warning() -> None:
     plan = newton_plan(array_at(SQUARE))
-    exact = replace(
-        plan.tare, baseline_kpa=plan.compensation.compute_kpa([[500] * 4], [[480] * 4])[0]
-    )
-    e = estimate(replace(plan, tare=exact), loaded_frames(held([0] * 4)))
+    unloaded_kpa = plan.compensation.compute_kpa([[500] * 4], [[480] * 4])[0]
+    plan = replace(plan, tare=replace(plan.tare, baseline_kpa=unloaded_kpa))
+    e = estimate_load([0] * 4, plan)
     assert e.grf_n.tolist() == [0.0] * 12
     assert all(np.isnan(getattr(e, name)).all() for name in COP)
 
 
-def test_the_centre_of_pressure_on_a_grid_is_that_worked_out_by_hand() -> None:
-    # 10 and 20 N at y = 0, 30 and 40 N at y = 10 mm; 60 of 100 N at x = 20 mm
-    e = estimate(newton_plan(array_at(SQUARE)), loaded_frames(held([10, 20, 30, 40])))
-    assert e.cop_x_m[-1] == pytest.approx(0.012, abs=1e-12)
-    assert e.cop_y_m[-1] == pytest.approx(0.007, abs=1e-12)
-    assert e.cop_index_x[-1] == pytest.approx(1.6, abs=1e-10)
-    assert e.cop_index_y[-1] == pytest.approx(1.7, abs=1e-10)
-    assert np.isnan(e.cop_x_m[:5]).all()  # contact is not believed yet
-
-
-def test_the_centre_of_pressure_on_a_line_is_that_worked_out_by_hand() -> None:
-    # (-21 * 4 - 7 * 8 + 7 * 12 + 21 * 16) / 40 mm; index (1 * 4 + 2 * 8 + 3 * 12 + 4 * 16) / 40
-    e = estimate(newton_plan(array_at(LINE)), loaded_frames(held([4, 8, 12, 16])))
-    assert e.cop_x_m[-1] == pytest.approx(0.007, abs=1e-12)
-    assert np.isnan(e.cop_y_m).all()
-    assert e.cop_index_x[-1] == pytest.approx(3.0, abs=1e-10)
-    assert e.cop_index_y[-1] == pytest.approx(1.0, abs=1e-10)
+@pytest.mark.parametrize(
+    ("positions", "forces_n", "cop_x_m", "cop_y_m", "index"),
+    [
+        # 10 and 20 N at y = 0, 30 and 40 N at y = 10 mm; 60 of 100 N at x = 20 mm
+        (SQUARE, [10, 20, 30, 40], 0.012, 0.007, (1.6, 1.7)),
+        # (-21 * 4 - 7 * 8 + 7 * 12 + 21 * 16) / 40 mm; index (1 * 4 + 2 * 8 + 3 * 12 + 4 * 16) / 40
+        (LINE, [4, 8, 12, 16], 0.007, np.nan, (3.0, 1.0)),
+        (SQUARE[:3], [10, 20, 30], 0.02 * 20 / 60, 0.01 * 30 / 60, (np.nan, np.nan)),
+        (SQUARE, [0, 20, 30, 40], 0.02 * 60 / 90, 0.01 * 70 / 90, (1 + 60 / 90, 1 + 70 / 90)),
+    ],
+    ids=["grid", "line", "no grid", "a punctured tile"],
+)
+def test_sum_and_centre_are_worked_out_by_hand(
+    positions: list[tuple[float, float, float]],
+    forces_n: list[float],
+    cop_x_m: float,
+    cop_y_m: float,
+    index: tuple[float, float],
+) -> None:
+    e = estimate_load(forces_n, newton_plan(array_at(positions)))
+    assert e.grf_n[-1] == pytest.approx(sum(forces_n))
+    found = [e.cop_x_m[-1], e.cop_y_m[-1], e.cop_index_x[-1], e.cop_index_y[-1]]
+    assert found == pytest.approx([cop_x_m, cop_y_m, *index], abs=1e-10, nan_ok=True)
+    assert np.isnan(e.cop_x_m[:5]).all(), "contact is not certain yet"
 
 
 def test_the_papers_index_weighs_with_pressure_and_counts_from_one() -> None:
     # The right tile needs three times the force for the same pressure: 10 and 30 N at 10 counts.
     tiles = [newton_tile("T01"), newton_tile("T02", f_scale_n=3.0)]
-    positions = [(0.0, 0.0, -0.15), (0.02, 0.0, -0.15)]
-    e = estimate(newton_plan(array_at(positions), tiles=tiles), loaded_frames(held([10, 10])))
-    assert e.grf_n[-1] == pytest.approx(40)
-    assert e.cop_x_m[-1] == pytest.approx(0.015)
-    assert e.cop_index_x[-1] == pytest.approx(1.5)
+    e = estimate_load([10, 10], newton_plan(array_at(SQUARE[:2]), tiles=tiles))
+    assert [e.grf_n[-1], e.cop_x_m[-1], e.cop_index_x[-1]] == pytest.approx([40, 0.015, 1.5])
 
 
-def test_tiles_that_fill_no_grid_have_a_centre_and_no_index() -> None:
-    e = estimate(newton_plan(array_at(SQUARE[:3])), loaded_frames(held([10, 20, 30])))
-    assert e.cop_x_m[-1] == pytest.approx(0.02 * 20 / 60)
-    assert np.isnan(e.cop_index_x).all()
-    assert np.isnan(e.cop_index_y).all()
-
-
-def test_a_reference_tile_is_in_no_sum_and_flags_nothing() -> None:
+def test_a_reference_tile_is_in_no_sum_and_raises_no_flag() -> None:
     plan = newton_plan(array_at([*SQUARE, (0.9, 0.9, -0.15)], references=[4]))
-    for surroundings in (80.0, 300.0, -90.0, np.nan):
-        e = estimate(plan, loaded_frames(held([10, 20, 30, 40, surroundings])))
+    for ambient_counts in (80.0, 300.0, -90.0, np.nan):
+        e = estimate_load([10, 20, 30, 40, ambient_counts], plan)
         assert e.estimate_flags[-1] == 0
-        assert e.grf_n[-1] == pytest.approx(100)
-        assert e.grf_sigma_n[-1] == pytest.approx(1.0)  # four times 0.5 N
-        assert e.cop_x_m[-1] == pytest.approx(0.012)
-        assert e.cop_index_x[-1] == pytest.approx(1.6)
-        assert np.isnan(e.force_n[-1, 4])
-        assert np.isnan(e.force_sigma_n[-1, 4])
-        if not np.isnan(surroundings):
-            assert e.gauge_kpa[-1, 4] == pytest.approx(surroundings * COUNT_KPA)
+        found = [e.grf_n[-1], e.grf_sigma_n[-1], e.cop_x_m[-1], e.cop_index_x[-1]]
+        assert found == pytest.approx([100, 1.0, 0.012, 1.6])  # four times 0.5 N
+        assert np.isnan([e.force_n[-1, 4], e.force_sigma_n[-1, 4]]).all()
+        expected_kpa = ambient_counts * COUNT_KPA
+        assert e.gauge_kpa[-1, 4] == pytest.approx(expected_kpa, nan_ok=True)
 
 
-def test_sigma_of_sum_and_centre_are_those_of_independent_tiles() -> None:
+def test_sigmas_of_sum_and_centre_are_of_independent_tiles() -> None:
     # COP at 12 and 7 mm of 100 N; each newton moves it by (x - 12 mm) / 100 N, likewise y
-    e = estimate(newton_plan(array_at(SQUARE), sigma_n=0.5), loaded_frames(held([10, 20, 30, 40])))
+    e = estimate_load([10, 20, 30, 40], newton_plan(array_at(SQUARE), sigma_n=0.5))
     assert e.force_sigma_n[-1] == pytest.approx([0.5] * 4)
     assert e.grf_sigma_n[-1] == pytest.approx(1.0)
-    by_x_m = math.sqrt(2 * 0.012**2 + 2 * 0.008**2) * 0.5 / 100
-    by_y_m = math.sqrt(2 * 0.007**2 + 2 * 0.003**2) * 0.5 / 100
-    assert e.cop_sigma_x_m[-1] == pytest.approx(by_x_m)
-    assert e.cop_sigma_y_m[-1] == pytest.approx(by_y_m)
+    of_x_m = math.sqrt(2 * 0.012**2 + 2 * 0.008**2) * 0.5 / 100
+    of_y_m = math.sqrt(2 * 0.007**2 + 2 * 0.003**2) * 0.5 / 100
+    assert [e.cop_sigma_x_m[-1], e.cop_sigma_y_m[-1]] == pytest.approx([of_x_m, of_y_m])
 
 
-def test_a_punctured_tile_pulls_the_sum_and_raises_no_flag() -> None:
-    e = estimate(newton_plan(array_at(SQUARE)), loaded_frames(held([0, 20, 30, 40])))
-    assert e.grf_n[-1] == pytest.approx(90)
-    assert e.cop_x_m[-1] == pytest.approx(0.02 * 60 / 90)
+# --- masks of the centre --------------------------------------------------------------------------
 
 
-# --- where there is no centre of pressure ---------------------------------------------------------
-
-
-def masked(e: Estimates, measured: str = "xy") -> list[bool]:
-    """Which rows have no centre; the flag and all its columns along measured axes must agree."""
-    out = (e.estimate_flags & EstimateFlag.COP_MASKED) != 0
+def find_masked(e: Estimates, measured: str) -> list[bool]:
+    """Find frames without a centre; the flag and all columns along measured axes must agree."""
+    masked = (e.estimate_flags & EstimateFlag.COP_MASKED) != 0
     for name in COP:
-        axis = name.removesuffix("_m")[-1]
-        is_there = axis in measured or "index" in name
-        expected = out if is_there else np.ones(len(e), dtype=bool)
+        is_measured = name.removesuffix("_m")[-1] in measured or "index" in name
+        expected = masked if is_measured else np.ones(len(e), dtype=bool)
         assert np.isnan(getattr(e, name)).tolist() == expected.tolist(), name
-    return [bool(row) for row in out]
+    return [bool(row) for row in masked]
 
 
-def test_no_centre_without_contact_however_good_it_would_be() -> None:
-    e = estimate(newton_plan(array_at(SQUARE)), loaded_frames(held([30] * 4, 12)))
-    assert masked(e) == [True] * 5 + [False] * 7
+def test_a_load_without_contact_has_no_centre() -> None:
+    assert find_masked(estimate_load([30] * 4), "xy") == [True] * 5 + [False] * 7
 
 
-def test_no_centre_that_is_too_uncertain() -> None:
-    # Tiles 200 mm apart with 0.5 N each: sigma is 100 mm * sqrt(2) * 0.5 N / GRF, 3 mm at 23.6 N.
-    far = array_at([(-0.1, 0.0, -0.15), (0.1, 0.0, -0.15)])
-    near_enough = estimate(newton_plan(far), loaded_frames(held([12, 12])))
-    assert near_enough.cop_sigma_x_m[-1] == pytest.approx(0.1 * math.sqrt(0.5) / 24)
-    assert not masked(near_enough, "x")[-1]
-    assert masked(estimate(newton_plan(far), loaded_frames(held([11, 11]))), "x")[-1]
-    across = array_at([(0.0, -0.1, -0.15), (0.0, 0.1, -0.15)])
-    assert not masked(estimate(newton_plan(across), loaded_frames(held([12, 12]))), "y")[-1]
-    assert masked(estimate(newton_plan(across), loaded_frames(held([11, 11]))), "y")[-1]
+NEAR = [(0.0, 0.0, -0.15), (0.014, 0.0, -0.15)]
+FAR = [(-0.1, 0.0, -0.15), (0.1, 0.0, -0.15)]
+ACROSS = [(0.0, -0.1, -0.15), (0.0, 0.1, -0.15)]
 
 
-def test_no_centre_below_five_sigma_of_load() -> None:
+@pytest.mark.parametrize(
+    ("positions", "measured", "forces_n", "is_masked"),
+    [
+        # Tiles 200 mm apart with 0.5 N each: sigma is 100 mm * sqrt(2) * 0.5 N / GRF, 3 mm at
+        # 23.6 N.
+        (FAR, "x", [12, 12], False),
+        (FAR, "x", [11, 11], True),
+        (ACROSS, "y", [12, 12], False),
+        (ACROSS, "y", [11, 11], True),
+        # 40 N here and -k there is 14 mm * k / (40 - k) beyond the last tile, with a sigma of about
+        # 14 mm * 0.5 N / 40 N, of which three may be chance.
+        (NEAR, "x", [40, 0], False),
+        (NEAR, "x", [40, -1], False),
+        (NEAR, "x", [40, -2], True),
+    ],
+)
+def test_an_uncertain_centre_or_one_outside_the_tiles_is_masked(
+    positions: list[tuple[float, float, float]],
+    measured: str,
+    forces_n: list[float],
+    is_masked: bool,
+) -> None:
+    e = estimate_load(forces_n, newton_plan(array_at(positions)))
+    assert find_masked(e, measured)[-1] == is_masked
+
+
+def test_a_load_below_five_sigma_has_no_centre() -> None:
     # Tiles a millimetre apart, so that the centre itself is certain; sigma of the sum 1.41 N.
-    # Contact holds down to 3 sigma (4.24 N), a centre only to 5 sigma (7.07 N).
+    # Contact lasts down to 3 sigma (4.24 N), a centre only to 5 sigma (7.07 N).
     close = array_at([(0.0, 0.0, -0.15), (0.001, 0.0, -0.15)])
-    forces_n = np.concatenate([held([20, 20], 10), held([4, 4], 10), held([4, 3], 10)])
-    e = estimate(newton_plan(close, sigma_n=1.0), loaded_frames(forces_n))
+    loads_n = [repeat_load(forces_n, 10) for forces_n in ([20, 20], [4, 4], [4, 3])]
+    e = estimate(newton_plan(close, sigma_n=1.0), loaded_frames(np.concatenate(loads_n)))
     assert (e.contact[10:] == 1).all()
-    assert masked(e, "x")[10:] == [False] * 10 + [True] * 10
+    assert find_masked(e, "x")[10:] == [False] * 10 + [True] * 10
 
 
-def test_no_centre_outside_the_tiles_except_by_noise() -> None:
-    # 40 N here and -k there puts it 14 mm * k / (40 - k) beyond the last tile, with a sigma of
-    # about 14 mm * 0.5 N / 40 N: three of them are let through, so -1 N is and -2 N is not.
-    pair = array_at([(0.0, 0.0, -0.15), (0.014, 0.0, -0.15)])
-    plan = newton_plan(pair, sigma_n=0.5)
-    assert not masked(estimate(plan, loaded_frames(held([40, 0]))), "x")[-1]
-    by_noise = estimate(plan, loaded_frames(held([40, -1])))
-    assert not masked(by_noise, "x")[-1]
-    assert by_noise.cop_x_m[-1] == pytest.approx(-0.014 / 39)
-    assert masked(estimate(plan, loaded_frames(held([40, -2]))), "x")[-1]
+# --- axes that a layout measures ------------------------------------------------------------------
+
+ALONG = {
+    "x": ("cop_x_m", "cop_sigma_x_m", "cop_ground_x_m"),
+    "y": ("cop_y_m", "cop_sigma_y_m", "cop_ground_y_m"),
+}
+
+
+@pytest.mark.parametrize(
+    ("positions", "measured"),
+    [(SQUARE, "xy"), (SQUARE[2:], "x"), ([SQUARE[1], SQUARE[3]], "y"), (SQUARE[3:], "")],
+    ids=["square", "row along x", "row along y", "one tile"],
+)
+@pytest.mark.parametrize("degrees", [0, 20])
+def test_a_centre_is_a_number_along_measured_axes_only(
+    positions: list[tuple[float, float, float]], measured: str, degrees: int
+) -> None:
+    # A bare tile elsewhere bears no load, and measures no axis.
+    places = [*positions, (0.3, 0.3, -0.15)]
+    info = array_at(places, references=[len(positions)], servo=make_servo())
+    counts = 2048 + round(4096 * degrees / 360)
+    e = estimate_load([30.0] * len(positions) + [0.0], newton_plan(info), servo_counts=counts)
+    assert (e.contact[-1], e.estimate_flags[-1]) == (1, 0), "a frame in contact is not masked"
+    for axis, names in ALONG.items():
+        for name in names:
+            values = getattr(e, name)
+            assert np.isfinite(values[-1]) == (axis in measured), name
+            assert axis in measured or np.isnan(values).all(), name
+            assert axis not in measured or "sigma" not in name or values[-1] > 0.0
+
+
+@pytest.mark.parametrize(("apart_m", "is_row"), [(1e-6, True), (2e-6, False)])
+def test_tiles_a_micrometre_apart_are_in_one_row(apart_m: float, is_row: bool) -> None:
+    pair = array_at([(0.0, 0.0, -0.15), (0.02, apart_m, -0.15)])
+    assert newton_plan(pair).cop_measured == (True, not is_row)
+
+
+PLACES_M = st.sampled_from([-0.012, 0.0, 0.009, 0.02])
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    places=st.lists(st.tuples(PLACES_M, PLACES_M), min_size=1, max_size=5),
+    seed=st.integers(0, 2**32 - 1),
+    lag_ms=st.sampled_from([0.0, 20.0]),
+)
+def test_an_axis_that_is_not_measured_changes_no_other_bit(
+    places: list[tuple[float, float]], seed: int, lag_ms: float
+) -> None:
+    info = array_at([(x_m, y_m, -0.15) for x_m, y_m in places], servo=make_servo())
+    plan = newton_plan(info, lag_ms=lag_ms)
+    frames = draw_wild_frames(120, len(places), seed)
+    found = estimate(plan, *cut_up(frames, [7, 40]))
+    with_both_axes = estimate(replace(plan, cop_measured=(True, True)), frames)
+    is_row = dict(
+        zip("xy", (len(set(axis)) == 1 for axis in zip(*places, strict=True)), strict=True)
+    )
+    unmeasured = {name for axis in "xy" if is_row[axis] for name in ALONG[axis]}
+    for field in fields(Estimates):
+        values = getattr(found, field.name)
+        if field.name in unmeasured:
+            assert np.isnan(values).all(), field.name
+        else:
+            assert values.tobytes() == getattr(with_both_axes, field.name).tobytes(), field.name
+    masked = (found.estimate_flags & EstimateFlag.COP_MASKED) != 0
+    for axis, is_unmeasured in is_row.items():
+        assert is_unmeasured or (np.isnan(getattr(found, f"cop_{axis}_m")) == masked).all()
 
 
 # --- servo and ground frame -----------------------------------------------------------------------
 
 
-def test_a_foot_without_servo_has_no_angle_and_no_ground_frame() -> None:
-    e = estimate(
-        newton_plan(array_at(SQUARE)), loaded_frames(held([9] * 4), servo_counts=[2048] * 12)
-    )
-    assert np.isnan(e.angle_rad).all()
-    assert np.isnan(e.cop_ground_x_m).all()
-    assert np.isnan(e.cop_ground_y_m).all()
-
-
 @pytest.mark.parametrize("degrees", [-80, -45, 0, 8, 45, 80])
-def test_a_rolling_foot_stands_where_its_ankle_is(degrees: int) -> None:
+def test_a_rolling_foot_stands_under_its_ankle(degrees: int) -> None:
     # Tiles about a place on an arc of 150 mm touch at its own arc angle, right under an ankle
     # that has come 150 mm a radian. 4096 counts a turn: 8 degrees are 91 counts, to a half.
     counts = round(degrees / 360 * 4096)
     arc_rad = counts / 4096 * 2 * math.pi
-    info = array_at(
-        [
-            (
-                0.15 * math.sin(arc_rad) + along_m * math.cos(arc_rad),
-                y_m,
-                along_m * math.sin(arc_rad) - 0.15 * math.cos(arc_rad),
-            )
-            for y_m in (-0.01, 0.01)
-            for along_m in (-0.005, 0.005)
-        ],
-        servo=make_servo(),
-    )
-    e = estimate(
-        newton_plan(info),
-        loaded_frames(held([15, 15, 5, 5]), servo_counts=np.full(12, 2048 + counts)),
-    )
-    assert e.angle_rad[-1] == pytest.approx(arc_rad, abs=1e-15)
-    assert e.cop_ground_x_m[-1] == pytest.approx(0.15 * arc_rad, abs=1e-12)
-    assert e.cop_ground_y_m[-1] == pytest.approx(-0.005, abs=1e-12)
+    sin, cos = math.sin(arc_rad), math.cos(arc_rad)
+    places = [
+        (0.15 * sin + along_m * cos, y_m, along_m * sin - 0.15 * cos)
+        for y_m in (-0.01, 0.01)
+        for along_m in (-0.005, 0.005)
+    ]
+    plan = newton_plan(array_at(places, servo=make_servo()))
+    e = estimate_load([15, 15, 5, 5], plan, servo_counts=2048 + counts)
+    found = [e.angle_rad[-1], e.cop_ground_x_m[-1], e.cop_ground_y_m[-1]]
+    assert found == pytest.approx([arc_rad, 0.15 * arc_rad, -0.005], abs=1e-12)
 
 
 def test_the_ground_frame_uses_the_height_of_the_centre() -> None:
     # Centre at x = 15 mm, z = -0.145 m; at 30 degrees with an ankle that stays where it is
-    info = array_at(
-        [(0.0, 0.0, -0.16), (0.02, 0.0, -0.14)],
-        servo=make_servo(ratio=1 / 3, ankle_travel_m_per_rad=0.0),
-    )
-    e = estimate(
-        newton_plan(info), loaded_frames(held([10, 30]), servo_counts=np.full(12, 2048 + 1024))
-    )
+    servo = make_servo(ratio=1 / 3, ankle_travel_m_per_rad=0.0)
+    info = array_at([(0.0, 0.0, -0.16), (0.02, 0.0, -0.14)], servo=servo)
+    e = estimate_load([10, 30], newton_plan(info), servo_counts=2048 + 1024)
     assert e.angle_rad[-1] == pytest.approx(math.pi / 6)
     expected_m = 0.015 * math.cos(math.pi / 6) - 0.145 * 0.5
     assert e.cop_ground_x_m[-1] == pytest.approx(expected_m, abs=1e-12)
 
 
-def test_unknown_travel_leaves_the_angle_and_no_ground_frame() -> None:
-    plan = newton_plan(array_at(SQUARE, servo=make_servo(ankle_travel_m_per_rad=None)))
-    e = estimate(plan, loaded_frames(held([9] * 4), servo_counts=[2048] * 12))
-    assert e.angle_rad.tolist() == [0.0] * 12
-    assert np.isfinite(e.cop_x_m[-1])
-    assert np.isnan(e.cop_ground_x_m).all()
-    assert np.isnan(e.cop_ground_y_m).all()
+UNKNOWN_TRAVEL = make_servo(ankle_travel_m_per_rad=None)
 
 
 @pytest.mark.parametrize(
-    "columns",
+    ("servo", "columns", "angle_rad"),
     [
-        {"servo_counts": [NO_SERVO_COUNTS] * 12},
-        {"servo_counts": [2048] * 12, "frame_flags": [FrameFlag.SERVO_STALE] * 12},
-        {"servo_counts": [2048] * 12, "frame_flags": [FrameFlag.SERVO_TURN_UNKNOWN] * 12},
+        (None, {"servo_counts": 2048}, np.nan),
+        (UNKNOWN_TRAVEL, {"servo_counts": 2048}, 0.0),
+        (make_servo(), {"servo_counts": NO_SERVO_COUNTS}, np.nan),
+        (make_servo(), {"servo_counts": 2048, "frame_flags": FrameFlag.SERVO_STALE}, np.nan),
+        (make_servo(), {"servo_counts": 2048, "frame_flags": FrameFlag.SERVO_TURN_UNKNOWN}, np.nan),
     ],
+    ids=["no servo", "unknown travel", "no counts", "stale", "unknown turn"],
 )
-def test_a_servo_whose_position_or_turn_is_not_known_gives_nan_and_the_foot_goes_on(
-    columns: dict[str, list[int]],
+def test_a_foot_of_unknown_angle_or_travel_has_no_ground_frame(
+    servo: Any, columns: dict[str, int], angle_rad: float
 ) -> None:
-    e = estimate(
-        newton_plan(array_at(SQUARE, servo=make_servo())), loaded_frames(held([9] * 4), **columns)
-    )
-    assert np.isnan(e.angle_rad).all()
+    e = estimate_load([9] * 4, newton_plan(array_at(SQUARE, servo=servo)), **columns)
+    assert e.angle_rad == pytest.approx([angle_rad] * 12, nan_ok=True)
     assert np.isnan(e.cop_ground_x_m).all()
+    assert np.isnan(e.cop_ground_y_m[-1]) == (servo in (None, UNKNOWN_TRAVEL))
     assert e.cop_x_m[-1] == pytest.approx(0.01)
     assert e.estimate_flags[-1] == 0
 
 
-def test_an_angle_goes_on_over_the_end_of_a_turn() -> None:
+def test_an_angle_continues_over_the_end_of_a_turn() -> None:
     counts = [4094, 4095, 4096, 4097, 8191, 8192, 1, 0, -1, -2, -4096, -4097]
     plan = newton_plan(array_at(SQUARE, servo=make_servo(ratio=0.1)))
-    angle_rad = estimate(plan, loaded_frames(held([9] * 4), servo_counts=counts)).angle_rad
+    angle_rad = estimate_load([9] * 4, plan, servo_counts=counts).angle_rad
     expected = [0.1 * (c - 2048) / 4096 * 2 * math.pi for c in counts]
     assert angle_rad == pytest.approx(expected, abs=1e-15)
-
-
-def test_the_sum_of_tiles_on_an_arc_is_less_certain_by_what_their_axes_leave_open() -> None:
-    arc_rad = np.array([-0.2, -0.07, 0.07, 0.2])
-    arc = [(0.15 * math.sin(a), 0.0, -0.15 * math.cos(a)) for a in arc_rad.tolist()]
-    forces_n = [5.0, 20.0, 20.0, 5.0]
-    flat, curved = (
-        estimate(newton_plan(array_at(places)), loaded_frames(held(forces_n)))
-        for places in ([(x, y, -0.15) for x, y, _ in arc], arc)
-    )
-    assert curved.grf_n.tolist() == flat.grf_n.tolist()
-    more_n = math.sqrt(float(curved.grf_sigma_n[-1] ** 2 - flat.grf_sigma_n[-1] ** 2))
-    lost_n = sum(f * (1.0 - math.cos(a)) for f, a in zip(forces_n, arc_rad.tolist(), strict=True))
-    assert more_n == pytest.approx(lost_n, rel=0.1)
-    # A tile's own force is along its own axis.
-    assert curved.force_sigma_n.tolist() == flat.force_sigma_n.tolist()

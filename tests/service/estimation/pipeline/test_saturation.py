@@ -1,4 +1,4 @@
-"""What is saturated: the chip's range by what was read, the calibrated one behind the gas."""
+"""Saturation: the chip's range by its reading, the calibrated one after the gas has cooled."""
 
 from __future__ import annotations
 
@@ -18,28 +18,33 @@ from devices.chips.mpl115a2 import (
 )
 from devices.errors import CalibrationError
 from devices.flags import EstimateFlag
-from service.estimation.calibration import TileCalibration
 from service.estimation.effects import Effects, GasEffect, Parameter
 from service.estimation.fitting.dome_model import DomeModel
 from service.estimation.models.gas import GasModel, compute_isothermal_lower_bound_kpa
+from service.estimation.pipeline.plan import EstimationPlan
+from service.estimation.pipeline.saturation import is_after_long_gap, select_farther_bound
 from service.estimation.records import Estimates
 from tests.builders.arrays import COUNT_KPA, PERIOD_NS, UNLOADED_KPA, make_array
 from tests.builders.calibrations import make_effects, newton_tile
 from tests.builders.estimates import estimate, newton_plan
 from tests.builders.frames import loaded_frames, make_frames
 
-BASE_KPA, SCALE_KPA, STEP_S = 100.0, 16.0, 0.002
-CURVE = np.array([22.0, 5.0, 5.0])  # newtons at the end of the range: 32
+BASE_KPA = 100.0
+FASTEST_GAS = GasModel(*(np.array([x]) for x in (1.4, 10.0, 0.0, BASE_KPA)))
 
 
-def squeezed(force_n: Floats, gamma: float, tau_s: float, wall: float) -> tuple[Floats, Floats]:
-    """Pressures that are read under a load every 2 ms, and those that the gas would settle at."""
-    model = DomeModel(CURVE, SCALE_KPA, BASE_KPA, wall, gamma=gamma, tau_s=tau_s)
-    pressed = model.compute_response(STEP_S * np.arange(len(force_n), dtype=np.float64), force_n)
-    return pressed.kpa, pressed.isothermal_kpa
+def squeeze(force_n: Floats, gamma: float, tau_s: float, wall: float) -> tuple[Floats, Floats]:
+    """Compute the readings of a dome of 32 N under a load every 2 ms, and with cooled gas."""
+    model = DomeModel(np.array([22.0, 5.0, 5.0]), 16.0, BASE_KPA, wall, gamma=gamma, tau_s=tau_s)
+    response = model.compute_response(0.002 * np.arange(len(force_n), dtype=np.float64), force_n)
+    return response.kpa, response.isothermal_kpa
 
 
-loads = st.lists(st.tuples(st.floats(0.0, 45.0), st.integers(1, 60)), min_size=1, max_size=12).map(
+def bound_kpa(gas: GasModel, kpa: float) -> float:
+    return float(compute_isothermal_lower_bound_kpa(gas.to_records()[0], float(kpa)))
+
+
+LOADS = st.lists(st.tuples(st.floats(0.0, 45.0), st.integers(1, 60)), min_size=1, max_size=12).map(
     lambda steps: np.interp(
         np.arange(sum(n for _, n in steps) + 1),
         np.cumsum([0, *(n for _, n in steps)]),
@@ -48,138 +53,125 @@ loads = st.lists(st.tuples(st.floats(0.0, 45.0), st.integers(1, 60)), min_size=1
 )
 
 
-def at_least(gas: GasModel, kpa: float) -> float:
-    return float(compute_isothermal_lower_bound_kpa(gas.to_records()[0], float(kpa)))
-
-
-@settings(max_examples=200, deadline=None)
-@given(loads, st.floats(1.05, 1.4), st.floats(0.005, 0.06), st.floats(0.0, 0.0015))
-def test_what_is_hidden_behind_the_chips_end_settles_at_no_less_than_is_said(
+@settings(max_examples=100, deadline=None)
+@given(LOADS, st.floats(1.05, 1.4), st.floats(0.005, 0.06), st.floats(0.0, 0.0015))
+def test_a_pressure_beyond_the_chips_end_settles_above_its_bound(
     force_n: Floats, gamma: float, tau_s: float, wall: float
 ) -> None:
-    read_kpa, settled_kpa = squeezed(force_n, gamma, tau_s, wall)
-    gas = GasModel(np.array([gamma]), np.array([tau_s]), np.array([wall]), np.array([BASE_KPA]))
-    bound_kpa = at_least(gas, 115.0)
-    assert BASE_KPA < bound_kpa < 115.0
-    assert (settled_kpa[read_kpa > 115.0] > bound_kpa - 0.02).all()
+    read_kpa, settled_kpa = squeeze(force_n, gamma, tau_s, wall)
+    gas = GasModel(*(np.array([x]) for x in (gamma, tau_s, wall, BASE_KPA)))
+    assert BASE_KPA < bound_kpa(gas, 115.0) < 115.0
+    assert (settled_kpa[read_kpa > 115.0] > bound_kpa(gas, 115.0) - 0.02).all()
 
 
-def test_the_bound_is_reached_by_the_fastest_squeeze() -> None:
+def test_the_fastest_squeeze_reaches_the_bound() -> None:
     force_n = np.concatenate([np.zeros(5), np.full(2, 30.0)])
-    read_kpa, settled_kpa = squeezed(force_n, 1.4, 10.0, 0.0)
-    gas = GasModel(np.array([1.4]), np.array([10.0]), np.array([0.0]), np.array([BASE_KPA]))
-    assert settled_kpa[-1] == pytest.approx(at_least(gas, read_kpa[-1]), abs=0.01)
+    read_kpa, settled_kpa = squeeze(force_n, 1.4, 10.0, 0.0)
+    assert settled_kpa[-1] == pytest.approx(bound_kpa(FASTEST_GAS, read_kpa[-1]), abs=0.01)
 
 
-@pytest.mark.parametrize("kpa", [-20.0, 0.0, 60.0, BASE_KPA])
-def test_below_the_baseline_nothing_is_known_of_heat_that_has_gone_already(kpa: float) -> None:
-    gas = GasModel(np.array([1.4]), np.array([10.0]), np.array([0.0]), np.array([BASE_KPA]))
-    assert at_least(gas, kpa) == kpa
-    assert np.isnan(at_least(gas, np.nan))
+@pytest.mark.parametrize("kpa", [-20.0, 0.0, 60.0, BASE_KPA, np.nan])
+def test_a_pressure_below_the_baseline_is_its_own_bound(kpa: float) -> None:
+    assert bound_kpa(FASTEST_GAS, kpa) == pytest.approx(kpa, abs=0.0, nan_ok=True)
+
+
+def test_the_farther_of_two_bounds_is_selected() -> None:
+    assert [select_farther_bound(value, 0.0, 10.0) for value in (1.0, 9.0)] == [10.0, 0.0]
+
+
+def test_a_gap_of_more_than_50_ms_is_long() -> None:
+    assert [is_after_long_gap(t_ns, 1) for t_ns in (50_000_001, 50_000_002)] == [False, True]
 
 
 # --- in an estimate -------------------------------------------------------------------------------
 
 GAMMA, TAU_S = 1.3, 0.012
-GAS = make_effects(
-    gas=GasEffect(
-        gamma=Parameter(value=GAMMA, sigma=0.0), tau_s=Parameter(value=TAU_S, sigma=0.0), misfit=0.1
-    )
-)
+
+
+def effects_of_gas(gamma: float, tau_s: float) -> Effects:
+    g, tau = (Parameter(value=value, sigma=0.0) for value in (gamma, tau_s))
+    return make_effects(gas=GasEffect(gamma=g, tau_s=tau, misfit=0.1))
+
+
+GAS = effects_of_gas(GAMMA, TAU_S)
 NO_GAS = GAS.model_copy(update={"gas": None, "refused": {"gas": "not determined"}})
-NEWTON_KPA = 100 * COUNT_KPA
-"""End of the calibrated range of the tiles below: 100 N, of 118 that the chip can tell."""
+RANGE_KPA = 100 * COUNT_KPA
+"""End of the calibrated range of the tiles below: 100 N, of 118 N within the chip's range."""
 
 
-def read_n(force_n: Floats) -> Floats:
-    """What a tile of one newton a count seems to bear, its gas heated by being squeezed."""
-    curve = np.array([100.0, 0.0, 0.0])
-    wall = GAS.wall_compliance_or_default_per_kpa
-    model = DomeModel(curve, NEWTON_KPA, UNLOADED_KPA, wall, gamma=GAMMA, tau_s=TAU_S)
-    pressed = model.compute_response(
-        1e-9 * PERIOD_NS * np.arange(len(force_n), dtype=np.float64), force_n
-    )
-    return np.asarray((pressed.kpa - UNLOADED_KPA) / COUNT_KPA)
+def compute_read_n(force_n: Floats) -> Floats:
+    """Compute the apparent force on a tile of one newton a count, its gas heated by the squeeze."""
+    wall, curve = GAS.wall_compliance_or_default_per_kpa, np.array([100.0, 0.0, 0.0])
+    model = DomeModel(curve, RANGE_KPA, UNLOADED_KPA, wall, gamma=GAMMA, tau_s=TAU_S)
+    t_s = 1e-9 * PERIOD_NS * np.arange(len(force_n), dtype=np.float64)
+    return np.asarray((model.compute_response(t_s, force_n).kpa - UNLOADED_KPA) / COUNT_KPA)
 
 
-def fast_load(peak_n: float) -> Floats:
-    """Nothing, up in 4 ms, held for 20 ms, and long enough without load."""
+def make_fast_load(peak_n: float) -> Floats:
+    """Make a load that rises in 4 ms and lasts for 20 ms."""
     return np.interp(np.arange(200), [0, 20, 22, 32, 34, 199], [0, 0, peak_n, peak_n, 0, 0])
 
 
-def tile(serial: str, effects: Effects = GAS) -> TileCalibration:
-    return newton_tile(serial, range_kpa=(0.0, NEWTON_KPA), effects=effects)
+def plan_with(effects: tuple[Effects, ...], *models: str) -> EstimationPlan:
+    info = make_array(len(effects))
+    tiles = [
+        newton_tile(serial, range_kpa=(0.0, RANGE_KPA), effects=each)
+        for serial, each in zip(info.serials, effects, strict=True)
+    ]
+    return newton_plan(info, tiles=tiles, models=("unwrap", "gas", "static", *models))
 
 
-def estimated(forces_n: Floats, effects: tuple[Effects, ...]) -> Estimates:
-    info = make_array(forces_n.shape[1])
-    tiles = [tile(serial, each) for serial, each in zip(info.serials, effects, strict=True)]
-    plan = newton_plan(info, tiles=tiles, models=("unwrap", "gas", "static"))
-    return estimate(plan, loaded_frames(forces_n))
+def estimate_forces(forces_n: list[Floats], *effects: Effects) -> Estimates:
+    return estimate(plan_with(effects), loaded_frames(np.stack(forces_n, axis=1)))
 
 
-def test_a_fast_load_that_reads_beyond_the_calibrated_range_is_not_saturated() -> None:
-    true_n = fast_load(90.0)
-    seen_n = read_n(true_n)
-    assert 100.0 < seen_n.max() < 118.0  # beyond what was calibrated, within the chip's range
-    e = estimated(np.stack([seen_n, seen_n], axis=1), (GAS, GAS))
+def test_a_fast_load_read_beyond_the_calibrated_range_is_not_saturated() -> None:
+    true_n = make_fast_load(90.0)
+    read_n = compute_read_n(true_n)
+    assert 100.0 < read_n.max() < 118.0, "beyond the calibrated range, within the chip's"
+    e = estimate_forces([read_n, read_n], GAS, GAS)
     assert not (e.estimate_flags & EstimateFlag.SATURATED).any()
-    np.testing.assert_allclose(e.force_n[:, 0], true_n, atol=1.0)  # a count, and what it heats
+    np.testing.assert_allclose(e.force_n[:, 0], true_n, atol=1.0)  # a count, and its heat
     assert np.isfinite(e.grf_sigma_n).all()
 
 
-def test_what_the_chip_cannot_tell_is_saturated_whatever_the_gas_says_and_a_bound() -> None:
-    true_n = fast_load(99.0)
-    seen_n = read_n(true_n)
-    hidden = np.rint(seen_n) > 118.0
+def test_a_load_beyond_the_chips_range_is_saturated_and_a_bound() -> None:
+    true_n = make_fast_load(99.0)
+    read_n = compute_read_n(true_n)
+    hidden = np.rint(read_n) > 118.0
     assert hidden.any()
-    e = estimated(np.stack([seen_n, np.zeros(200)], axis=1), (GAS, GAS))
-    saturated = (e.estimate_flags & EstimateFlag.SATURATED) > 0
-    assert saturated[hidden].all()
-    assert (e.force_n[hidden, 0] <= true_n[hidden]).all()
-    assert (e.force_n[hidden, 0] > 0.75 * true_n[hidden]).all()  # and not an idle one
+    e = estimate_forces([read_n, np.zeros(200)], GAS, GAS)
+    assert ((e.estimate_flags & EstimateFlag.SATURATED) > 0)[hidden].all()
+    bound_n = e.force_n[hidden, 0]
+    assert (bound_n <= true_n[hidden]).all()
+    assert (bound_n > 0.75 * true_n[hidden]).all(), "and not an idle one"
     assert np.isnan(e.force_sigma_n[hidden, 0]).all()
 
 
 @pytest.mark.parametrize("warmer_k", [-6.0, 10.0])
-def test_a_bound_holds_for_a_dome_that_is_warmer_or_colder_than_at_its_tare(
-    warmer_k: float,
-) -> None:
-    """What warmth puts into the pressure is no load, also where only the chip's end is known."""
-    info, true_n = make_array(2), 98.0
-    warm_kpa = warmer_k * 0.3
-    temperature_raw = round(480 + warmer_k * TADC_PER_KELVIN)
-    chip = Coefficients.from_words(info.tiles[0].coefficient_words)
-    # Slow, so that no heat of the squeeze is left; warmth acts on all of the gas.
-    kpa = (UNLOADED_KPA + true_n * COUNT_KPA) * (1.0 + warm_kpa / UNLOADED_KPA)
-    pressure_raw = round(float(compute_padc(kpa, temperature_raw, chip)))
-    seen_kpa = float(
-        compensate_kpa(pressure_raw, temperature_raw, chip.a0, chip.b1, chip.b2, chip.c12)
-    )
+def test_a_bound_is_valid_for_a_warmer_and_a_colder_dome(warmer_k: float) -> None:
+    true_n, temperature_raw = 98.0, round(480 + warmer_k * TADC_PER_KELVIN)
     # A gas that hardly heats, so that the bound is near.
-    gamma = Parameter(value=1.02, sigma=0.0)
-    cool = GAS.model_copy(update={"gas": GasEffect(gamma=gamma, tau_s=gamma, misfit=0.1)})
-    tiles = [tile(serial, cool) for serial in info.serials]
-    plan = newton_plan(info, tiles=tiles, models=("unwrap", "temperature", "gas", "static"))
-    plan = replace(plan, chip_max_kpa=np.full(2, seen_kpa - 0.05))  # ANY: fields of EstimationPlan
+    plan = plan_with((effects_of_gas(1.02, 1.02),) * 2, "temperature")
+    chip = Coefficients.from_words(plan.info.tiles[0].coefficient_words)
+    # Slow, so that no heat of the squeeze is left; warmth acts on all of the gas.
+    kpa = (UNLOADED_KPA + true_n * COUNT_KPA) * (1.0 + warmer_k * 0.3 / UNLOADED_KPA)
+    pressure_raw = round(float(compute_padc(kpa, temperature_raw, chip)))
+    read_kpa = compensate_kpa(pressure_raw, temperature_raw, chip.a0, chip.b1, chip.b2, chip.c12)
+    plan = replace(plan, chip_max_kpa=np.full(2, float(read_kpa) - 0.05))
     # So long after the first frame that the gas is as warm as the chip.
     t_mono_ns = 60_000_000_000 + PERIOD_NS * np.arange(20)
     t_mono_ns[0] = 0
-    e = estimate(
-        plan,
-        make_frames(
-            20, 2, pressure_raw=pressure_raw, temperature_raw=temperature_raw, t_mono_ns=t_mono_ns
-        ),
-    )
+    columns = {"pressure_raw": pressure_raw, "temperature_raw": temperature_raw}
+    e = estimate(plan, make_frames(20, 2, t_mono_ns=t_mono_ns, **columns))
     assert ((e.estimate_flags & EstimateFlag.SATURATED) > 0).all()
     assert (e.force_n <= true_n).all()
-    assert (e.force_n[1:] > 0.93 * true_n).all()  # and not an idle one
+    assert (e.force_n[1:] > 0.93 * true_n).all(), "and not an idle one"
 
 
-def test_a_tile_without_gas_goes_without_alone_and_its_uncertainty_says_so() -> None:
-    true_n = fast_load(60.0)
-    seen_n = read_n(true_n)
-    e = estimated(np.stack([seen_n] * 3, axis=1), (GAS, NO_GAS, GAS))
+def test_a_tile_without_a_gas_model_is_uncertain_alone() -> None:
+    true_n = make_fast_load(60.0)
+    e = estimate_forces([compute_read_n(true_n)] * 3, GAS, NO_GAS, GAS)
     off_n = np.abs(e.force_n - true_n[:, None])
     assert off_n[:, [0, 2]].max() < 1.5
     assert off_n[:, 1].max() > 10.0
@@ -189,4 +181,4 @@ def test_a_tile_without_gas_goes_without_alone_and_its_uncertainty_says_so() -> 
 
 def test_a_model_that_no_tile_offers_is_refused() -> None:
     with pytest.raises(CalibrationError, match="'gas' is not offered for tile T01: not determined"):
-        estimated(np.zeros((5, 2)), (NO_GAS, NO_GAS))
+        plan_with((NO_GAS, NO_GAS))

@@ -1,9 +1,9 @@
-"""`denoise` on a foot: what the sum of tiles shows bounds the windows of each of them."""
+"""`denoise` on a foot: the sum of tiles limits the windows of every tile."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 
@@ -25,7 +25,7 @@ SIGMA_N, PERIOD_NS, TILES = 0.3, 1_838_235, 4
 
 
 def smooth(forces_n: Floats) -> Floats:
-    """Averaged forces of tiles, (n, tiles), all sampled with their frame."""
+    """Average forces of tiles, (n, tiles), all sampled with their frame."""
     n, tiles = forces_n.shape
     info = array_at([(0.01 * j, 0.0, 0.0) for j in range(tiles)])
     params = make_kernel_params(
@@ -57,38 +57,38 @@ def _average_all(params: KernelParams, buffer: FrameBuffer, out: Floats) -> None
             out[i, j] = forces[j].force_n
 
 
-def noisy(load_n: np.ndarray, seed: int) -> np.ndarray:
+def add_noise(load_n: np.ndarray, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     return load_n[:, None] + rng.normal(0.0, SIGMA_N, (len(load_n), TILES))
 
 
-def one_by_one(forces_n: np.ndarray) -> np.ndarray:
-    """Every tile as if there were no other."""
+def smooth_apart(forces_n: np.ndarray) -> np.ndarray:
+    """Average every tile as if it were alone."""
     return np.concatenate([smooth(column[:, None]) for column in forces_n.T], axis=1)
 
 
-def test_a_load_that_lets_go_within_a_tiles_noise_is_seen_in_the_sum_of_all() -> None:
-    # 25 ms of a load whose bend no tile can tell from its noise.
+def test_a_bend_below_a_tiles_noise_is_found_in_the_sum() -> None:
+    # 25 ms of a load whose bend is below the noise of every tile.
     t_s = 1e-9 * PERIOD_NS * np.arange(400)
     load_n = 6.0 + 0.45 * np.sin(2 * math.pi * 35.0 * t_s)
 
-    def grf_off_n(smoothed: Any) -> float:
-        found = [smoothed(noisy(load_n, seed)).sum(axis=1) for seed in range(20)]
+    def compute_grf_error_n(smoothed: Callable[[Floats], Floats]) -> float:
+        found = [smoothed(add_noise(load_n, seed)).sum(axis=1) for seed in range(10)]
         return float(np.sqrt(np.mean((np.array(found) - TILES * load_n) ** 2)))
 
-    assert grf_off_n(smooth) < 0.85 * grf_off_n(one_by_one)
+    assert compute_grf_error_n(smooth) < 0.85 * compute_grf_error_n(smooth_apart)
 
 
-def test_a_still_load_costs_little_more_noise() -> None:
-    still_n = np.full(400, 6.0)
-    found = [[s(noisy(still_n, seed)) for s in (smooth, one_by_one)] for seed in range(20)]
+def test_a_constant_load_has_little_more_noise() -> None:
+    constant_n = np.full(400, 6.0)
+    found = [[s(add_noise(constant_n, seed)) for s in (smooth, smooth_apart)] for seed in range(20)]
     off_n2 = np.mean((np.array(found) - 6.0) ** 2, axis=(0, 2, 3))
     assert off_n2[0] < 1.5 * off_n2[1]
     assert off_n2[0] < 0.2 * SIGMA_N**2
 
 
-def test_a_load_that_goes_from_tile_to_tile_is_judged_by_each_of_them() -> None:
-    # In the sum nothing happens.
+def test_a_load_that_moves_between_tiles_is_found_in_every_tile() -> None:
+    # The sum is constant.
     step_n = np.where(np.arange(200) < 100, 0.0, 8.0)
     load_n = np.stack([step_n, 8.0 - step_n, step_n, 8.0 - step_n], axis=1)
     rng = np.random.default_rng(1)
@@ -96,12 +96,12 @@ def test_a_load_that_goes_from_tile_to_tile_is_judged_by_each_of_them() -> None:
     assert np.abs(off_n).max() < 5.5 * SIGMA_N
 
 
-def test_where_a_tile_is_missing_the_others_are_averaged_on_their_own() -> None:
-    forces_n = noisy(np.full(200, 6.0), 2)
+def test_tiles_beside_a_missing_one_are_averaged_apart() -> None:
+    forces_n = add_noise(np.full(200, 6.0), 2)
     forces_n[50:60, 1] = math.nan
     out = smooth(forces_n)
     assert np.flatnonzero(np.isnan(out).any(axis=1)).tolist() == list(range(50, 60))
     silent = forces_n.copy()
     silent[:, 1] = math.nan
     others = [0, 2, 3]
-    assert smooth(silent)[:, others].tolist() == one_by_one(forces_n)[:, others].tolist()
+    assert smooth(silent)[:, others].tolist() == smooth_apart(forces_n)[:, others].tolist()

@@ -1,4 +1,4 @@
-"""A bench recording reduced to blocks: which readings count, and what they are averaged to."""
+"""A rig recording reduced to blocks, and its state before the first press."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from devices.errors import CalibrationError
 from service.estimation.fitting.rig.indentation import (
     Indentation,
     average_stroke_blocks,
-    format_origin,
     measure_initial_unloaded,
 )
 
@@ -19,7 +18,7 @@ Segment = tuple[str, list[float], list[float]]
 """Phase, absolute pressures and reference forces; a phase with * is of another tile."""
 
 
-def recording(*segments: Segment, period_ms: float = 10.0, **changes: Any) -> Indentation:
+def record(*segments: Segment, period_ms: float = 10.0, **changes: Any) -> Indentation:
     phase = [name.rstrip("*") for name, kpa, _ in segments for _ in kpa]
     under = [not name.endswith("*") for name, kpa, _ in segments for _ in kpa]
     columns: dict[str, Any] = {
@@ -45,42 +44,44 @@ def ramp(phase: str, begin: float, end: float, n: int = 60) -> Segment:
     return phase, (100.0 + x).tolist(), (2.0 * x).tolist()
 
 
-def test_baseline_noise_and_zero_come_from_the_second_before_the_first_press() -> None:
+def test_baseline_noise_and_zero_are_of_the_second_before_the_first_press() -> None:
     early = rest(50, kpa=90.0, force_n=9.0)  # more than a second before
     late = ("rest", [99.0, 101.0] * 50, [0.1, 0.3] * 50)
-    zero = measure_initial_unloaded(recording(early, late, ramp("load", 0, 10)))
+    zero = measure_initial_unloaded(record(early, late, ramp("load", 0, 10)))
     assert zero.baseline_kpa == pytest.approx(100.0)
     assert zero.noise_kpa == pytest.approx(np.sqrt(100 / 99))
     assert zero.reference_zero_n == pytest.approx(0.2)
 
 
-def test_the_reference_has_no_zero_where_it_was_not_over_the_tile() -> None:
-    away = ("rest*", [100.0] * 20, [7.0] * 20)
-    assert measure_initial_unloaded(recording(away, ramp("load", 0, 10))).reference_zero_n == 0.0
-    blind = ("rest", [100.0] * 20, [np.nan] * 20)
-    assert measure_initial_unloaded(recording(blind, ramp("load", 0, 10))).reference_zero_n == 0.0
+@pytest.mark.parametrize(
+    "rest_segment",
+    [
+        ("rest*", [100.0] * 20, [7.0] * 20),
+        ("rest", [100.0] * 20, [np.nan] * 20),
+        ("rest", [100.0, np.nan] * 10, [0.0] * 20),
+    ],
+    ids=["reference over another tile", "reference without readings", "unreadable pressures"],
+)
+def test_missing_readings_are_in_no_baseline_and_no_zero(rest_segment: Segment) -> None:
+    state = measure_initial_unloaded(record(rest_segment, ramp("load", 0, 10)))
+    assert (state.reference_zero_n, state.baseline_kpa) == (0.0, 100.0)
 
 
-def test_unreadable_samples_are_not_in_the_baseline() -> None:
-    gappy = ("rest", [100.0, np.nan] * 10, [0.0] * 20)
-    assert measure_initial_unloaded(recording(gappy, ramp("load", 0, 10))).baseline_kpa == 100.0
-
-
-def test_too_little_rest_before_the_press_is_refused_with_file_and_tile() -> None:
+def test_a_short_rest_before_the_press_is_refused() -> None:
     with pytest.raises(CalibrationError, match=r"bench\.parquet, tile T01: only 9 readings"):
-        measure_initial_unloaded(recording(rest(9), ramp("load", 0, 10)))
-    assert measure_initial_unloaded(recording(rest(10), ramp("load", 0, 10))).baseline_kpa == 100.0
+        measure_initial_unloaded(record(rest(9), ramp("load", 0, 10)))
+    assert measure_initial_unloaded(record(rest(10), ramp("load", 0, 10))).baseline_kpa == 100.0
 
 
 def test_a_tile_that_is_never_pressed_is_refused() -> None:
     with pytest.raises(CalibrationError, match="never presses this tile"):
-        measure_initial_unloaded(recording(rest(), ("load*", [110.0] * 50, [20.0] * 50)))
+        measure_initial_unloaded(record(rest(), ("load*", [110.0] * 50, [20.0] * 50)))
 
 
 def test_a_stroke_is_averaged_in_sixty_blocks_each_way() -> None:
     # 180 readings a ramp, three to a block: the mean of three neighbours is the middle one
     made = average_stroke_blocks(
-        recording(
+        record(
             rest(force_n=0.5),
             ("load", (100 + np.arange(180) / 10).tolist(), (0.5 + np.arange(180) / 5).tolist()),
             ("unload", (118 - np.arange(180) / 10).tolist(), (36 - np.arange(180) / 5).tolist()),
@@ -93,15 +94,11 @@ def test_a_stroke_is_averaged_in_sixty_blocks_each_way() -> None:
     assert made.repeat.tolist() == [0] * 120
 
 
-def test_repeats_are_numbered_in_order() -> None:
-    one = (ramp("load", 0, 10), ramp("unload", 10, 0), rest())
-    made = average_stroke_blocks(recording(rest(), *one, *one, *one))
-    assert made.repeat.tolist() == [0] * 120 + [1] * 120 + [2] * 120
-
-
-def test_strokes_need_no_rest_between_them() -> None:
-    one = (ramp("load", 0, 10), ramp("unload", 10, 0))
-    assert np.unique(average_stroke_blocks(recording(rest(), *one, *one)).repeat).tolist() == [0, 1]
+@pytest.mark.parametrize("rests", [1, 0])
+def test_repeats_are_numbered_in_order_with_or_without_rests(rests: int) -> None:
+    one = (ramp("load", 0, 10), ramp("unload", 10, 0), *[rest()] * rests)
+    blocks = average_stroke_blocks(record(rest(), *one, *one, *one))
+    assert blocks.repeat.tolist() == [0] * 120 + [1] * 120 + [2] * 120
 
 
 def test_holds_releases_taps_and_soak_are_not_used() -> None:
@@ -115,31 +112,27 @@ def test_holds_releases_taps_and_soak_are_not_used() -> None:
         ramp("soak", 0, 1),
     )
     slow = (ramp("load", 0, 10), ramp("unload", 10, 0))
-    with_them = average_stroke_blocks(recording(rest(), *slow, rest(), *fast))
-    without = average_stroke_blocks(recording(rest(), *slow))
+    with_them = average_stroke_blocks(record(rest(), *slow, rest(), *fast))
+    without = average_stroke_blocks(record(rest(), *slow))
     assert with_them.gauge_kpa.tolist() == without.gauge_kpa.tolist()
     assert with_them.force_n.tolist() == without.force_n.tolist()
     with pytest.raises(CalibrationError, match="no slow stroke"):
-        average_stroke_blocks(recording(rest(), *fast))
+        average_stroke_blocks(record(rest(), *fast))
 
 
 def test_strokes_on_other_tiles_are_not_used() -> None:
     other = (("load*", [100.0] * 60, [5.0] * 60), ("unload*", [100.0] * 60, [5.0] * 60))
     own = (ramp("load", 0, 10), ramp("unload", 10, 0))
-    made = average_stroke_blocks(recording(rest(), *other, rest(), *own))
+    made = average_stroke_blocks(record(rest(), *other, rest(), *own))
     assert made.force_n.max() == pytest.approx(20.0)
     assert np.unique(made.repeat).tolist() == [0]
 
 
-def test_readings_that_are_missing_shorten_a_block_and_shift_nothing() -> None:
+def test_missing_readings_shorten_their_block_only() -> None:
     kpa = (100 + np.arange(180) / 10).tolist()
     force_n = (np.arange(180) / 5).tolist()
     kpa[::3] = [np.nan] * 60  # of each block of three one is left out
     back = ramp("unload", 17.9, 0)
-    made = average_stroke_blocks(recording(rest(), ("load", kpa, force_n), back))
+    made = average_stroke_blocks(record(rest(), ("load", kpa, force_n), back))
     assert made.loading.sum() == 60
     np.testing.assert_allclose(made.force_n[:60], 2.0 * made.gauge_kpa[:60], rtol=1e-12)
-
-
-def test_a_place_names_file_and_tile() -> None:
-    assert format_origin(recording(rest())) == "bench.parquet, tile T01"

@@ -1,4 +1,4 @@
-"""Loadings of a tile on the bench, as they go into the fit of fast effects."""
+"""Loadings of a tile on the rig, for the fit of fast effects."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from service.estimation.fitting.rig.loading import extract_loading_points, join_
 ZERO = (0.0, 0.1)  # of the reference, N; noise, kPa
 
 
-def taps(n: int = 3, *, outlier_at: int | None = None) -> Indentation:
-    """Taps of 15 N and 6 kPa whose top is a single reading, and rest."""
+def record_taps(n: int = 3, *, outlier_at: int | None = None) -> Indentation:
+    """Record taps of 15 N and 6 kPa whose top is a single reading, and rest."""
     one_n = np.concatenate([np.zeros(40), [5.0, 10.0, 15.0, 10.0, 5.0]])
     force_n = np.tile(one_n, n)
     kpa = 100.0 + 0.4 * force_n
@@ -21,7 +21,7 @@ def taps(n: int = 3, *, outlier_at: int | None = None) -> Indentation:
         kpa[outlier_at] -= 3.0
     return Indentation(
         serial="T01",
-        where="bench.parquet",
+        where="taps.parquet",
         t_ns=np.arange(len(force_n), dtype=np.int64) * 3_000_000,
         kpa=kpa,
         reference_n=force_n,
@@ -31,22 +31,22 @@ def taps(n: int = 3, *, outlier_at: int | None = None) -> Indentation:
     )
 
 
-def test_the_top_of_a_tap_stays_in_although_it_is_a_single_reading() -> None:
-    points = extract_loading_points(taps(), *ZERO)
+def test_the_single_reading_at_the_top_of_a_tap_counts() -> None:
+    points = extract_loading_points(record_taps(), *ZERO)
     assert np.isfinite(points.kpa[points.force_n == 15.0]).all()
 
 
-def test_a_spike_that_no_force_explains_is_left_out() -> None:
+def test_a_spike_without_a_force_is_left_out() -> None:
     points = extract_loading_points(
-        taps(outlier_at=60), *ZERO
+        record_taps(outlier_at=60), *ZERO
     )  # at rest between the first two taps
     assert np.flatnonzero(np.isnan(points.kpa)).tolist() == [60]
 
 
 def test_joined_recordings_keep_their_loadings_apart_and_far_apart() -> None:
     one, other = (
-        extract_loading_points(taps(3), *ZERO),
-        extract_loading_points(taps(2), *ZERO),
+        extract_loading_points(record_taps(3), *ZERO),
+        extract_loading_points(record_taps(2), *ZERO),
     )
     both = join_loading_points([one, other])
     assert both.n_loadings == one.n_loadings + other.n_loadings == 5
@@ -56,11 +56,11 @@ def test_joined_recordings_keep_their_loadings_apart_and_far_apart() -> None:
     np.testing.assert_array_equal(both.kpa, np.concatenate([one.kpa, other.kpa]))
 
 
-def test_strokes_that_follow_one_another_without_a_rest_are_loadings_of_their_own() -> None:
+def test_strokes_without_rests_are_separate_loadings() -> None:
     phase = np.repeat(["rest", "load", "unload", "load", "unload", "load", "hold"], 20)
-    bench = taps(1)
+    taps = record_taps(1)
     no_rests = replace(
-        bench,
+        taps,
         t_ns=np.arange(len(phase), dtype=np.int64) * 3_000_000,
         kpa=np.full(len(phase), 100.0),
         reference_n=np.zeros(len(phase)),
@@ -74,12 +74,9 @@ def test_strokes_that_follow_one_another_without_a_rest_are_loadings_of_their_ow
     assert not points.is_fast[points.loading < 2].any()
 
 
-def test_readings_of_the_same_instant_are_one_point() -> None:
-    bench = taps()
-    coarse = extract_loading_points(
-        replace(bench, t_ns=bench.t_ns // 12_000_000 * 12_000_000),
-        *ZERO,
-    )
+def test_readings_of_one_instant_are_one_point() -> None:
+    taps = record_taps()
+    coarse = extract_loading_points(replace(taps, t_ns=taps.t_ns // 12_000_000 * 12_000_000), *ZERO)
     assert (np.diff(coarse.t_s) > 0.0).all()
     assert coarse.force_n.max() > 5.0
     assert coarse.n_loadings == 3
