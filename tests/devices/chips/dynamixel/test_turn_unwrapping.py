@@ -85,52 +85,43 @@ def test_the_turn_of_a_servo_that_answers_quickly_is_known_after_every_restart(
         assert (found.is_turn_known, found.counts) == (True, true)
 
 
-def test_the_turn_stays_unknown_after_a_restart_in_a_long_silence() -> None:
+MANY, ONE = CountRange.MANY_TURNS, CountRange.ONE_TURN
+
+
+@pytest.mark.parametrize(
+    ("count_range", "first", "later", "expected"),
+    # Counts, ms and restarts of later readings; None where the turn is unknown.
+    [
+        (MANY, 5000, [(904, 1000, True), (904, 1010, False), (904, 1020, False)], [None] * 3),
+        (MANY, 5000, [(9000, 3000, False)], [9000]),
+        # Torque switched on in position control: no restart, and the count begins again.
+        *((MANY, 5000, [(5000 + n * TURN, 10, False)], [5000]) for n in (1, -1, 3)),
+        (MANY, 1000, [(2000, 10, False), (2000, 20, False)], [None] * 2),
+        (MANY, 2**31 - 10, [(-(2**31) + 10, 10, False)], [None]),
+        (ONE, 1000, [(3000, 2000, True), (3001, 2010, False)], [None, 3001]),
+        (ONE, 5000, [(904, 1000, False)], [None]),
+    ],
+    ids=[
+        "a restart in a long silence",
+        "a long silence without a restart",
+        *("a leap by a turn", "a leap back by a turn", "a leap by three turns"),
+        "a leap faster than any joint",
+        "a count beyond the column",
+        "a joint of one turn is known at its second answer",
+        "torque may have been switched on in a silence",
+    ],
+)
+def test_a_turn_is_known_or_unknown_after(
+    count_range: CountRange,
+    first: int,
+    later: list[tuple[int, int, bool]],
+    expected: list[int | None],
+) -> None:
     unwrapper = TurnUnwrapper()
-    unwrapper.unwrap(reading(5000, 0))
-    for i in range(5):
-        found = unwrapper.unwrap(reading(904, 1000 + 10 * i, restarted=i == 0))
-        assert (found.is_turn_known, found.counts) == (False, 904)
-
-
-def test_the_turn_is_known_after_a_long_silence_without_a_restart() -> None:
-    unwrapper = TurnUnwrapper()
-    unwrapper.unwrap(reading(5000, 0))
-    assert unwrapper.unwrap(reading(9000, 3000)).is_turn_known
-
-
-@pytest.mark.parametrize("leap", [TURN, -TURN, 3 * TURN])
-def test_a_leap_by_whole_turns_is_no_movement(leap: int) -> None:
-    # Torque switched on in position control: no restart, and the count begins again.
-    unwrapper = TurnUnwrapper()
-    unwrapper.unwrap(reading(5000, 0))
-    found = unwrapper.unwrap(reading(5000 + leap, 10))
-    assert (found.is_turn_known, found.counts) == (True, 5000)
-
-
-def test_the_turn_is_unknown_after_a_leap_faster_than_any_joint() -> None:
-    unwrapper = TurnUnwrapper()
-    unwrapper.unwrap(reading(1000, 0))
-    assert not unwrapper.unwrap(reading(2000, 10)).is_turn_known
-    assert not unwrapper.unwrap(reading(2000, 20)).is_turn_known
-
-
-def test_the_turn_of_a_joint_of_one_turn_is_known_at_its_second_answer() -> None:
-    unwrapper, joint = TurnUnwrapper(), CountRange.ONE_TURN
-    unwrapper.unwrap(reading(1000, 0, count_range=joint))
-    first = unwrapper.unwrap(reading(3000, 2000, restarted=True, count_range=joint))
-    second = unwrapper.unwrap(reading(3001, 2010, count_range=joint))
-    assert [first.is_turn_known, second.is_turn_known] == [False, True]
-    assert second.counts == 3001
-
-
-def test_the_turn_is_unknown_if_torque_may_have_been_switched_on_in_a_silence() -> None:
-    unwrapper, joint = TurnUnwrapper(), CountRange.ONE_TURN
-    unwrapper.unwrap(reading(5000, 0, count_range=joint))
-    assert not unwrapper.unwrap(reading(904, 1000, count_range=joint)).is_turn_known
-
-
-def test_the_turn_of_a_count_beyond_the_column_is_unknown() -> None:
-    unwrapper = TurnUnwrapper()
-    unwrapper.unwrap(reading(2**31 - 10, 0))
-    assert not unwrapper.unwrap(reading(-(2**31) + 10, 10)).is_turn_known
+    unwrapper.unwrap(reading(first, 0, count_range=count_range))
+    for (counts, t_ms, restarted), position in zip(later, expected, strict=True):
+        found = unwrapper.unwrap(
+            reading(counts, t_ms, restarted=restarted, count_range=count_range)
+        )
+        assert found.is_turn_known == (position is not None)
+        assert found.counts == (counts if position is None else position)
