@@ -1,4 +1,4 @@
-"""What several tests of the devices share: emulated tiles under an adapter that can be watched."""
+"""Emulated tiles behind an adapter that records its transactions and can be made to fail."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, get_args
 
+import pytest
 from smbus2 import i2c_msg
 
 from devices.array.schedules import BusTiming
@@ -36,10 +37,9 @@ TYPICAL_NS = 1_600_000
 SETTLED = 3
 """Frames after which every tile has the history that a reading is compared with."""
 
-
 Words = tuple[int, int, int, int]
 LOOK_FRAMES = 10
-"""In one of so many frames a tile is read once more before it is started anew."""
+"""In one of so many frames a tile is read again before it is started."""
 
 Plugs = tuple[tuple[int, int], ...]
 ONE: Plugs = ((0x70, 0),)
@@ -47,24 +47,38 @@ FOUR: Plugs = ((0x70, 0), (0x70, 1), (0x70, 2), (0x70, 3))
 TWO_MUXES: Plugs = ((0x70, 0), (0x70, 5), (0x73, 0), (0x73, 1))
 
 SCHEDULES: tuple[ScheduleName, ...] = ("simultaneous", "pipelined", "per_mux", "sequential")
+every_schedule = pytest.mark.parametrize("schedule", SCHEDULES)
+BIT_NS = 2_500
+WHOLE_NS = (4 * SELECT + CONVERT + 4 * READ) * BIT_NS + TYPICAL_NS
+"""Length of a simultaneous frame of four tiles."""
 
 
 def full(tiles: int) -> Plugs:
-    """So many tiles, eight to a mux as far as they go."""
+    """Return the plugs of so many tiles, eight to a mux."""
     return tuple((0x70 + i // 8, i % 8) for i in range(tiles))
 
 
 def counting(first: int) -> SampleFunction:
-    """A sense in which no two conversions are alike; its tile is told by the hundreds."""
+    """Return a sense of which no two samples are equal; its hundreds are those of `first`."""
     results: Iterator[int] = iter(range(first, first + 10_000_000))
     return lambda _: (1 + next(results) % 1000, 500)
 
 
-class Wires:
-    """Emulated tiles under an adapter that notes the transactions and can be made to fail.
+class Adapter:
+    """Calls of an I2C adapter on which its transactions do not depend."""
 
-    `on_transaction` is called with the number and the messages of each before it takes place,
-    `after_transaction` when it is over. `words` are the coefficients of single tiles, `tc_ns` their
+    def set_timeout(self, units_10ms: int) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+class Wires(Adapter):
+    """Emulated tiles behind an adapter that records its transactions and can be made to fail.
+
+    `on_transaction` is called with the number and the messages of each transaction before it,
+    `after_transaction` after it. `words` are the coefficients of single tiles, `tc_ns` their
     conversion times.
     """
 
@@ -111,7 +125,7 @@ class Wires:
         return PartFaults(**own, scene=self._faults)
 
     def fault(self, kind: FaultKind, target: str = BUS_TARGET) -> AbstractContextManager[None]:
-        """Something fails while the block runs: a tile ("T01"), a mux ("0x70") or the bus."""
+        """Inject a fault while the block runs: of a tile ("T01"), a mux ("0x70") or the bus."""
         return self._faults.inject(kind, target)
 
     @property
@@ -120,7 +134,7 @@ class Wires:
 
     @property
     def infos(self) -> tuple[TileInfo, ...]:
-        """The tiles as a self-test would have found them."""
+        """Tiles as a self-test finds them."""
         return tuple(
             make_tile(
                 i,
@@ -146,9 +160,6 @@ class Wires:
     def set_timeout(self, units_10ms: int) -> None:
         self.adapter.set_timeout(units_10ms)
 
-    def close(self) -> None:
-        pass
-
 
 def array_on(
     wires: Wires,
@@ -160,7 +171,7 @@ def array_on(
     recovery: BusRecovery | None = None,
     reference_n: Callable[[], float] | None = None,
 ) -> TileArray:
-    """An array that waits exactly as long as each part converts, unless it is told otherwise."""
+    """Return an array that waits as long as each part converts, or for `waits_ns`."""
     timing = BusTiming(
         wires.scl_hz,
         tuple(wait_ns * 1e-9 for wait_ns in waits_ns or wires.tc_ns),
@@ -180,9 +191,9 @@ def array_on(
     )
 
 
-def settled(wires: Wires, schedule: ScheduleName = "simultaneous", **options: object) -> TileArray:
-    """The same, after the frames in which every reading is read twice."""
-    array = array_on(wires, schedule, **options)  # type: ignore[arg-type]  # as there
+def settled(wires: Wires, schedule: ScheduleName = "simultaneous", **options: Any) -> TileArray:
+    """Return an array after the frames in which every reading is read twice."""
+    array = array_on(wires, schedule, **options)
     scanned(array, SETTLED + 1)
     return array
 
@@ -190,26 +201,26 @@ def settled(wires: Wires, schedule: ScheduleName = "simultaneous", **options: ob
 def settled_on(
     plugs: Plugs, schedule: ScheduleName = "simultaneous", **how: Any
 ) -> tuple[Wires, TileArray]:
-    """Tiles on these plugs, and an array of them that has its history."""
+    """Return tiles on these plugs, and an array that has their history."""
     wires = Wires(plugs, **how)
     return wires, settled(wires, schedule)
 
 
 def scanned(array: TileArray, frames: int) -> Scan:
-    """The last of so many frames."""
+    """Return the last of so many frames."""
     for _ in range(frames - 1):
         array.scan_frame()
     return array.scan_frame()
 
 
 def timed_scan(array: TileArray, wires: Wires) -> tuple[Scan, int]:
-    """One frame, and how long it took in ns."""
+    """Return one frame and its length in ns."""
     begin_ns = wires.clock.now_ns()
     return array.scan_frame(), wires.clock.now_ns() - begin_ns
 
 
 def hesitating(wires: Wires, seed: int, least_ns: int = 500_000) -> None:
-    """Now and then the machine hesitates before a transfer, by so much or up to 5 ms."""
+    """Delay some transfers, by so much or up to 5 ms, as a busy machine does."""
     rng = make_rng(f"machine {seed}")
 
     def hesitate(_: int, __: tuple[i2c_msg, ...]) -> None:
@@ -218,3 +229,15 @@ def hesitating(wires: Wires, seed: int, least_ns: int = 500_000) -> None:
             wires.clock.sleep_until_ns(wires.clock.now_ns() + late_ns)
 
     wires.on_transaction = hesitate
+
+
+def failing(
+    number: int, when: Callable[[int, tuple[i2c_msg, ...]], bool] = lambda _, __: True
+) -> Callable[[int, tuple[i2c_msg, ...]], None]:
+    """Return an `on_transaction` that fails with an errno when `when` is true."""
+
+    def on_transaction(count: int, messages: tuple[i2c_msg, ...]) -> None:
+        if when(count, messages):
+            raise OSError(number, "injected")
+
+    return on_transaction

@@ -39,7 +39,7 @@ DESIGN = {
 
 
 def batch(n: int = 3, tiles: int = 2, first: int = 0) -> FrameBatch:
-    """Every cell of every column is different from its neighbours."""
+    """Return a batch in which every cell differs from its neighbours."""
     columns = {
         name: np.arange(first, first + n * (tiles if per_tile else 1))
         .reshape((n, tiles) if per_tile else (n,))
@@ -49,17 +49,11 @@ def batch(n: int = 3, tiles: int = 2, first: int = 0) -> FrameBatch:
     return FrameBatch(**columns)
 
 
-def test_the_columns_are_those_of_the_design() -> None:
+def test_columns_marks_and_flags_are_those_of_the_design() -> None:
     assert [f.name for f in fields(FrameBatch)] == list(DESIGN)
     found = {name: (np.dtype(t).name, per_tile) for name, (t, per_tile) in FRAME_COLUMNS.items()}
     assert found == DESIGN
-
-
-def test_the_marks_of_what_was_not_read_are_those_of_the_design() -> None:
     assert (NOT_READ, NO_SERVO_COUNTS, NO_SERVO_AGE) == (65535, -2147483648, -1)
-
-
-def test_the_status_bits_are_those_of_the_design() -> None:
     assert {bit.name: bit.value for bit in TileFlag} == {
         "NO_ANSWER": 1,
         "STALE": 2,
@@ -76,39 +70,25 @@ def test_the_status_bits_are_those_of_the_design() -> None:
         "NEW_ARRAY_INFO": 16,
         "SERVO_TURN_UNKNOWN": 32,
     }
-
-
-def test_a_retried_or_over_ranged_tile_is_still_usable() -> None:
     usable = [bit.name for bit in TileFlag if not bit & TileFlag.UNUSABLE]
     assert usable == ["RETRIED", "OVER_RANGE"]
 
 
-@pytest.mark.parametrize("name", DESIGN)
-def test_a_column_of_another_type_is_refused_by_name(name: str) -> None:
+@pytest.mark.parametrize(("name", "per_tile"), [(n, is_2d) for n, (_, is_2d) in DESIGN.items()])
+def test_a_column_of_another_type_or_shape_is_refused_by_name(name: str, per_tile: bool) -> None:
     good = batch()
-    wrong = getattr(good, name).astype(np.complex128)
-    with pytest.raises(ValueError, match=rf"FrameBatch\.{name}\b"):
-        replace(good, **{name: wrong})
+    column = getattr(good, name)
+    wrong = [column.astype(np.complex128)]
+    if name != "pressure_raw":  # which has the shape that the others must have
+        wrong += [column[:-1], *([getattr(batch(tiles=3), name)] if per_tile else [])]
+    for values in wrong:
+        with pytest.raises(ValueError, match=rf"FrameBatch\.{name}:"):
+            replace(good, **{name: values})
 
 
-@pytest.mark.parametrize("name", [name for name in DESIGN if name != "pressure_raw"])
-def test_a_column_of_another_length_is_refused_by_name(name: str) -> None:
-    good = batch()
-    with pytest.raises(ValueError, match=rf"FrameBatch\.{name}\b"):
-        replace(good, **{name: getattr(good, name)[:-1]})
-
-
-@pytest.mark.parametrize("name", [n for n, (_, per_tile) in DESIGN.items() if per_tile])
-def test_a_column_for_another_number_of_tiles_is_refused(name: str) -> None:
-    with pytest.raises(ValueError, match=r"FrameBatch\."):
-        replace(batch(tiles=2), **{name: getattr(batch(tiles=3), name)})
-
-
-def test_a_batch_knows_its_size() -> None:
-    assert len(batch(n=3, tiles=2)) == 3
-    assert batch(n=3, tiles=2).tile_count == 2
-    assert len(batch(n=0, tiles=4)) == 0
-    assert batch(n=0, tiles=4).tile_count == 4
+def test_a_batch_has_frames_and_tiles_even_if_it_is_empty() -> None:
+    for n, tiles in ((3, 2), (0, 4)):
+        assert (len(batch(n, tiles)), batch(n, tiles).tile_count) == (n, tiles)
 
 
 @given(
@@ -140,33 +120,23 @@ def test_rows_copy_nothing() -> None:
         assert np.shares_memory(getattr(part, name), getattr(whole, name))
 
 
-def test_batches_of_different_arrays_do_not_join() -> None:
+def test_batches_of_different_arrays_and_no_batches_do_not_join() -> None:
     with pytest.raises(ValueError, match="dimension"):
         FrameBatch.concatenate([batch(tiles=2), batch(tiles=3)])
-
-
-def test_no_batch_at_all_does_not_join() -> None:
     with pytest.raises(ValueError, match="at least one"):
         FrameBatch.concatenate([])
 
 
-def described() -> ArrayInfo:
-    """An array with a servo, nothing in it a default."""
-    servo = make_servo(sign=-1, ratio=0.1, ankle_travel_m_per_rad=None)
-    return make_array(servo=servo, nominal_rate_hz=394.87, stream_id="00ff")
-
-
 def test_array_info_travels_as_json_without_loss() -> None:
-    info = described()
+    # Nothing in it is a default.
+    servo = make_servo(sign=-1, ratio=0.1, ankle_travel_m_per_rad=None)
+    info = make_array(servo=servo, nominal_rate_hz=394.87, stream_id="00ff")
     assert ArrayInfo.model_validate_json(info.model_dump_json()) == info
     plain = json.loads(info.model_dump_json())
     assert plain["utc_offset_ns"] == UTC_NS
     assert plain["tiles"][0]["coefficient_words"] == list(NEWTON_CHIP)
     assert plain["servo"]["ankle_travel_m_per_rad"] is None
-
-
-def test_serials_come_in_the_order_of_the_tiles() -> None:
-    assert make_array(2).serials == ("T01", "T02")
+    assert info.serials == ("T01", "T02")
 
 
 def test_array_info_of_a_newer_version_is_refused_rather_than_half_read() -> None:

@@ -1,4 +1,4 @@
-"""Compiled loops: the same numbers whatever becomes of the folder that they are kept in."""
+"""Compiled functions: the same numbers in any state of their cache."""
 
 from __future__ import annotations
 
@@ -19,60 +19,51 @@ def tripled(x: float) -> float:
 
 
 @pytest.fixture
-def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where compiled loops are kept."""
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder of machine code."""
     monkeypatch.setattr(numba.core.config, "CACHE_DIR", str(tmp_path))
     return tmp_path
 
 
-def called() -> tuple[float, int]:
-    """The loop's result as after a new start, and how often it came from disk."""
-    loop: Any = jit_cached(tripled)
-    return loop(2.0), sum(loop.stats.cache_hits.values())
+def call_tripled() -> tuple[float, int]:
+    """Return the result as after a new start, and the number of cache hits."""
+    function: Any = jit_cached(tripled)
+    return function(2.0), sum(function.stats.cache_hits.values())
 
 
-def test_it_is_compiled_once_and_kept(kept: Path) -> None:
-    assert [called(), called()] == [(6.0, 0), (6.0, 1)]
-
-
-@pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
-@pytest.mark.parametrize("left", [0, 40])
-def test_what_a_power_cut_left_of_it_is_compiled_anew(kept: Path, suffix: str, left: int) -> None:
-    called()
-    (file,) = kept.rglob(f"*{suffix}")
-    file.write_bytes(file.read_bytes()[:left])
-    assert [called(), called()] == [(6.0, 0), (6.0, 1)]
+def test_a_function_is_compiled_once(cache: Path) -> None:
+    assert [call_tripled(), call_tripled()] == [(6.0, 0), (6.0, 1)]
 
 
 @pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
-@pytest.mark.parametrize("share", [0.02, 0.3, 0.6, 0.9])
-def test_what_a_disk_has_garbled_of_it_is_compiled_anew(
-    kept: Path, suffix: str, share: float
+@pytest.mark.parametrize("damage", ["empty", "cut", 0.02, 0.3, 0.6, 0.9])
+def test_a_function_of_a_damaged_cache_is_compiled_again(
+    cache: Path, suffix: str, damage: str | float
 ) -> None:
-    called()
-    (file,) = kept.rglob(f"*{suffix}")
+    call_tripled()
+    (file,) = cache.rglob(f"*{suffix}")
     content = bytearray(file.read_bytes())
-    at = int(share * len(content))
-    content[at : at + 8] = bytes(255 - byte for byte in content[at : at + 8])
+    if isinstance(damage, float):  # garbled from this part of the file on
+        at = int(damage * len(content))
+        content[at : at + 8] = bytes(255 - byte for byte in content[at : at + 8])
+    else:
+        del content[0 if damage == "empty" else 40 :]
     file.write_bytes(content)
-    assert [called(), called()] == [(6.0, 0), (6.0, 1)]
+    assert [call_tripled(), call_tripled()] == [(6.0, 0), (6.0, 1)]
 
 
-def test_without_a_place_to_keep_it_it_is_compiled_all_the_same(
+def refuse_to_write(*_: Any) -> None:
+    raise OSError(28, "No space left on device")
+
+
+@pytest.mark.usefixtures("cache")
+def test_a_function_is_compiled_without_a_cache_and_on_a_full_disk(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    with monkeypatch.context() as disk:
+        disk.setattr(numba.core.caching.IndexDataCacheFile, "save", refuse_to_write)
+        assert jit_cached(tripled)(2.0) == 6.0
     monkeypatch.setattr(numba.core.caching.CacheImpl, "_locator_classes", [])
-    assert jit_cached(tripled)(2.0) == 6.0
-
-
-def test_on_a_full_disk_it_is_compiled_all_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: Any) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(numba.core.config, "CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(numba.core.caching.IndexDataCacheFile, "save", full)
     assert jit_cached(tripled)(2.0) == 6.0
 
 
@@ -115,7 +106,7 @@ def at_far(x: float) -> float:
     return x * PLACE[0].far  # type: ignore[no-any-return]  # a field of a record
 
 
-@pytest.mark.usefixtures("kept")
+@pytest.mark.usefixtures("cache")
 @pytest.mark.parametrize(
     ("one", "other", "expected"),
     [
@@ -124,19 +115,19 @@ def at_far(x: float) -> float:
         (at_near, at_far, [2.0, 10.0]),
     ],
 )
-def test_what_it_calls_has_but_another_name_in_it_and_it_is_compiled_anew(
+def test_a_function_is_compiled_again_if_its_callee_differs_in_a_name_only(
     one: Any, other: Any, expected: list[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Names are no part of Python's byte code: it says "the second name".
+    # Python's byte code has the number of a name, and not the name.
     found = []
-    for called_now in (one, other):
-        monkeypatch.setitem(globals(), "inner", jit_cached(called_now))
+    for callee in (one, other):
+        monkeypatch.setitem(globals(), "inner", jit_cached(callee))
         found.append(jit_cached(scaled)(1.0))
     assert found == expected
 
 
-@pytest.mark.usefixtures("kept")
-def test_an_index_that_points_to_what_was_kept_before_is_not_believed(
+@pytest.mark.usefixtures("cache")
+def test_an_index_without_its_machine_code_is_not_used(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     assert jit_cached(scaled)(1.0) == 6.0
@@ -145,30 +136,26 @@ def test_an_index_that_points_to_what_was_kept_before_is_not_believed(
     monkeypatch.setattr(locator, "get_source_stamp", lambda _: "edited")
     monkeypatch.setitem(globals(), "FACTOR", 10.0)
     with monkeypatch.context() as disk:
-
-        def full(*_: Any) -> None:
-            raise OSError(28, "No space left on device")
-
-        disk.setattr(numba.core.caching.IndexDataCacheFile, "_save_data", full)
+        disk.setattr(numba.core.caching.IndexDataCacheFile, "_save_data", refuse_to_write)
         assert jit_cached(scaled)(1.0) == 30.0
     assert jit_cached(scaled)(1.0) == 30.0
 
 
-@pytest.mark.usefixtures("kept")
+@pytest.mark.usefixtures("cache")
 @pytest.mark.parametrize(
     ("name", "value", "expected"), [("FACTOR", 10.0, 30.0), ("inner", jit_cached(halved), 1.0)]
 )
-def test_what_it_calls_or_takes_from_elsewhere_has_changed_and_it_is_compiled_anew(
+def test_a_function_is_compiled_again_if_a_callee_or_a_constant_has_changed(
     name: str, value: Any, expected: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # The file of `scaled` is as it was, which is all that numba looks at.
+    # The file of `scaled` is unchanged, and numba compares nothing else.
     assert jit_cached(scaled)(1.0) == 6.0
     monkeypatch.setitem(globals(), name, value)
     assert jit_cached(scaled)(1.0) == expected
 
 
-@pytest.mark.usefixtures("kept")
-def test_what_calls_others_is_found_again_while_nothing_has_changed() -> None:
+@pytest.mark.usefixtures("cache")
+def test_an_unchanged_function_with_a_callee_is_compiled_once() -> None:
     first: Any = jit_cached(scaled)
     again: Any = jit_cached(scaled)
     assert first(1.0) == again(1.0) == 6.0

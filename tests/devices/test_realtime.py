@@ -1,4 +1,4 @@
-"""What is asked of the kernel, and that a refusal is no failure."""
+"""Requests to the kernel. A refusal is no failure."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from devices import realtime
 PR_GET_TIMERSLACK = 30
 
 
-def in_a_thread(body: Callable[[], object]) -> object:
-    """Settings of a thread end with it."""
+def run_in_a_thread(body: Callable[[], object]) -> object:
+    """Run in a thread of its own, with which its settings end."""
     result: list[object] = []
     thread = threading.Thread(target=lambda: result.append(body()))
     thread.start()
@@ -27,24 +27,24 @@ def in_a_thread(body: Callable[[], object]) -> object:
     return result[0]
 
 
-def test_timers_are_as_sharp_as_asked_for() -> None:
+def test_the_timer_slack_is_the_requested_one() -> None:
     def slack_ns() -> int:
         assert realtime.set_timer_slack(2_000)
         return int(ctypes.CDLL(None).prctl(PR_GET_TIMERSLACK, 0, 0, 0, 0))
 
-    assert in_a_thread(slack_ns) == 2_000
+    assert run_in_a_thread(slack_ns) == 2_000
 
 
-def test_a_priority_that_is_not_permitted_is_done_without(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refused_priority_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise PermissionError
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    assert in_a_thread(realtime.use_realtime_priority) is False
+    assert run_in_a_thread(realtime.use_realtime_priority) is False
 
 
 @pytest.mark.parametrize(("state", "is_set"), [(0, True), (1, True), (5, False), (-1, False)])
-def test_the_clock_is_set_unless_the_kernel_says_otherwise(
+def test_a_clock_is_set_unless_the_kernel_reports_an_error(
     monkeypatch: pytest.MonkeyPatch, state: int, is_set: bool
 ) -> None:
     class Libc:
@@ -57,7 +57,7 @@ def test_the_clock_is_set_unless_the_kernel_says_otherwise(
 
 
 @pytest.mark.process
-def test_what_is_loaded_is_not_looked_at_again_and_what_comes_later_is() -> None:
+def test_the_garbage_collector_skips_loaded_objects_and_collects_later_ones() -> None:
     code = """
 import gc, weakref
 from devices.realtime import freeze_garbage_collector
@@ -79,7 +79,7 @@ assert later() is None
 
 
 @pytest.mark.process
-def test_a_process_ends_with_its_parent_even_if_that_is_killed() -> None:
+def test_a_process_ends_with_its_killed_parent() -> None:
     child = (
         "import sys, time; from devices.realtime import terminate_with_parent; "
         "terminate_with_parent(); print(1, flush=True); time.sleep(60)"

@@ -9,10 +9,11 @@ from hypothesis import strategies as st
 
 from devices.flags import TileFlag
 from devices.frames import NOT_READ, FrameBatch
-from devices.temperature_hold import HeldTemperature, hold_temperature
+from devices.temperature_hold import hold_temperature
 from tests.builders.frames import make_frames
 
 MS = 1_000_000
+N = NOT_READ
 
 
 def frames(
@@ -27,132 +28,85 @@ def frames(
     )
 
 
-def held(batch: FrameBatch, before: HeldTemperature | None = None) -> list[list[int]]:
-    result: list[list[int]] = hold_temperature(batch, before)[0].temperature_raw.tolist()
-    return result
-
-
-N = NOT_READ
-
-
-def test_a_frame_without_temperature_has_that_of_the_frame_before() -> None:
-    assert held(frames([[500], [N], [N], [503], [N]])) == [[500], [500], [500], [503], [503]]
-
-
-def test_each_tile_has_its_own() -> None:
-    assert held(frames([[500, N], [N, 600], [N, N]])) == [[500, N], [500, 600], [500, 600]]
-
-
-def test_nothing_is_held_from_a_later_frame() -> None:
-    assert held(frames([[N], [N], [500]])) == [[N], [N], [500]]
-
-
-def test_what_was_read_is_never_changed() -> None:
+def test_frames_that_read_every_temperature_are_not_copied() -> None:
     batch = frames([[500], [510], [490]])
-    assert hold_temperature(batch)[0] is batch, "nothing to do, nothing copied"
+    assert hold_temperature(batch)[0] is batch
 
 
-def test_the_last_of_temperatures_that_were_all_read_is_held_and_is_no_part_of_the_frames() -> None:
+def test_the_last_temperatures_are_held_for_the_next_frames_and_share_no_memory_with_these() -> (
+    None
+):
     batch = frames([[500, 600], [510, 601]], [7, 9])
-    last = hold_temperature(batch)[1]
+    _, last = hold_temperature(batch)
     assert last.temperature_raw.tolist() == [510, 601]
     assert last.t_mono_ns.tolist() == [9 * MS, 9 * MS]
     assert (last.temperature_raw.dtype.name, last.t_mono_ns.dtype.name) == ("uint16", "int64")
     assert not np.shares_memory(last.temperature_raw, batch.temperature_raw)
-    assert held(frames([[N, N]], [10]), last) == [[510, 601]]
+    following, _ = hold_temperature(frames([[N, N]], [10]), last)
+    assert following.temperature_raw.tolist() == [[510, 601]]
 
 
-def test_the_frames_themselves_keep_what_was_read() -> None:
-    batch = frames([[500], [N]])
-    hold_temperature(batch)
-    assert batch.temperature_raw.tolist() == [[500], [N]]
-
-
-@pytest.mark.parametrize(("age_ms", "known"), [(1, True), (1000, True), (1001, False)])
-def test_a_temperature_is_held_for_a_second(age_ms: int, known: bool) -> None:
-    assert held(frames([[500], [N]], [0, age_ms])) == [[500], [500 if known else N]]
-
-
-def test_being_held_does_not_make_it_any_younger() -> None:
-    assert held(frames([[500], [N], [N]], [0, 700, 1400])) == [[500], [500], [N]]
-
-
-@pytest.mark.parametrize("bit", [s for s in TileFlag if s & TileFlag.UNUSABLE])
-def test_an_unusable_reading_is_not_held(bit: TileFlag) -> None:
-    batch = frames([[500], [1023], [N]], tile_flags=[[0], [int(bit)], [0]])
-    assert held(batch) == [[500], [1023], [500]]
-
-
-@pytest.mark.parametrize("bit", [TileFlag.RETRIED, TileFlag.OVER_RANGE])
-def test_a_usable_reading_is_held_whatever_else_is_said_of_it(bit: TileFlag) -> None:
-    batch = frames([[500], [505], [N]], tile_flags=[[0], [int(bit)], [0]])
-    assert held(batch) == [[500], [505], [505]]
-
-
-def test_no_temperature_has_come_before_the_first_frame() -> None:
+def test_a_tile_that_never_read_a_temperature_has_none_to_hold() -> None:
     _, last = hold_temperature(frames([[N, 500], [N, N]]))
     assert last.temperature_raw.tolist() == [N, 500]
     assert last.t_mono_ns.tolist() == [0, 0]
 
 
-streams = st.integers(1, 30).flatmap(
-    lambda n: st.tuples(
-        st.lists(
-            st.lists(st.sampled_from([N, N, N, 480, 500, 520]), min_size=2, max_size=2),
-            min_size=n,
-            max_size=n,
-        ),
-        st.lists(st.integers(1, 700), min_size=n, max_size=n),
-        st.lists(
-            st.lists(st.sampled_from([0, 0, 0, 1, 4, 8]), min_size=2, max_size=2),
-            min_size=n,
-            max_size=n,
-        ),
-        st.lists(st.booleans(), min_size=n, max_size=n),
-    )
+@pytest.mark.parametrize(
+    ("t_ms", "expected"),
+    [
+        ([0, 1, 1000], [500, 500, 500]),
+        ([0, 1, 1001], [500, 500, N]),
+        ([0, 700, 1400], [500, 500, N]),
+    ],
 )
-
-
-@settings(max_examples=200)
-@given(stream=streams)
-def test_any_split_of_a_stream_gives_the_same(
-    stream: tuple[list[list[int]], list[int], list[list[int]], list[bool]],
+def test_a_temperature_is_held_for_a_second_since_it_was_read(
+    t_ms: list[int], expected: list[int]
 ) -> None:
-    temperature_raw, gaps_ms, status, cuts = stream
-    batch = frames(temperature_raw, np.cumsum(gaps_ms).tolist(), status)
+    batch = frames([[500], [N], [N]], t_ms)
+    assert hold_temperature(batch)[0].temperature_raw[:, 0].tolist() == expected
+    assert batch.temperature_raw[:, 0].tolist() == [500, N, N], "the frames keep what they read"
+
+
+def test_every_flag_of_an_unusable_reading_keeps_its_temperature_from_being_held() -> None:
+    for bit in TileFlag:
+        batch = frames([[500], [505], [N]], tile_flags=[[0], [int(bit)], [0]])
+        expected = 500 if bit & TileFlag.UNUSABLE else 505
+        assert hold_temperature(batch)[0].temperature_raw[:, 0].tolist() == [500, 505, expected]
+
+
+def pairs(values: list[int], rows: int) -> st.SearchStrategy[list[list[int]]]:
+    pair = st.lists(st.sampled_from(values), min_size=2, max_size=2)
+    return st.lists(pair, min_size=rows, max_size=rows)
+
+
+@settings(max_examples=100)
+@given(data=st.data(), rows=st.integers(1, 30))
+def test_the_last_usable_temperature_of_the_last_second_is_held_in_any_split_of_a_stream(
+    data: st.DataObject, rows: int
+) -> None:
+    temperature_raw = data.draw(pairs([N, N, N, 480, 500, 520], rows))
+    t_ms = np.cumsum(data.draw(st.lists(st.integers(1, 700), min_size=rows, max_size=rows)))
+    flags = data.draw(pairs([0, 0, 0, 1, 4, 8], rows))
+    batch = frames(temperature_raw, t_ms.tolist(), flags)
     whole, last = hold_temperature(batch)
-    ends = [row for row, cut in enumerate(cuts) if cut and row] + [len(batch)]
+
+    expected = [list(row) for row in temperature_raw]
+    for tile in range(2):
+        usable: int | None = None
+        for row in range(rows):
+            if temperature_raw[row][tile] != N:
+                usable = usable if flags[row][tile] & TileFlag.UNUSABLE else row
+            elif usable is not None and t_ms[row] - t_ms[usable] <= 1000:
+                expected[row][tile] = temperature_raw[usable][tile]
+    assert whole.temperature_raw.tolist() == expected
+
     pieces, before, begin = [], None, 0
-    for end in ends:
+    for end in sorted(data.draw(st.sets(st.integers(1, rows))) | {rows}):
         piece, before = hold_temperature(batch.slice_rows(begin, end), before)
-        pieces.append(piece)
+        pieces += piece.temperature_raw.tolist()
         begin = end
-    assert (
-        np.concatenate([piece.temperature_raw for piece in pieces]).tolist()
-        == whole.temperature_raw.tolist()
-    )
+    assert pieces == expected
     assert before is not None
     np.testing.assert_array_equal(before.temperature_raw, last.temperature_raw)
     np.testing.assert_array_equal(before.t_mono_ns, last.t_mono_ns)
-
-
-@settings(max_examples=200)
-@given(stream=streams)
-def test_what_is_held_is_the_last_usable_one_of_the_last_second(
-    stream: tuple[list[list[int]], list[int], list[list[int]], list[bool]],
-) -> None:
-    temperature_raw, gaps_ms, status, _ = stream
-    t_ms = np.cumsum(gaps_ms).tolist()
-    expected = [list(row) for row in temperature_raw]
-    for tile in range(2):
-        for row in range(len(temperature_raw)):
-            if temperature_raw[row][tile] != N:
-                continue
-            usable = [
-                r
-                for r in range(row)
-                if temperature_raw[r][tile] != N and not status[r][tile] & TileFlag.UNUSABLE
-            ]
-            if usable and t_ms[row] - t_ms[usable[-1]] <= 1000:
-                expected[row][tile] = temperature_raw[usable[-1]][tile]
-    assert held(frames(temperature_raw, t_ms, status)) == expected

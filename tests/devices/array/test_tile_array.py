@@ -1,45 +1,55 @@
-"""An array of tiles: what a frame holds, when it was sampled, and what stands beside it."""
+"""An array of tiles: the readings of a frame, their instants, and the reference force."""
 
 from __future__ import annotations
 
+import math
+import statistics
+from functools import partial
+
+import numpy as np
 import pytest
 from smbus2 import i2c_msg
 
+from devices.array.startup import prepare_array
+from devices.array.tile_array import TileArray
+from devices.buses.i2c import open_bus
+from devices.clock import VirtualClock
+from devices.emulation.world import World
 from devices.errors import SceneError
 from devices.flags import TileFlag
 from devices.frames import NOT_READ
 from devices.scene.hardware_sections import ScheduleName
-from tests.devices.array.wiring import BIT_NS, WHOLE_NS, every_schedule
+from devices.scene.scene_file import load_scene
 from tests.devices.rigs import (
+    BIT_NS,
     CONVERT,
     FOUR,
     READ,
-    SCHEDULES,
     SELECT,
     TWO_MUXES,
     TYPICAL_NS,
+    WHOLE_NS,
     Wires,
     array_on,
+    every_schedule,
     settled,
     settled_on,
     timed_scan,
 )
 
-READS_THE_FRAME_BEFORE = ("pipelined", "per_mux")
-"""Schedules that read what the frame before has started."""
-
-
-# What a frame holds
+# Readings and instants
 
 
 @every_schedule
-def test_every_frame_is_a_fresh_conversion_of_every_tile(schedule: ScheduleName) -> None:
+def test_every_frame_is_a_new_conversion_of_every_tile(schedule: ScheduleName) -> None:
     array = array_on(wires := Wires(TWO_MUXES), schedule)
+    assert array.tiles == wires.infos
+    assert array.tiles_by_mux == ((0, 1), (2, 3))
     first = array.scan_frame()
     last = [100 * i + 1 for i in range(4)]
-    if schedule in READS_THE_FRAME_BEFORE:
-        converted = [status != TileFlag.NOT_CONVERTED for status in first.tile_flags]
-        # per_mux has had the tiles of the last mux convert before it came to them.
+    if schedule in ("pipelined", "per_mux"):  # which read conversions of the frame before
+        converted = [flags != TileFlag.NOT_CONVERTED for flags in first.tile_flags]
+        # per_mux starts the tiles of the last mux before it reads them.
         assert converted == [False, False] + [schedule == "per_mux"] * 2
         array.scan_frame()
         last = array.scan_frame().pressure_raw
@@ -53,19 +63,19 @@ def test_every_frame_is_a_fresh_conversion_of_every_tile(schedule: ScheduleName)
         assert scan.temperature_raw == [500] * 4
         assert scan.tile_flags == [0] * 4
         assert not scan.bus_fault
-    assert [pressure_raw // 100 for pressure_raw in last] == [0, 1, 2, 3], "each tile's own"
-    assert wires.clock.now_ns() > 0
+        assert math.isnan(scan.reference_n)
+    assert [pressure_raw // 100 for pressure_raw in last] == [0, 1, 2, 3], "of each tile its own"
 
 
 def test_all_tiles_of_a_simultaneous_frame_convert_at_one_instant() -> None:
     wires = Wires(TWO_MUXES)
-    array = array_on(wires)
     begin_ns = wires.clock.now_ns()
-    # Nothing is known at first, so both muxes are selected, then comes the CONVERT.
-    assert array.scan_frame().convert_stop_ns == [begin_ns + (2 * SELECT + CONVERT) * BIT_NS] * 4
+    # At first no mask is known, so both muxes are selected before the CONVERT.
+    stop_ns = begin_ns + (2 * SELECT + CONVERT) * BIT_NS
+    assert array_on(wires).scan_frame().convert_stop_ns == [stop_ns] * 4
 
 
-def test_each_tile_of_a_sequential_frame_has_an_instant_of_its_own() -> None:
+def test_each_tile_of_a_sequential_frame_has_its_own_instant() -> None:
     wires, array = settled_on(FOUR, "sequential")
     first_ns = wires.clock.now_ns() + (SELECT + CONVERT) * BIT_NS
     step_ns = (SELECT + CONVERT + READ) * BIT_NS + TYPICAL_NS
@@ -74,61 +84,51 @@ def test_each_tile_of_a_sequential_frame_has_an_instant_of_its_own() -> None:
 
 
 @every_schedule
-def test_a_sample_is_dated_by_the_stop_of_its_own_convert(schedule: ScheduleName) -> None:
+def test_a_reading_has_the_instant_of_its_own_convert(schedule: ScheduleName) -> None:
     wires = Wires(TWO_MUXES)
-    told: list[dict[tuple[int, int], int]] = [{} for _ in wires.tiles]
-    for tile, stops_ns in zip(wires.tiles, told, strict=True):
+    stops_ns: dict[tuple[int, tuple[int, int]], int] = {}
 
-        def note(
-            stop_ns: int,
-            words: tuple[int, int],
-            chip: tuple[int, int, int, int],
-            stops: dict[tuple[int, int], int] = stops_ns,
-        ) -> None:
-            stops[words] = stop_ns
+    def note(tile: int, stop_ns: int, counts: tuple[int, int], chip: object) -> None:
+        stops_ns[tile, counts] = stop_ns
 
-        tile.on_conversion = note
+    for i, part in enumerate(wires.tiles):
+        part.on_conversion = partial(note, i)
     array = array_on(wires, schedule)
     array.scan_frame()
     for _ in range(20):
         scan = array.scan_frame()
-        for i in range(4):
-            assert scan.convert_stop_ns[i] == told[i][scan.pressure_raw[i], scan.temperature_raw[i]]
+        counts = zip(scan.pressure_raw, scan.temperature_raw, strict=True)
+        assert scan.convert_stop_ns == [stops_ns[reading] for reading in enumerate(counts)]
 
 
-def test_the_sample_is_taken_to_lie_a_quarter_into_each_parts_own_conversion() -> None:
+def test_a_sample_lies_a_quarter_into_the_conversion_of_its_part() -> None:
     array = array_on(Wires(FOUR, tc_ns=[1_600_000, 1_400_000, 2_000_000, 2_999_999]))
     assert array.sample_delay_ns == (400_000, 350_000, 500_000, 749_999)
 
 
-def test_a_wait_that_is_too_short_gives_the_conversion_before() -> None:
+def test_too_short_a_wait_gives_the_conversion_before() -> None:
     array = array_on(Wires(FOUR), waits_ns=[800_000] * 4)
     first, second = array.scan_frame(), array.scan_frame()
     assert first.tile_flags[0] == TileFlag.NOT_CONVERTED
     assert second.pressure_raw[0] != 2
 
 
-def test_an_array_knows_its_tiles_and_which_are_behind_one_mux() -> None:
-    for name in SCHEDULES:
-        wires = Wires(TWO_MUXES)
-        array = array_on(wires, name)
-        assert array.tiles == wires.infos
-        assert array.tiles_by_mux == ((0, 1), (2, 3))
+def test_an_array_opens_no_more_channels_than_allowed() -> None:
+    for wires, schedule, channels in (
+        (Wires(FOUR), "simultaneous", 4),
+        (Wires(TWO_MUXES), "per_mux", 2),
+        (Wires(FOUR), "pipelined", 1),
+    ):
+        array_on(wires, schedule, broadcast_channels=channels)  # type: ignore[arg-type]
+        if channels > 1:
+            with pytest.raises(SceneError, match=f"opens {channels} channels at once"):
+                array_on(wires, schedule, broadcast_channels=channels - 1)  # type: ignore[arg-type]
 
 
-def test_an_array_refuses_to_open_more_channels_than_allowed() -> None:
-    with pytest.raises(SceneError, match="opens 4 channels at once"):
-        array_on(Wires(FOUR), "simultaneous", broadcast_channels=3)
-    with pytest.raises(SceneError, match="opens 2 channels at once"):
-        array_on(Wires(TWO_MUXES), "per_mux", broadcast_channels=1)
-    array_on(Wires(TWO_MUXES), "per_mux", broadcast_channels=2)
-    array_on(Wires(FOUR), "pipelined", broadcast_channels=1)
+# Reference force
 
 
-# What stands beside the array
-
-
-def test_what_stands_beside_is_read_once_a_frame_at_the_first_tiles_sample_instant() -> None:
+def test_the_reference_force_is_read_once_a_frame_at_the_sample_instant_of_the_first_tile() -> None:
     wires = Wires(FOUR)
     asked_ns: list[int] = []
 
@@ -138,20 +138,11 @@ def test_what_stands_beside_is_read_once_a_frame_at_the_first_tiles_sample_insta
 
     array = array_on(wires, reference_n=reference_n)
     for frame in range(1, 8):
-        scan = array.scan_frame()
+        scan, took_ns = timed_scan(array, wires)
         assert scan.reference_n == 0.25 * frame
         assert len(asked_ns) == frame
         assert asked_ns[-1] == scan.convert_stop_ns[0] + 400_000 == scan.reference_ns
-
-
-def test_what_stands_beside_costs_no_time_on_the_bus() -> None:
-    array = settled(wires := Wires(FOUR), reference_n=lambda: 1.0)
-    assert timed_scan(array, wires)[1] == WHOLE_NS
-
-
-def test_without_anything_beside_there_is_no_force() -> None:
-    scan = array_on(Wires(FOUR)).scan_frame()
-    assert scan.reference_n != scan.reference_n  # NaN
+    assert took_ns == WHOLE_NS, "it takes no time on the bus"
 
 
 # Temperature in every k-th frame
@@ -159,12 +150,10 @@ def test_without_anything_beside_there_is_no_force() -> None:
 
 @every_schedule
 @pytest.mark.parametrize("every", [2, 3, 10])
-def test_temperature_is_read_in_every_kth_frame_and_not_known_in_between(
-    schedule: ScheduleName, every: int
-) -> None:
+def test_temperature_is_read_in_every_kth_frame_only(schedule: ScheduleName, every: int) -> None:
     array = array_on(Wires(FOUR), schedule, temperature_every=every)
     array.scan_frame()
-    array.scan_frame()  # by now every tile has one, whatever the count of frames says
+    array.scan_frame()  # now every tile has one
     for frame in range(2, 32):
         scan = array.scan_frame()
         assert scan.temperature_raw == [500 if frame % every == 0 else NOT_READ] * 4
@@ -172,21 +161,13 @@ def test_temperature_is_read_in_every_kth_frame_and_not_known_in_between(
         assert scan.tile_flags == [0] * 4
 
 
-def test_a_frame_without_temperature_reads_two_bytes_and_saves_18_bits_a_tile() -> None:
+def test_a_frame_without_temperature_is_18_bits_a_tile_shorter() -> None:
     array = settled(wires := Wires(FOUR), temperature_every=2)
     wires.log.clear()
-    costs = [timed_scan(array, wires)[1] for _ in range(4)]
-    assert (
-        costs == [WHOLE_NS - 4 * 18 * BIT_NS, WHOLE_NS] * 2
-        or costs
-        == [
-            WHOLE_NS,
-            WHOLE_NS - 4 * 18 * BIT_NS,
-        ]
-        * 2
-    )
-    reads = [entry for entry in wires.log if entry.startswith("60<00")]
-    assert reads.count("60<00 60>2") == reads.count("60<00 60>4") == 8
+    took_ns = [timed_scan(array, wires)[1] for _ in range(4)]
+    assert took_ns[:2] == took_ns[2:]
+    assert set(took_ns) == {WHOLE_NS - 4 * 18 * BIT_NS, WHOLE_NS}
+    assert wires.log.count("60<00 60>2") == wires.log.count("60<00 60>4") == 8
 
 
 @every_schedule
@@ -199,7 +180,7 @@ def test_the_first_reading_of_a_tile_has_its_temperature(schedule: ScheduleName)
         assert first.temperature_raw[i] == 500
 
 
-def test_a_tile_that_comes_back_brings_its_temperature() -> None:
+def test_the_first_reading_of_a_tile_that_returns_has_its_temperature() -> None:
     wires = Wires(FOUR)
     array = settled(wires, temperature_every=1000)
     with wires.fault("no_answer", "T02"):
@@ -209,13 +190,11 @@ def test_a_tile_that_comes_back_brings_its_temperature() -> None:
     assert scan.temperature_raw == [NOT_READ, 500, NOT_READ, NOT_READ]
 
 
-# A stream begins, and goes on
+# Streams
 
 
 @every_schedule
-def test_after_something_else_used_the_bus_nothing_is_read_that_was_started_before(
-    schedule: ScheduleName,
-) -> None:
+def test_no_conversion_from_before_another_use_of_the_bus_is_read(schedule: ScheduleName) -> None:
     wires, array = settled_on(TWO_MUXES, schedule)
     wires.bus.transfer(i2c_msg.write(0x73, [0xFF]))
     wires.clock.sleep_until_ns(wires.clock.now_ns() + 1_000_000_000)
@@ -223,13 +202,13 @@ def test_after_something_else_used_the_bus_nothing_is_read_that_was_started_befo
     array.discard_bus_state()
     scan = array.scan_frame()
     for i in range(4):
-        read = scan.pressure_raw[i] != NOT_READ
-        assert scan.tile_flags[i] == (0 if read else TileFlag.NOT_CONVERTED)
-        assert scan.convert_stop_ns[i] > resumed_ns or not read
+        is_read = scan.pressure_raw[i] != NOT_READ
+        assert scan.tile_flags[i] == (0 if is_read else TileFlag.NOT_CONVERTED)
+        assert scan.convert_stop_ns[i] > resumed_ns or not is_read
     assert array.scan_frame().tile_flags == [0] * 4
 
 
-def test_what_went_wrong_is_counted_from_the_begin_of_a_stream_and_on_when_it_goes_on() -> None:
+def test_faults_are_counted_from_the_beginning_of_a_stream() -> None:
     wires, array = settled_on(FOUR)
     with wires.fault("no_answer", "T03"):
         array.scan_frame()
@@ -239,3 +218,61 @@ def test_what_went_wrong_is_counted_from_the_begin_of_a_stream_and_on_when_it_go
     assert dict(array.health[2].fault_counts) == counted
     array.begin_stream()
     assert not array.health[2].fault_counts
+
+
+# Turns of a pipelined frame
+
+
+class SlowDriver:
+    """An array of four tiles with a driver that takes `late_ns` before each transfer."""
+
+    def __init__(self) -> None:
+        scene = load_scene("standing")
+        self.clock = VirtualClock()
+        self.late_ns = 0
+        adapter = World(scene, self.clock).i2c_adapter
+        rdwr = adapter.i2c_rdwr
+
+        def rdwr_late(*messages: i2c_msg) -> None:
+            self.clock.sleep_until_ns(self.clock.now_ns() + self.late_ns)
+            rdwr(*messages)
+
+        vars(adapter)["i2c_rdwr"] = rdwr_late
+        bus = open_bus("emulated", adapter)
+        self.array: TileArray = prepare_array(bus, scene, self.clock, schedule="pipelined").array
+
+    def measure_period_ns(self, frames: int = 60) -> float:
+        """Return the median period, which second readings do not affect."""
+        ends_ns = []
+        for _ in range(frames):
+            self.array.scan_frame()
+            ends_ns.append(self.clock.now_ns())
+        return statistics.median(np.diff(ends_ns).tolist())
+
+    def measure_skew_ns(self) -> int:
+        stops_ns = self.array.scan_frame().convert_stop_ns
+        return max(stops_ns) - min(stops_ns)
+
+
+def test_a_slow_driver_delays_a_frame_by_the_transfers_of_one_tile() -> None:
+    slow = SlowDriver()
+    without_ns = slow.measure_period_ns()
+    slow.late_ns = 30_000
+    slow.measure_period_ns()  # in which the array measures the delay
+    transfers = 3  # of each tile: select, read, convert
+    assert slow.measure_period_ns() - without_ns <= transfers * 30_000 + 3_000
+    slow.late_ns = 0
+    slow.measure_period_ns(200)
+    assert abs(slow.measure_period_ns() - without_ns) < 3_000
+
+
+def test_the_skew_after_a_late_frame_is_soon_as_before() -> None:
+    slow = SlowDriver()
+    slow.late_ns = 10_000
+    slow.measure_period_ns()
+    before_ns = slow.measure_skew_ns()
+    slow.late_ns = 60_000
+    slow.measure_skew_ns()  # of conversions from before
+    slow.late_ns = 10_000
+    assert slow.measure_skew_ns() > before_ns + 100_000
+    assert min(slow.measure_skew_ns() for _ in range(10)) < before_ns + 3_000

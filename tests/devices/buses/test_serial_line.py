@@ -1,4 +1,4 @@
-"""The latency timer of an adapter, with a folder in place of sysfs."""
+"""The latency timer and the stable path of a serial adapter."""
 
 from __future__ import annotations
 
@@ -9,56 +9,47 @@ import pytest
 from devices.buses.serial_line import check_latency_timer, find_stable_path, read_latency_timer_ms
 
 
-def adapter(sysfs: Path, content: str) -> None:
-    (sysfs / "ttyUSB7").mkdir()
-    (sysfs / "ttyUSB7" / "latency_timer").write_text(content)
+@pytest.fixture
+def sysfs(tmp_path: Path) -> Path:
+    """A folder in place of sysfs, with an adapter and its timer of 16 ms."""
+    (tmp_path / "ttyUSB7").mkdir()
+    (tmp_path / "ttyUSB7" / "latency_timer").write_text("16\n")
+    return tmp_path
 
 
-def test_the_latency_timer_is_read_from_sysfs(tmp_path: Path) -> None:
-    adapter(tmp_path, "16\n")
-    assert read_latency_timer_ms("/dev/ttyUSB7", tmp_path) == 16
-
-
-def test_a_link_to_the_port_is_followed(tmp_path: Path) -> None:
-    adapter(tmp_path, "4\n")
-    link = tmp_path / "usb-FTDI_adapter-port0"
+def test_the_latency_timer_is_read_by_a_port_or_a_link_to_it(sysfs: Path) -> None:
+    link = sysfs / "usb-FTDI_adapter-port0"
     link.symlink_to("/dev/ttyUSB7")
-    assert read_latency_timer_ms(str(link), tmp_path) == 4
+    for port in ("/dev/ttyUSB7", str(link)):
+        assert read_latency_timer_ms(port, sysfs) == 16
 
 
 @pytest.mark.parametrize("port", ["/dev/ttyAMA0", "/dev/pts/7", "ttyUSB8"])
-def test_a_port_that_is_no_ftdi_adapter_has_no_timer(tmp_path: Path, port: str) -> None:
-    adapter(tmp_path, "16\n")
-    assert read_latency_timer_ms(port, tmp_path) is None
-    assert check_latency_timer(port, tmp_path) is None
+def test_a_port_that_is_no_ftdi_adapter_has_no_timer(sysfs: Path, port: str) -> None:
+    assert read_latency_timer_ms(port, sysfs) is None
+    assert check_latency_timer(port, sysfs) is None
 
 
-def test_a_machine_without_usb_serial_has_no_timer(tmp_path: Path) -> None:
-    assert read_latency_timer_ms("/dev/ttyUSB7", tmp_path / "not there") is None
+def test_a_timer_that_is_missing_or_no_number_is_none(sysfs: Path) -> None:
+    assert read_latency_timer_ms("/dev/ttyUSB7", sysfs / "missing") is None
+    (sysfs / "ttyUSB7" / "latency_timer").write_text("soon\n")
+    assert read_latency_timer_ms("/dev/ttyUSB7", sysfs) is None
 
 
-def test_a_timer_that_says_no_number_is_none(tmp_path: Path) -> None:
-    adapter(tmp_path, "soon\n")
-    assert read_latency_timer_ms("/dev/ttyUSB7", tmp_path) is None
+@pytest.mark.parametrize(("timer", "is_slow"), [("0", False), ("1", False), ("16", True)])
+def test_a_slow_timer_is_a_warning_with_its_remedy(sysfs: Path, timer: str, is_slow: bool) -> None:
+    (sysfs / "ttyUSB7" / "latency_timer").write_text(timer)
+    warning = check_latency_timer("/dev/ttyUSB7", sysfs)
+    assert (warning is not None) == is_slow
+    if warning is not None:
+        assert warning.startswith("/dev/ttyUSB7: ")
+        for part in ("16 ms", "expected 1 ms", "udev", 'ATTR{latency_timer}="1"'):
+            assert part in warning
 
 
-def test_a_slow_timer_is_remarked_on_with_the_remedy(tmp_path: Path) -> None:
-    adapter(tmp_path, "16\n")
-    remark = check_latency_timer("/dev/ttyUSB7", tmp_path)
-    assert remark is not None
-    assert remark.startswith("/dev/ttyUSB7: ")
-    for part in ("16 ms", "expected 1 ms", "udev", 'ATTR{latency_timer}="1"'):
-        assert part in remark
-
-
-@pytest.mark.parametrize("timer", ["0", "1"])
-def test_a_quick_timer_is_not(tmp_path: Path, timer: str) -> None:
-    adapter(tmp_path, timer)
-    assert check_latency_timer("/dev/ttyUSB7", tmp_path) is None
-
-
-def test_the_name_that_lasts_is_udevs_link_to_the_adapter(tmp_path: Path) -> None:
+def test_the_stable_path_of_a_port_is_its_link_by_id(tmp_path: Path) -> None:
     device, other, by_id = tmp_path / "ttyUSB0", tmp_path / "ttyUSB1", tmp_path / "by-id"
+    assert find_stable_path(str(device), by_id) == str(device), "without udev"
     by_id.mkdir()
     for file in (device, other):
         file.touch()
@@ -66,9 +57,5 @@ def test_the_name_that_lasts_is_udevs_link_to_the_adapter(tmp_path: Path) -> Non
     assert find_stable_path(str(device), by_id) == str(device)
     link = by_id / "usb-FTDI_adapter-port0"
     link.symlink_to(device)
-    assert find_stable_path(str(device), by_id) == str(link)
-    assert find_stable_path(str(link), by_id) == str(link)
-
-
-def test_without_udev_a_port_keeps_its_own_name(tmp_path: Path) -> None:
-    assert find_stable_path("/dev/ttyUSB0", tmp_path / "by-id") == "/dev/ttyUSB0"
+    for path in (device, link):
+        assert find_stable_path(str(path), by_id) == str(link)

@@ -32,7 +32,7 @@ PART = DomeProperties(
 
 
 class Pressing:
-    """The same force, as a function of time, on every dome."""
+    """A force as a function of time, equal on every dome."""
 
     def __init__(self, force: Force, domes: int) -> None:
         self._force = force
@@ -42,18 +42,18 @@ class Pressing:
         return np.repeat(self._force(np.asarray(t_s))[:, None], self._domes, axis=1)
 
 
-def nothing(t_s: Floats) -> Floats:
+def no_force(t_s: Floats) -> Floats:
     return np.zeros_like(t_s)
 
 
 def domes_of(
-    force: Force = nothing,
+    force: Force = no_force,
     *parts: DomeProperties,
     label: str = "test",
     in_real_time: bool = False,
     **effects: Any,
 ) -> Domes:
-    """Domes under a force, with only the named effects on."""
+    """Return domes under a force, with the named effects only."""
     scene = EmulationSection(**({"gas": False, "rubber": False, "hysteresis": False} | effects))
     parts = parts or (PART,)
     serials = [f"S{i}" for i in range(len(parts))]
@@ -67,26 +67,26 @@ def kpa_at(domes: Domes, t_s: npt.ArrayLike, dome: int = 0) -> Floats:
 
 
 def grid(begin_s: float, end_s: float, every: int = 1) -> Floats:
-    """Grid points, between which the emulation is linear."""
+    """Return grid points, between which the emulation is linear."""
     steps = np.arange(round(begin_s / GRID_S), round(end_s / GRID_S) + 1, every)
     return np.asarray(steps * GRID_S, dtype=np.float64)
 
 
 def lost(force_n: npt.ArrayLike, part: DomeProperties = PART) -> Floats:
-    """Part of the bubble's volume that a slow force takes."""
+    """Return the part of the bubble's volume that a slow force takes."""
     return np.asarray(part.stiffening * np.log1p(np.asarray(force_n) / part.knee_n))
 
 
 def static_kpa(force_n: npt.ArrayLike, part: DomeProperties = PART) -> Floats:
-    """Positive root of p (1 + c (p - seal)) (1 - lost) = seal."""
+    """Return the positive root of p (1 + c (p - seal)) (1 - lost) = seal."""
     c, seal = part.wall_per_kpa, part.seal_kpa
     v = 1 - lost(force_n, part)
     b = 1 - c * seal
     return np.asarray((-b + np.sqrt(b * b + 4 * c * seal / v)) / (2 * c))
 
 
-def felt_n(kpa: Floats, part: DomeProperties = PART) -> Floats:
-    """The static force that would give this pressure."""
+def static_force_n(kpa: Floats, part: DomeProperties = PART) -> Floats:
+    """Return the static force of this pressure."""
     v = part.seal_kpa / (kpa * (1 + part.wall_per_kpa * (kpa - part.seal_kpa)))
     return np.asarray(part.knee_n * np.expm1((1 - v) / part.stiffening))
 

@@ -1,4 +1,4 @@
-"""The loop of a dome, and the gain that each loading draws."""
+"""The hysteresis loop of a dome, and the gain of each loading."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from tests.devices.emulation.domes import (
     PART,
     Floats,
     domes_of,
-    felt_n,
     grid,
     kpa_at,
     lost,
+    static_force_n,
     static_kpa,
 )
 
 # Gain
 
 
-def test_a_gain_that_drifted_since_the_bench_is_another_one_for_each_dome() -> None:
+def test_the_gain_drifts_for_each_dome_differently() -> None:
     def gains(label: str, gain_drift: float) -> Floats:
         domes = domes_of(
             np.ones_like, *[PART] * 40, label=label, gain_drift=gain_drift, hysteresis=False
@@ -52,11 +52,11 @@ def triangle(t_s: Floats, peak_n: float = 30.0, half_s: float = 2.0) -> Floats:
 
 
 def loop(half_s: float, loads_n: Floats, peak_n: float = 30.0) -> tuple[Floats, Floats]:
-    """Forces felt at the same loads on the way up and on the way down."""
+    """Return static forces at the same loads on the way up and on the way down."""
     domes = domes_of(lambda t_s: triangle(t_s, peak_n, half_s), hysteresis=True)
     up_s = loads_n / peak_n * half_s
     up, down = kpa_at(domes, up_s), kpa_at(domes, (2 * half_s - up_s)[::-1])[::-1]
-    return felt_n(up), felt_n(down)
+    return static_force_n(up), static_force_n(down)
 
 
 def test_the_loop_closes_at_zero_load() -> None:
@@ -65,7 +65,7 @@ def test_the_loop_closes_at_zero_load() -> None:
     np.testing.assert_allclose(kpa_at(domes, grid(4.0, 5.0, every=100)), 100.0, atol=1e-9)
 
 
-def test_the_unloading_branch_lies_above_and_the_loop_is_as_wide_as_the_part_says() -> None:
+def test_the_unloading_branch_lies_above_and_the_loop_has_the_width_of_the_part() -> None:
     loads_n = np.linspace(1.0, 20.0, 20)
     up, down = loop(2.0, loads_n)
     width_n = down - up
@@ -90,19 +90,19 @@ def test_the_loop_does_not_depend_on_the_speed() -> None:
 
 
 def viscous_width_n(half_s: float, at_n: float) -> float:
-    """Width of the loop of viscosity alone, of a triangle of 30 N."""
+    """Return the width of the viscous loop of a triangle of 30 N."""
     domes = domes_of(lambda t_s: triangle(t_s, 30.0, half_s), VISCOUS, hysteresis=True)
     up_s = at_n / 30.0 * half_s
-    up, down = felt_n(kpa_at(domes, [up_s, 2 * half_s - up_s]))
+    up, down = static_force_n(kpa_at(domes, [up_s, 2 * half_s - up_s]))
     return float(down - up)
 
 
-def test_the_viscous_loop_is_as_wide_as_the_part_says_at_a_slow_stroke() -> None:
+def test_the_viscous_loop_of_a_slow_stroke_has_the_width_of_the_part() -> None:
     assert viscous_width_n(4.0, 20.0) == pytest.approx(2 * 0.4, rel=0.05)
 
 
 def test_the_viscous_loop_grows_with_a_low_power_of_the_speed() -> None:
-    # Where flow has become steady, rate is stress to the fourth.
+    # In steady flow the rate is stress to the fourth.
     slow, fast = viscous_width_n(8.0, 15.0), viscous_width_n(0.5, 15.0)
     assert fast / slow == pytest.approx(16 ** (1 / 4), rel=0.1)
 
@@ -122,13 +122,13 @@ def test_viscous_flow_obeys_its_equation_under_any_load(part: float, power: floa
     dome = replace(VISCOUS, flow_part=part, flow_power=power)
     domes = domes_of(lambda t_s: np.array([force(t) for t in t_s]), dome, hysteresis=True)
     np.testing.assert_allclose(
-        felt_n(kpa_at(domes, t_s), dome), np.maximum(load - solved.y[0], 0.0), atol=2e-3
+        static_force_n(kpa_at(domes, t_s), dome), np.maximum(load - solved.y[0], 0.0), atol=2e-3
     )
 
 
-def test_what_viscosity_has_left_behind_fades_and_the_dome_never_pulls() -> None:
+def test_the_viscous_residue_fades_and_the_dome_never_pulls() -> None:
     domes = domes_of(lambda t_s: np.interp(t_s, [1, 1.005], [20.0, 0.0]), VISCOUS, hysteresis=True)
-    felt = felt_n(kpa_at(domes, grid(1.005, 9.0, every=20)), VISCOUS)
+    felt = static_force_n(kpa_at(domes, grid(1.005, 9.0, every=20)), VISCOUS)
     assert 0.5 < felt[0] <= 0.08 * 20.0
     assert (np.diff(felt) < 1e-9).all()
     assert 0.0 < felt[-1] < 0.25
@@ -142,7 +142,7 @@ def test_domes_with_and_without_viscosity_stand_beside_one_another() -> None:
         np.testing.assert_allclose(kpa_at(both, t_s, dome), kpa_at(alone, t_s), atol=1e-9)
 
 
-def test_a_held_load_stays_where_it_is_on_the_loop() -> None:
+def test_a_constant_load_keeps_its_place_on_the_loop() -> None:
     hold = domes_of(lambda t_s: np.interp(t_s, [0, 1, 1.5], [0.0, 30.0, 15.0]), hysteresis=True)
     kpa = kpa_at(hold, grid(1.5, 4.0, every=100))
     np.testing.assert_allclose(kpa, kpa[0], atol=1e-12)
@@ -167,17 +167,14 @@ def pulses(t_s: Floats) -> Floats:
 
 
 def peaks(loadings: int, **options: Any) -> Floats:
-    """Volume lost in the middle of each loading, relative to what the load should take."""
+    """Return the relative gain in the middle of each loading."""
     kpa = kpa_at(domes_of(pulses, **options), np.arange(loadings) + 0.5)
     v = PART.seal_kpa / (kpa * (1 + PART.wall_per_kpa * (kpa - PART.seal_kpa)))
     return np.asarray((1 - v) / float(lost(20.0)))
 
 
-def test_without_repeatability_every_loading_is_the_same() -> None:
+def test_every_loading_draws_a_gain_of_its_own_by_the_repeatability() -> None:
     np.testing.assert_allclose(peaks(5), 1.0, atol=1e-9)
-
-
-def test_every_loading_draws_a_gain_of_its_own() -> None:
     gains = peaks(200, repeatability=0.03)
     assert len(np.unique(gains.round(9))) == 200
     # Standard error of a standard deviation from 200: 5 %

@@ -1,4 +1,4 @@
-"""What playing the silicon costs is not the driver's time; what the driver takes is."""
+"""The driver's clock does not include the time that the emulation takes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SELECT_NS = 50_000  # 20 bits at 400 kHz
 
 
 class Host(VirtualClock):
-    """A machine's clock, of which every wait ends late, and which computes when it is told to."""
+    """The clock of a machine on which every wait ends late."""
 
     def __init__(self, late_ns: int = 0) -> None:
         super().__init__(1_000_000_000)
@@ -40,14 +40,14 @@ def hosted(late_ns: int = 0) -> tuple[Host, DriverClock, WireClock]:
     return host, driver, WireClock(driver, host)
 
 
-def test_a_transfer_takes_its_time_on_the_wire_however_late_the_machine_wakes_up() -> None:
+def test_a_transfer_takes_its_time_on_the_wire_on_a_late_machine() -> None:
     host, driver, wires = hosted(late_ns=60_000)
     world = World(make_scene(ONE), wires, begins_now=False)
     begin_ns = driver.now_ns()
     for _ in range(20):
         world.i2c_adapter.i2c_rdwr(SELECT)
     assert driver.now_ns() - begin_ns == 20 * SELECT_NS
-    assert host.now_ns() - begin_ns < 20 * SELECT_NS + 2 * 60_000, "what was late is caught up with"
+    assert host.now_ns() - begin_ns < 20 * SELECT_NS + 2 * 60_000
 
 
 def test_no_transfer_is_over_on_the_machine_before_its_bits_have_passed() -> None:
@@ -61,7 +61,7 @@ def test_no_transfer_is_over_on_the_machine_before_its_bits_have_passed() -> Non
         host.compute(took_ns)
 
 
-def test_what_the_driver_takes_between_two_transfers_is_its_own() -> None:
+def test_the_time_between_two_transfers_is_the_drivers() -> None:
     host, driver, wires = hosted()
     world = World(make_scene(ONE), wires, begins_now=False)
     world.i2c_adapter.i2c_rdwr(SELECT)
@@ -70,7 +70,7 @@ def test_what_the_driver_takes_between_two_transfers_is_its_own() -> None:
     assert driver.now_ns() == before_ns + 77_000
 
 
-def test_a_driver_that_is_woken_late_from_its_own_wait_is_late() -> None:
+def test_a_driver_that_wakes_late_from_its_own_wait_is_late() -> None:
     host, driver, _ = hosted(late_ns=60_000)
     t_ns = driver.now_ns() + 1_000_000
     driver.sleep_until_ns(t_ns)
@@ -78,7 +78,7 @@ def test_a_driver_that_is_woken_late_from_its_own_wait_is_late() -> None:
 
 
 @given(computed_ns=st.integers(0, LAG_MAX_NS), wait_ns=st.integers(0, 2 * LAG_MAX_NS))
-def test_a_wait_of_the_driver_is_shorter_by_what_the_emulation_was_behind(
+def test_a_wait_of_the_driver_is_shorter_by_the_lag_of_the_emulation(
     computed_ns: int, wait_ns: int
 ) -> None:
     host, driver, wires = hosted()
@@ -91,7 +91,7 @@ def test_a_wait_of_the_driver_is_shorter_by_what_the_emulation_was_behind(
     assert host.now_ns() == end_ns + max(computed_ns, wait_ns)
 
 
-def test_a_machine_that_cannot_play_the_wires_any_faster_makes_its_driver_late() -> None:
+def test_an_emulation_that_lags_too_far_makes_its_driver_late() -> None:
     host, driver, wires = hosted()
     end_ns = wires.now_ns()
     host.compute(LAG_MAX_NS + 5_000_000)
@@ -105,7 +105,7 @@ def test_a_machine_that_cannot_play_the_wires_any_faster_makes_its_driver_late()
     ),
     late_ns=st.integers(0, 1_000_000),
 )
-def test_the_drivers_clock_never_goes_back_nor_ahead_of_the_machines(
+def test_the_clock_of_the_driver_never_goes_back_nor_ahead_of_the_machine(
     steps: list[tuple[str, int]], late_ns: int
 ) -> None:
     host, driver, wires = hosted(late_ns)
@@ -125,7 +125,7 @@ def test_the_drivers_clock_never_goes_back_nor_ahead_of_the_machines(
 
 
 class Laggard:
-    """How that machine plays wires: it computes for a while, and then is woken late."""
+    """A host that computes for a while before each wait, and then wakes late."""
 
     def __init__(self, host: Host, compute_ns: int, late_ns: int) -> None:
         self._host = host
@@ -141,7 +141,7 @@ class Laggard:
 
 
 def instants(clock: Clock, world: World, frames: int = 200) -> list[list[int]]:
-    """When each tile's conversion began, since the first, as a driver of this clock saw it."""
+    """Return the instants of conversions by a driver with this clock, since the first."""
     ready = prepare_array(open_bus("emulated", world.i2c_adapter), world.scene, clock)
     begin_ns = clock.now_ns()
     scans = [ready.array.scan_frame() for _ in range(frames)]
@@ -150,7 +150,7 @@ def instants(clock: Clock, world: World, frames: int = 200) -> list[list[int]]:
 
 
 @pytest.mark.parametrize(("compute_us", "late_us"), [(0, 60), (40, 0), (90, 60)])
-def test_a_slow_machine_shows_its_driver_the_very_instants_of_virtual_time(
+def test_a_driver_on_a_slow_machine_has_the_instants_of_virtual_time(
     compute_us: int, late_us: int
 ) -> None:
     scene = load_scene("standing")

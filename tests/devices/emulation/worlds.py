@@ -1,4 +1,4 @@
-"""Emulated feet that are switched on, and what is asked of them."""
+"""Emulated feet that are switched on, and their readings."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ EPOCH_NS = 5_000_000_000
 
 
 def switched_on(scene: Scene, **options: Any) -> tuple[World, TileArray, VirtualClock]:
-    """A world and its driver, at a time that is not zero."""
+    """Return a world and its driver, at a time that is not zero."""
     clock = VirtualClock(EPOCH_NS)
     world = World(scene, clock, **options)
     bus = open_bus("emulated", world.i2c_adapter)
@@ -39,7 +39,7 @@ def identified(scene: Scene, **options: Any) -> tuple[TileInfo, ...]:
 
 
 def counts(scene: Scene, frames: int = 30, **options: Any) -> npt.NDArray[np.int64]:
-    """`padc` and `tadc`, (frames, 2, tiles), as the driver reads them."""
+    """Return `padc` and `tadc`, (frames, 2, tiles), as the driver reads them."""
     _, array, _ = switched_on(scene, **options)
     scans = [array.scan_frame() for _ in range(frames)]
     assert all(scan.tile_flags == [0] * len(scene.tile) for scan in scans)

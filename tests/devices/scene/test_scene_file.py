@@ -1,4 +1,4 @@
-"""Scene files: what loads, and with which defaults."""
+"""Scene files: built-in scenes, and the defaults of missing keys."""
 
 from __future__ import annotations
 
@@ -13,11 +13,7 @@ from devices.scene.emulation_sections import MudGround, PoppyGround
 from devices.scene.scene_file import list_builtin_scenes, load_scene
 from tests.devices.scene.texts import refused, scene, tile
 
-# What loads
-
-
-def test_the_scenes_that_come_with_foottile_are_those_of_the_design_so_far() -> None:
-    assert {"standing", "indentation", "rolling", "insole"} <= set(list_builtin_scenes())
+# Built-in scenes
 
 
 @pytest.mark.parametrize("name", list_builtin_scenes())
@@ -28,55 +24,43 @@ def test_a_built_in_scene_loads_under_its_own_name(name: str) -> None:
     assert not loaded.fault
 
 
-def test_standing_has_four_tiles_of_the_typical_conversion_time() -> None:
+def test_built_in_scenes_have_the_facts_of_the_paper() -> None:
+    assert {"standing", "indentation", "rolling", "insole"} <= set(list_builtin_scenes())
     standing = load_scene("standing")
     assert len(standing.tile) == 4
     assert (standing.array.conversion_ms, standing.array.wait_ms) == (1.6, None)
     assert standing.array.scl_hz == 400_000
-
-
-def test_the_rolling_foot_is_an_arc_of_150_mm() -> None:
-    rolling = load_scene("rolling")
-    assert len(rolling.tile) == 4
-    for t in rolling.tile:
-        assert math.hypot(t.x_m, t.z_m) == pytest.approx(0.150, abs=1e-6)
-    assert rolling.servo is not None
-    assert rolling.servo.ankle_travel_m_per_rad == 0.150
-
-
-@pytest.mark.parametrize("name", ["poppy", "mud"])
-def test_the_hopping_foot_is_the_rolling_one(name: str) -> None:
-    foot = load_scene(name).tile[:4]
-    assert foot == load_scene("rolling").tile
-    assert [tile.reference for tile in load_scene(name).tile[4:]] == (
-        [True] if name == "mud" else []
-    )
-
-
-def test_the_hopping_leg_is_the_papers_and_falls_from_10_cm() -> None:
-    # hardware.md 0: 909 g; docs/scenes.md: a 10 cm drop, on wet ground about 5 cm deep
-    for name in ("poppy", "mud"):
-        ground = load_scene(name).ground
-        assert isinstance(ground, PoppyGround | MudGround)
-        assert (ground.mass_kg, ground.drop_m) == (0.909, 0.10)
-
-
-def test_mud_has_a_temperature_step_of_its_own() -> None:
-    text = refused(sections="[ground]\nkind = 'mud'\n[emulation]\ntemperature_step_k = -4.0")
-    assert "ground.temperature_step_k" in text
-
-
-def test_the_insole_has_its_tiles_where_the_recording_had_its_cells() -> None:
+    indentation = load_scene("indentation")
+    assert indentation.emulation.repeatability == 0.03
+    assert indentation.ground.kind == "indentation"
     # data/README.md: left foot, in mm; our x is its y, our y its -x
     cells_mm = [(0, -100), (-25, -50), (25, -50), (-25, 0), (25, 0), (-25, 50), (25, 50), (0, 100)]
     places = [(t.x_m, t.y_m) for t in load_scene("insole").tile]
     assert places == [(y / 1000, -x / 1000) for x, y in cells_mm]
 
 
-def test_the_mill_shows_the_repeatability_of_the_paper() -> None:
-    indentation = load_scene("indentation")
-    assert indentation.emulation.repeatability == 0.03
-    assert indentation.ground.kind == "indentation"
+def test_rolling_and_hopping_feet_are_an_arc_of_150_mm() -> None:
+    rolling = load_scene("rolling")
+    assert len(rolling.tile) == 4
+    for t in rolling.tile:
+        assert math.hypot(t.x_m, t.z_m) == pytest.approx(0.150, abs=1e-6)
+    assert rolling.servo is not None
+    assert rolling.servo.ankle_travel_m_per_rad == 0.150
+    for name, references in (("poppy", []), ("mud", [True])):
+        hopping = load_scene(name)
+        assert hopping.tile[:4] == rolling.tile
+        assert [tile.reference for tile in hopping.tile[4:]] == references
+        # hardware.md 0: 909 g; docs/scenes.md: a 10 cm drop, on wet ground about 5 cm deep
+        assert isinstance(hopping.ground, PoppyGround | MudGround)
+        assert (hopping.ground.mass_kg, hopping.ground.drop_m) == (0.909, 0.10)
+
+
+# Scene files
+
+
+def test_the_temperature_step_of_mud_is_that_of_its_ground() -> None:
+    text = refused(sections="[ground]\nkind = 'mud'\n[emulation]\ntemperature_step_k = -4.0")
+    assert "ground.temperature_step_k" in text
 
 
 def test_a_scene_file_is_read_by_its_path(tmp_path: Path) -> None:
@@ -85,7 +69,7 @@ def test_a_scene_file_is_read_by_its_path(tmp_path: Path) -> None:
     assert load_scene(str(path)).name == "mine"
 
 
-def test_what_a_scene_does_not_say_has_the_defaults_of_the_design() -> None:
+def test_missing_keys_have_the_defaults_of_the_design() -> None:
     bare = scene()
     assert bare.rate_hz == 0
     assert bare.calibration == "emulated-rig"
@@ -106,8 +90,9 @@ def test_what_a_scene_does_not_say_has_the_defaults_of_the_design() -> None:
     assert bare.fault == ()
 
 
-def test_an_integer_may_stand_for_a_number_with_a_unit() -> None:
+def test_a_rate_is_an_integer_or_as_slow_as_a_stream_can_hold() -> None:
     assert scene("rate_hz = 100").rate_hz == 100.0
+    assert scene("rate_hz = 0.001").rate_hz == 0.001
 
 
 def test_a_fault_names_a_tile_and_a_time() -> None:

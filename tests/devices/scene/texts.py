@@ -1,4 +1,4 @@
-"""Scene files in a few words."""
+"""Short scene files, valid and refused."""
 
 from __future__ import annotations
 

@@ -1,41 +1,55 @@
-"""A servo on a serial line, emulated or scripted."""
+"""The driver on an emulated servo."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import pytest
 
 from devices.chips.dynamixel.driver import DynamixelServo, open_servo
 from devices.clock import VirtualClock
+from devices.emulation.fault_timing import FaultTiming
 from tests.builders.servo import FaultyServo
 
-# In real time. No test waits for the ample one; where a time-out is to happen, it is short.
+# In real time. No test waits for the ample timeout; a timeout that a test expects is short.
 AMPLE_S = 5.0
 SHORT_S = 0.02
+
+both_protocols = pytest.mark.parametrize("protocol", [1, 2])
+
+
+class Line(NamedTuple):
+    servo: FaultyServo
+    driver: DynamixelServo
+    clock: VirtualClock
 
 
 @contextlib.contextmanager
 def emulated(
     position: Callable[[int], int] = lambda _: 0,
-    baudrate: int = 1_000_000,
+    *,
     timeout_s: float = AMPLE_S,
-    asked_id: int = 1,
     protocol: int = 2,
-) -> Iterator[tuple[FaultyServo, DynamixelServo, VirtualClock]]:
-    clock = VirtualClock(t_ns=1_000_000_000)
-    with FaultyServo(position, clock, baudrate=baudrate, protocol=protocol) as servo:
-        driver = open_servo(
-            servo.port,
-            baudrate=baudrate,
-            clock=clock,
-            servo_id=asked_id,
-            timeout_s=timeout_s,
-            protocol=protocol,
-        )
+    baudrate: int = 1_000_000,
+    asked: dict[str, Any] | None = None,
+    table: tuple[int, bytes] | None = None,
+    **facts: Any,
+) -> Iterator[Line]:
+    """Open a servo on a virtual clock.
+
+    `asked` are options of the driver that do not match the servo, `table` are registers and
+    `facts` options of the servo.
+    """
+    clock = VirtualClock(1_000_000_000)
+    for fault in facts.values():
+        if isinstance(fault, FaultTiming):
+            fault.begin_scene_time(clock.now_ns())
+    with FaultyServo(position, clock, protocol=protocol, baudrate=baudrate, **facts) as servo:
+        if table is not None:
+            servo.write_table(*table)
+        options = {"baudrate": baudrate, "timeout_s": timeout_s, "protocol": protocol}
+        driver = open_servo(lambda: servo.port, clock=clock, **(options | (asked or {})))
         with contextlib.closing(driver):
-            yield servo, driver, clock
-
-
-both_protocols = pytest.mark.parametrize("protocol", [1, 2])
+            yield Line(servo, driver, clock)

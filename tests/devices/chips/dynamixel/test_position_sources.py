@@ -1,23 +1,21 @@
-"""The servo in lock-step with virtual time: nothing is known before its answer is complete."""
+"""Sources of servo positions: in virtual time and in a thread, over faults of servo and line."""
 
 from __future__ import annotations
 
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from devices.chips.dynamixel.driver import PositionReading, open_servo
 from devices.chips.dynamixel.position_sources import ThreadedServoSource, VirtualTimeServoSource
 from devices.chips.dynamixel.protocol import Instruction, Packet
 from devices.clock import SystemClock, VirtualClock
-from devices.emulation.chips.dynamixel import EmulatedServo
 from devices.emulation.fault_timing import FaultTiming
 from devices.errors import (
     ServoError,
@@ -27,15 +25,15 @@ from devices.errors import (
     ServoTimeoutError,
 )
 from tests.builders.servo import FaultyServo
-from tests.devices.chips.dynamixel.lines import AMPLE_S, both_protocols
+from tests.devices.chips.dynamixel.lines import AMPLE_S, both_protocols, emulated
 from tests.waiting import until
 
 MS = 1_000_000
 ANSWER_NS = 600_000
 
 
-class Scripted:
-    """A servo whose n-th reading is n, takes 0.6 ms, and is true in the middle of it."""
+class ScriptedServo:
+    """A servo with n as its n-th reading, which takes 0.6 ms and is sampled in the middle."""
 
     def __init__(self, clock: VirtualClock) -> None:
         self.clock = clock
@@ -57,51 +55,38 @@ class Scripted:
         )
 
 
-def polled(rate_hz: float = 100.0, start_ns: int = 0) -> tuple[VirtualTimeServoSource, Scripted]:
+def polled(
+    rate_hz: float = 100.0, start_ns: int = 0
+) -> tuple[VirtualTimeServoSource, ScriptedServo]:
     clock = VirtualClock(start_ns)
-    servo: Any = Scripted(clock)
+    servo: Any = ScriptedServo(clock)
     return VirtualTimeServoSource(servo, clock, rate_hz=rate_hz), servo
 
 
-def test_a_position_is_known_only_from_the_end_of_its_answer_on() -> None:
-    source, _ = polled(start_ns=5 * MS)
-    assert source.find_latest_position(5 * MS - 1) is None
-    assert source.find_latest_position(5 * MS) is None
-    assert source.find_latest_position(5 * MS + ANSWER_NS - 1) is None
-    assert source.find_latest_position(5 * MS + ANSWER_NS) == (1, 5 * MS + ANSWER_NS // 2)
-
-
-def test_the_position_before_is_given_until_the_next_one_is_complete() -> None:
-    source, _ = polled()
-    assert source.find_latest_position(10 * MS + ANSWER_NS - 1) == (1, ANSWER_NS // 2)
-    assert source.find_latest_position(10 * MS + ANSWER_NS) == (2, 10 * MS + ANSWER_NS // 2)
-
-
-def test_the_servo_is_asked_at_its_own_rate_however_often_frames_ask() -> None:
-    often, often_servo = polled(rate_hz=100.0)
-    for t_ns in range(0, 100 * MS, MS // 3):
-        often.find_latest_position(t_ns)
-    seldom, seldom_servo = polled(rate_hz=100.0)
-    seldom.find_latest_position(100 * MS - 1)
-    expected = [10 * MS * i for i in range(10)]
-    assert often_servo.asked_ns == seldom_servo.asked_ns == expected
-
-
-@given(steps=st.lists(st.integers(1, 40 * MS), min_size=1, max_size=40))
-def test_what_a_frame_sees_does_not_depend_on_who_asked_before(steps: list[int]) -> None:
-    source, _ = polled()
-    t_ns = 0
-    for step in steps:
-        t_ns += step
+@given(
+    steps_ns=st.lists(st.integers(1, 40 * MS), min_size=1, max_size=40),
+    start_ns=st.sampled_from([0, 5 * MS]),
+)
+@example([ANSWER_NS - 1, 1], 5 * MS)
+@example([10 * MS + ANSWER_NS - 1, 1], 0)
+@example([100 * MS - 1], 0)
+@example([MS // 3] * 300, 0)
+def test_a_position_is_known_from_the_end_of_its_answer_on_however_often_frames_ask(
+    steps_ns: list[int], start_ns: int
+) -> None:
+    source, servo = polled(start_ns=start_ns)
+    assert source.find_latest_position(start_ns - 1) is None
+    t_ns = start_ns
+    for step_ns in steps_ns:
+        t_ns += step_ns
         seen = source.find_latest_position(t_ns)
-        complete = (t_ns - ANSWER_NS) // (10 * MS)  # number of the newest complete answer
-        if complete < 0:
-            assert seen is None
-        else:
-            assert seen == (complete + 1, complete * 10 * MS + ANSWER_NS // 2)
+        newest = (t_ns - start_ns - ANSWER_NS) // (10 * MS)  # number of the newest answer
+        sampled_ns = start_ns + newest * 10 * MS + ANSWER_NS // 2
+        assert seen == (None if newest < 0 else (newest + 1, sampled_ns))
+    assert servo.asked_ns == list(range(start_ns, t_ns + 1, 10 * MS))
 
 
-def test_a_servo_slower_than_its_rate_is_asked_again_as_soon_as_it_is_done() -> None:
+def test_a_servo_slower_than_its_rate_is_read_again_at_once() -> None:
     source, servo = polled(rate_hz=1000.0)
     servo.answer_ns = 1_700_000
     source.find_latest_position(5 * MS)
@@ -114,9 +99,7 @@ def test_a_position_is_stale_after_three_intervals(rate_hz: float) -> None:
 
 
 @pytest.mark.parametrize("kind", [ServoTimeoutError, ServoPacketError, ServoStatusError])
-def test_a_reading_that_fails_is_counted_and_the_last_position_grows_old(
-    kind: type[ServoError],
-) -> None:
+def test_a_failed_reading_is_counted_and_the_last_position_ages(kind: type[ServoError]) -> None:
     source, servo = polled()
     assert source.find_latest_position(MS) == (1, ANSWER_NS // 2)
     servo.error = kind("no answer")
@@ -127,193 +110,137 @@ def test_a_reading_that_fails_is_counted_and_the_last_position_grows_old(
     assert source.failed_readings == 3
 
 
-def test_what_is_no_error_of_the_servo_is_raised() -> None:
+def test_an_error_that_is_not_of_the_servo_is_raised() -> None:
     source, servo = polled()
     servo.error = ZeroDivisionError("a bug")
     with pytest.raises(ZeroDivisionError):
         source.find_latest_position(0)
 
 
-def test_a_servo_that_never_answers_has_no_position() -> None:
-    source, servo = polled()
-    servo.error = ServoTimeoutError("no answer")
-    assert source.find_latest_position(95 * MS) is None
-    assert source.failed_readings == 10
+# An emulated servo
 
 
-@contextlib.contextmanager
-def emulated(
-    position: Callable[[int], int], asked_id: int = 1, timeout_s: float = 5.0
-) -> Iterator[tuple[VirtualTimeServoSource, VirtualClock]]:
-    line_clock = VirtualClock(1_000 * MS)
-    with EmulatedServo(position, line_clock) as servo:
-        driver = open_servo(
-            servo.port,
-            baudrate=1_000_000,
-            clock=line_clock,
-            servo_id=asked_id,
-            timeout_s=timeout_s,
-        )
-        with contextlib.closing(driver):
-            yield VirtualTimeServoSource(driver, line_clock, rate_hz=200.0), line_clock
-
-
-def test_an_emulated_servo_is_read_over_its_line_and_ages_right() -> None:
-    with emulated(lambda t_ns: t_ns // 1000 % 100_000) as (source, _):
+def test_positions_of_an_emulated_servo_have_their_age() -> None:
+    # The position of this servo is the time in us; 200 Hz, and an answer of 0.8 ms.
+    with emulated(lambda t_ns: t_ns // 1000 % 100_000) as (_, driver, clock):
+        source = VirtualTimeServoSource(driver, clock, rate_hz=200.0)
         for t_ns in (1_010 * MS, 1_013 * MS, 1_050 * MS):
             seen = source.find_latest_position(t_ns)
             assert seen is not None
             counts, sampled_ns = seen
-            # The position of this servo is the time in us; 200 Hz, and an answer of 0.8 ms.
             assert 0 < t_ns - sampled_ns < 6 * MS
             assert counts == pytest.approx(sampled_ns // 1000 % 100_000, abs=260)
         assert source.failed_readings == 0
 
 
-def test_a_servo_of_another_id_is_counted_as_failing() -> None:
-    with emulated(lambda _: 0, asked_id=2, timeout_s=0.01) as (source, line_clock):
-        opened_ns = line_clock.now_ns()
-        assert source.find_latest_position(opened_ns) is None
-        assert source.failed_readings == 1
-        assert line_clock.now_ns() >= opened_ns + 10 * MS, (
-            "the time-out passes on the virtual clock"
-        )
-
-
-# A servo that goes away, and one that restarts
-
 MULTI_TURN = {1: (6, b"\xff\x0f\xff\x0f"), 2: (11, b"\x04")}
-"""Register and value that make a servo count turns (e-manual mx-64.md, mx-64-2.md)."""
+"""Register and value of a servo that counts turns (e-manual mx-64.md, mx-64-2.md)."""
+ONE_TURN = {1: (6, b"\x00\x00\xff\x0f"), 2: (11, b"\x03")}
 
 
-@contextlib.contextmanager
-def faulty(
-    position: Callable[[int], int],
-    *,
-    protocol: int = 2,
-    unplugged: FaultTiming | None = None,
-    unpowered: FaultTiming | None = None,
-    mode: tuple[int, bytes] | None = None,
-) -> Iterator[VirtualTimeServoSource]:
-    clock = VirtualClock(1_000 * MS)
-    for fault in (unplugged, unpowered):
-        if fault is not None:
-            fault.begin_scene_time(clock.now_ns())
-    with FaultyServo(
-        position, clock, protocol=protocol, unplugged=unplugged, unpowered=unpowered
-    ) as servo:
-        servo.write_table(*(mode or MULTI_TURN[protocol]))
-        driver = open_servo(
-            lambda: servo.port,
-            baudrate=1_000_000,
-            clock=clock,
-            timeout_s=AMPLE_S if unpowered is None else 0.25,
-            protocol=protocol,
-        )
-        with contextlib.closing(driver):
-            yield VirtualTimeServoSource(driver, clock, rate_hz=100.0)
-
-
-def seen_each_100_ms(source: VirtualTimeServoSource, end_s: float) -> dict[int, int | None]:
-    """Position at each tenth of a second after the beginning; None where it is not known."""
+def read_tenths(source: VirtualTimeServoSource, end_s: float) -> dict[int, int | None]:
+    """Return the position at each tenth of a second; None where it is stale or unknown."""
     found: dict[int, int | None] = {}
     for tenth in range(1, round(10 * end_s)):
         t_ns = (1_000 + 100 * tenth) * MS
         position = source.find_latest_position(t_ns)
-        fresh = position is not None and t_ns - position[1] <= source.stale_after_ns
-        found[tenth] = position[0] if position and fresh and source.is_turn_known else None
+        is_fresh = position is not None and t_ns - position[1] <= source.stale_after_ns
+        found[tenth] = position[0] if position and is_fresh and source.is_turn_known else None
     return found
 
 
 @both_protocols
-@pytest.mark.parametrize("away_s", [0.05, 0.7, 3.0])
-def test_an_adapter_that_was_unplugged_is_opened_again_and_the_turn_is_kept(
+@pytest.mark.parametrize("away_s", [0.05, 3.0])
+def test_an_unplugged_adapter_is_opened_again_and_the_turn_stays_known(
     protocol: int, away_s: float
 ) -> None:
-    with faulty(
-        lambda _: 9000, protocol=protocol, unplugged=FaultTiming([(1.0, 1.0 + away_s)])
-    ) as source:
-        assert set(seen_each_100_ms(source, 1.0).values()) == {9000}
-        assert source.find_latest_position(2_050 * MS) is None, (
-            "what was read before tells nothing now"
-        )
+    line = emulated(
+        lambda _: 9000,
+        protocol=protocol,
+        unplugged=FaultTiming([(1.0, 1.0 + away_s)]),
+        table=MULTI_TURN[protocol],
+    )
+    with line as (_, driver, clock):
+        source = VirtualTimeServoSource(driver, clock, rate_hz=100.0)
+        assert set(read_tenths(source, 1.0).values()) == {9000}
+        assert source.find_latest_position(2_050 * MS) is None
         assert "serial port" in source.warning
-        seen = seen_each_100_ms(source, 8.0)
-        assert seen[79] == 9000
+        assert read_tenths(source, 8.0)[79] == 9000
         assert source.warning == ""
 
 
 @both_protocols
-def test_a_restart_beyond_its_turn_leaves_no_angle_and_is_said(protocol: int) -> None:
-    with faulty(lambda _: 9000, protocol=protocol, unpowered=FaultTiming([(1.0, 1.5)])) as source:
-        seen = seen_each_100_ms(source, 4.0)
-        assert {seen[tenth] for tenth in range(1, 10)} == {9000}
-        assert {seen[tenth] for tenth in range(11, 40)} == {None}
-        assert (source.find_latest_position(5_000 * MS) or (None,))[0] == 9000 % 4096, (
-            "kept as it was read"
-        )
-        assert "turn" in source.warning
+@pytest.mark.parametrize("is_multi_turn", [True, False])
+def test_the_turn_is_unknown_after_a_restart_unless_the_joint_has_one_turn(
+    protocol: int, is_multi_turn: bool
+) -> None:
+    counts = 9000 if is_multi_turn else 3000
+    line = emulated(
+        lambda _: counts,
+        protocol=protocol,
+        unpowered=FaultTiming([(1.0, 1.5)]),
+        table=(MULTI_TURN if is_multi_turn else ONE_TURN)[protocol],
+        timeout_s=0.25,
+    )
+    with line as (_, driver, clock):
+        source = VirtualTimeServoSource(driver, clock, rate_hz=100.0)
+        seen = read_tenths(source, 4.0)
+        assert {seen[tenth] for tenth in range(1, 10)} == {counts}
+        assert {seen[tenth] for tenth in range(11, 15)} == {None}
+        assert {seen[tenth] for tenth in range(20, 40)} == {None if is_multi_turn else counts}
+        if is_multi_turn:
+            position = source.find_latest_position(5_000 * MS)
+            assert position is not None
+            assert position[0] == 9000 % 4096, "counts are stored as read"
+            assert "turn" in source.warning
 
 
-@both_protocols
-def test_a_restart_of_a_joint_that_stays_in_its_turn_costs_the_silence_only(protocol: int) -> None:
-    mode = {1: (6, b"\x00\x00\xff\x0f"), 2: (11, b"\x03")}[protocol]
-    with faulty(
-        lambda _: 3000, protocol=protocol, unpowered=FaultTiming([(1.0, 1.5)]), mode=mode
-    ) as source:
-        seen = seen_each_100_ms(source, 4.0)
-    assert {seen[tenth] for tenth in range(11, 15)} == {None}
-    assert {seen[tenth] for tenth in range(20, 40)} == {3000}
-
-
-def test_a_wheel_in_protocol_1_goes_on_beyond_its_turn() -> None:
+def test_a_wheel_of_protocol_1_is_counted_beyond_its_turn() -> None:
     def position(t_ns: int) -> int:
         return (t_ns - 1_000 * MS) // (MS // 2)  # half a turn a second
 
-    with faulty(position, protocol=1, mode=(6, bytes(4))) as source:
-        seen = seen_each_100_ms(source, 6.0)
+    with emulated(position, protocol=1, table=(6, bytes(4))) as (_, driver, clock):
+        seen = read_tenths(VirtualTimeServoSource(driver, clock, rate_hz=100.0), 6.0)
     assert seen[59] == pytest.approx(2 * 5_900, abs=40)
 
 
-class PositionOnly(FaultyServo):
-    """A servo that answers its position, its identity, and nothing else."""
+def test_a_servo_without_registers_is_read_and_a_silence_counts_as_a_restart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    answer = FaultyServo._answer
 
-    def _answer(self, packet: Packet, received_ns: int) -> None:
+    def answer_positions(self: FaultyServo, packet: Packet, received_ns: int) -> None:
         if packet.instruction == Instruction.PING or packet.parameters[0] == 132:
-            super()._answer(packet, received_ns)
+            answer(self, packet, received_ns)
+
+    monkeypatch.setattr(FaultyServo, "_answer", answer_positions)
+    with emulated(lambda _: 9000, timeout_s=0.25) as (servo, driver, clock):
+        source = VirtualTimeServoSource(driver, clock, rate_hz=100.0)
+        assert read_tenths(source, 4.0)[39] == 9000
+        with servo.silent():
+            source.find_latest_position(6_000 * MS)
+        source.find_latest_position(6_500 * MS)
+        assert not source.is_turn_known
 
 
-def test_a_servo_without_registers_is_read_all_the_same() -> None:
-    clock = VirtualClock(1_000 * MS)
-    with PositionOnly(lambda _: 9000, clock) as servo:
-        driver = open_servo(servo.port, baudrate=1_000_000, clock=clock, timeout_s=0.25)
-        with contextlib.closing(driver):
-            source = VirtualTimeServoSource(driver, clock, rate_hz=100.0)
-            assert seen_each_100_ms(source, 4.0)[39] == 9000
-            with servo.silent():
-                source.find_latest_position(6_000 * MS)
-            source.find_latest_position(6_500 * MS)
-            assert not source.is_turn_known, "it may have restarted"
-
-
-def test_another_servo_in_its_place_is_not_read() -> None:
+def test_another_servo_at_the_same_port_is_not_read() -> None:
     clock = VirtualClock(1_000 * MS)
     with (
         FaultyServo(lambda _: 5, clock) as right,
         FaultyServo(lambda _: 7, clock, model="MX-28") as wrong,
     ):
-        here = [right.port]
-        driver = open_servo(lambda: here[0], baudrate=1_000_000, clock=clock, timeout_s=AMPLE_S)
+        ports = [right.port]
+        driver = open_servo(lambda: ports[0], baudrate=1_000_000, clock=clock, timeout_s=AMPLE_S)
         with contextlib.closing(driver):
             source = VirtualTimeServoSource(driver, clock, rate_hz=100.0)
             assert source.find_latest_position(1_050 * MS) is not None
-            here[0] = wrong.port
+            ports[0] = wrong.port
             right.close()
             assert source.find_latest_position(4_000 * MS) is None
             assert "MX-28" in source.warning
 
 
-def test_a_port_that_is_not_there_yet_is_waited_for_if_that_is_asked(tmp_path: Path) -> None:
+def test_a_missing_port_is_opened_later_if_the_caller_allows_it(tmp_path: Path) -> None:
     clock, path = VirtualClock(1_000 * MS), tmp_path / "ttyUSB0"
     with pytest.raises(ServoLostError):
         open_servo(str(path), baudrate=1_000_000, clock=clock)
@@ -323,16 +250,17 @@ def test_a_port_that_is_not_there_yet_is_waited_for_if_that_is_asked(tmp_path: P
     assert "not there yet" in driver.opening_warnings[0]
     source = VirtualTimeServoSource(driver, clock, rate_hz=100.0)
     assert source.find_latest_position(1_500 * MS) is None
-    with FaultyServo(lambda _: 77, clock) as servo:
+    with FaultyServo(lambda _: 77, clock) as servo, contextlib.closing(driver):
         path.symlink_to(servo.port)
-        with contextlib.closing(driver):
-            assert (source.find_latest_position(2_600 * MS) or (None,))[0] == 77
+        position = source.find_latest_position(2_600 * MS)
+    assert position is not None
+    assert position[0] == 77
 
 
-# On a real clock
+# A thread on the system clock
 
 
-def test_a_thread_opens_a_port_again_that_hung_up() -> None:
+def test_a_thread_reopens_a_lost_port() -> None:
     clock = SystemClock()
     pulled = FaultTiming()
     with FaultyServo(lambda _: 11, clock, unplugged=pulled) as servo:
@@ -349,25 +277,17 @@ def test_a_thread_opens_a_port_again_that_hung_up() -> None:
             until(lambda: source.warning == "")
 
 
-def soon(true: Callable[[], bool]) -> bool:
-    end = time.monotonic() + 10.0
-    while not true() and time.monotonic() < end:
-        time.sleep(0.001)
-    return true()
-
-
-class Counting:
-    """A servo whose n-th reading is n; it fails or hangs when it is told to."""
+class CountingServo:
+    """A servo with n as its n-th reading, which can fail and hang."""
 
     def __init__(self) -> None:
         self.readings = 0
         self.error: ServoError | None = None
-        self.hangs = threading.Event()
-        self.goes_on = threading.Event()
+        self.may_answer = threading.Event()
+        self.may_answer.set()
 
     def read_position(self) -> PositionReading:
-        if self.hangs.is_set():
-            self.goes_on.wait(10.0)
+        self.may_answer.wait(10.0)
         if self.error is not None:
             raise self.error
         self.readings += 1
@@ -375,70 +295,52 @@ class Counting:
         return PositionReading(self.readings, now_ns, 0, now_ns)
 
 
-def test_a_reader_on_a_real_clock_has_ever_newer_positions() -> None:
-    servo: Any = Counting()
+def test_a_thread_reads_ever_newer_positions_and_a_frame_gets_that_of_its_instant() -> None:
+    servo: Any = CountingServo()
     with ThreadedServoSource(servo, SystemClock(), rate_hz=500.0) as source:
-        assert soon(lambda: source.find_latest_position(time.monotonic_ns()) is not None)
-        first = source.find_latest_position(time.monotonic_ns())
-        assert first is not None
-        assert soon(
-            lambda: (source.find_latest_position(time.monotonic_ns()) or (0, 0))[0] > first[0] + 5
-        )
-        newest = source.find_latest_position(time.monotonic_ns())
-        assert newest is not None
-        assert newest[1] > first[1]
-    assert "servo" not in {thread.name for thread in threading.enumerate()}
-
-
-def test_a_position_sampled_while_the_frame_was_taken_has_no_negative_age() -> None:
-    servo: Any = Counting()
-    with ThreadedServoSource(servo, SystemClock(), rate_hz=500.0) as source:
-        assert soon(lambda: source.find_latest_position(time.monotonic_ns()) is not None)
-        reading = source.find_latest_position(0)
-    assert reading is not None
-    assert reading[1] == 0
-
-
-def test_a_frame_gets_the_position_of_its_own_instant_though_newer_ones_have_come() -> None:
-    servo: Any = Counting()
-    with ThreadedServoSource(servo, SystemClock(), rate_hz=500.0) as source:
-        assert soon(lambda: servo.readings > 3)
+        until(lambda: servo.readings > 3)
         t_mono_ns = time.monotonic_ns()
         at_once = source.find_latest_position(t_mono_ns)
         readings = servo.readings
-        assert soon(lambda: servo.readings > readings + 3)
+        until(lambda: servo.readings > readings + 3)
         later = source.find_latest_position(t_mono_ns)
+        newest = source.find_latest_position(time.monotonic_ns())
+        oldest = source.find_latest_position(0)
     assert at_once is not None
     assert later is not None
-    assert later[1] <= t_mono_ns
-    assert 0 <= later[0] - at_once[0] <= 1, "one more may have been on its way"
+    assert newest is not None
+    assert later[1] <= t_mono_ns < newest[1]
+    assert 0 <= later[0] - at_once[0] <= 1, "one reading may have been on its way"
+    assert newest[0] > readings + 2
+    assert oldest is not None
+    assert oldest[1] == 0, "no age is negative"
+    assert "servo" not in {thread.name for thread in threading.enumerate()}
 
 
-def test_a_hanging_servo_costs_the_frames_nothing_and_grows_old() -> None:
-    servo: Any = Counting()
+def test_a_hanging_servo_does_not_delay_frames_and_its_position_ages() -> None:
+    servo: Any = CountingServo()
     with ThreadedServoSource(servo, SystemClock(), rate_hz=500.0) as source:
-        assert soon(lambda: servo.readings > 3)
-        servo.hangs.set()
+        until(lambda: servo.readings > 3)
+        servo.may_answer.clear()
         begin_s = time.monotonic()
-        assert soon(
-            lambda: (
-                time.monotonic_ns()
-                - (source.find_latest_position(time.monotonic_ns()) or (0, 0))[1]
-                > source.stale_after_ns
-            )
-        )
+
+        def is_stale() -> bool:
+            position = source.find_latest_position(time.monotonic_ns())
+            assert position is not None
+            return time.monotonic_ns() - position[1] > source.stale_after_ns
+
+        until(is_stale)
         for _ in range(1000):
             source.find_latest_position(time.monotonic_ns())
         assert time.monotonic() - begin_s < 5.0
-        servo.hangs.clear()
-        servo.goes_on.set()
+        servo.may_answer.set()
 
 
-def test_failed_readings_are_counted_and_it_goes_on_when_the_servo_does() -> None:
-    servo: Any = Counting()
+def test_a_thread_counts_failed_readings_and_reads_on() -> None:
+    servo: Any = CountingServo()
     servo.error = ServoTimeoutError("no answer")
     with ThreadedServoSource(servo, SystemClock(), rate_hz=500.0) as source:
-        assert soon(lambda: source.failed_readings > 2)
+        until(lambda: source.failed_readings > 2)
         assert source.find_latest_position(time.monotonic_ns()) is None
         servo.error = None
-        assert soon(lambda: source.find_latest_position(time.monotonic_ns()) is not None)
+        until(lambda: source.find_latest_position(time.monotonic_ns()) is not None)

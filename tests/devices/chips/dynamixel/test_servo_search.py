@@ -1,4 +1,4 @@
-"""Finding a servo whose protocol and baud rate nobody remembers."""
+"""Search for a servo of unknown protocol and baud rate."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TIMEOUT_S = 0.3
     [(1, "MX-28", 29), (1, "MX-64", 310), (2, "MX-28", 30), (2, "MX-64", 311)],
 )
 @pytest.mark.parametrize("baudrate", [57_600, 3_000_000])
-def test_a_servo_is_found_whatever_it_speaks(
+def test_a_servo_of_any_protocol_and_baud_rate_is_found(
     protocol: int, model: str, number: int, baudrate: int
 ) -> None:
     clock = VirtualClock()
@@ -37,16 +37,15 @@ def test_a_servo_is_found_whatever_it_speaks(
     assert found == [FoundServo(3, baudrate, protocol, model, number, FIRMWARE_VERSION)]
 
 
-def test_nobody_is_found_where_nobody_answers() -> None:
-    with FaultyServo(lambda _: 0, VirtualClock()) as servo, servo.silent():
-        assert find_servos(servo.port, VirtualClock(), timeout_s=0.01) == []
+def test_a_silent_servo_and_a_damaged_answer_are_not_found() -> None:
+    clock = VirtualClock()
+    with FaultyServo(lambda _: 0, clock) as servo:
+        with servo.silent():
+            assert find_servos(servo.port, clock, timeout_s=0.01) == []
+        with servo.corrupt_crc():
+            assert find_servos(servo.port, clock, baudrates=(1_000_000,), timeout_s=0.02) == []
 
 
-def test_a_damaged_answer_is_no_servo() -> None:
-    with FaultyServo(lambda _: 0, VirtualClock()) as servo, servo.corrupt_crc():
-        assert find_servos(servo.port, VirtualClock(), baudrates=(1_000_000,), timeout_s=0.02) == []
-
-
-def test_a_port_that_is_not_there_cannot_be_probed() -> None:
+def test_a_missing_port_cannot_be_searched() -> None:
     with pytest.raises(ServoSetupError, match="cannot be opened"):
         find_servos("/dev/no-such-port", VirtualClock())

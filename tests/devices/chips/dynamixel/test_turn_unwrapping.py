@@ -1,4 +1,4 @@
-"""Whole turns of a count: continued or not known, and never a plausible wrong one."""
+"""Whole turns of a count: continued or unknown, and never wrong."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ def reading(
 
 @dataclass
 class Step:
-    """What happens between two readings."""
+    """Time, movement and restart between two readings."""
 
     wait_ms: int
     speed: float
-    """Of the greatest that a joint can have, -1 to 1."""
+    """Share of the greatest speed of a joint, -1 to 1."""
     restarts: bool
 
 
@@ -49,11 +49,11 @@ steps = st.lists(
 
 
 @given(count_range=st.sampled_from(CountRange), start=st.integers(0, TURN - 1), steps=steps)
-def test_a_position_is_the_true_one_or_its_turn_is_not_known(
+def test_a_position_is_the_true_one_or_its_turn_is_unknown(
     count_range: CountRange, start: int, steps: list[Step]
 ) -> None:
-    counter, true, zero, t_ms = TurnUnwrapper(), start, 0, 0
-    counter.unwrap(reading(true, t_ms, count_range=count_range))
+    unwrapper, true, zero, t_ms = TurnUnwrapper(), start, 0, 0
+    unwrapper.unwrap(reading(true, t_ms, count_range=count_range))
     for step in steps:
         t_ms += step.wait_ms
         true += round(step.speed * 2.9 * TURN * step.wait_ms * 1e-3)
@@ -62,75 +62,66 @@ def test_a_position_is_the_true_one_or_its_turn_is_not_known(
         if step.restarts:
             zero = true // TURN * TURN
         counts = true % TURN if count_range is CountRange.WRAPPED else true - zero
-        found = counter.unwrap(
+        found = unwrapper.unwrap(
             reading(counts, t_ms, restarted=step.restarts, count_range=count_range)
         )
         if found.is_turn_known:
             assert found.counts == true
         else:
-            assert found.counts == counts, "as it was read"
+            assert found.counts == counts, "as read"
 
 
 @given(start=st.integers(0, TURN - 1), steps=steps)
-def test_a_servo_that_answers_quickly_is_followed_over_every_restart(
+def test_the_turn_of_a_servo_that_answers_quickly_is_known_after_every_restart(
     start: int, steps: list[Step]
 ) -> None:
-    counter, true, zero = TurnUnwrapper(), start, 0
-    counter.unwrap(reading(true, 0))
+    unwrapper, true, zero = TurnUnwrapper(), start, 0
+    unwrapper.unwrap(reading(true, 0))
     for i, step in enumerate(steps, start=1):
         true += round(step.speed * 2.9 * TURN * 0.1)
         if step.restarts:
             zero = true // TURN * TURN
-        found = counter.unwrap(reading(true - zero, 100 * i, restarted=step.restarts))
+        found = unwrapper.unwrap(reading(true - zero, 100 * i, restarted=step.restarts))
         assert (found.is_turn_known, found.counts) == (True, true)
 
 
-def test_after_a_long_silence_in_which_it_restarted_the_turn_stays_unknown() -> None:
-    counter = TurnUnwrapper()
-    counter.unwrap(reading(5000, 0))
-    for i in range(5):
-        found = counter.unwrap(reading(904, 1000 + 10 * i, restarted=i == 0))
-        assert (found.is_turn_known, found.counts) == (False, 904)
+MANY, ONE = CountRange.MANY_TURNS, CountRange.ONE_TURN
 
 
-def test_a_long_silence_without_a_restart_costs_nothing() -> None:
-    counter = TurnUnwrapper()
-    counter.unwrap(reading(5000, 0))
-    assert counter.unwrap(reading(9000, 3000)).is_turn_known
-
-
-@pytest.mark.parametrize("leap", [TURN, -TURN, 3 * TURN])
-def test_a_leap_by_whole_turns_is_no_movement(leap: int) -> None:
-    # Torque switched on in position control: no restart, and the count begins anew.
-    counter = TurnUnwrapper()
-    counter.unwrap(reading(5000, 0))
-    found = counter.unwrap(reading(5000 + leap, 10))
-    assert (found.is_turn_known, found.counts) == (True, 5000)
-
-
-def test_a_leap_faster_than_any_joint_is_no_position() -> None:
-    counter = TurnUnwrapper()
-    counter.unwrap(reading(1000, 0))
-    assert not counter.unwrap(reading(2000, 10)).is_turn_known
-    assert not counter.unwrap(reading(2000, 20)).is_turn_known
-
-
-def test_a_joint_that_cannot_leave_its_turn_is_known_again_once_it_answers() -> None:
-    counter, joint = TurnUnwrapper(), CountRange.ONE_TURN
-    counter.unwrap(reading(1000, 0, count_range=joint))
-    first = counter.unwrap(reading(3000, 2000, restarted=True, count_range=joint))
-    second = counter.unwrap(reading(3001, 2010, count_range=joint))
-    assert [first.is_turn_known, second.is_turn_known] == [False, True]
-    assert second.counts == 3001
-
-
-def test_torque_that_was_switched_on_in_a_silence_may_have_begun_the_count_anew() -> None:
-    counter, joint = TurnUnwrapper(), CountRange.ONE_TURN
-    counter.unwrap(reading(5000, 0, count_range=joint))
-    assert not counter.unwrap(reading(904, 1000, count_range=joint)).is_turn_known
-
-
-def test_a_count_beyond_what_a_frame_holds_is_not_known() -> None:
-    counter = TurnUnwrapper()
-    counter.unwrap(reading(2**31 - 10, 0))
-    assert not counter.unwrap(reading(-(2**31) + 10, 10)).is_turn_known
+@pytest.mark.parametrize(
+    ("count_range", "first", "later", "expected"),
+    # Counts, ms and restarts of later readings; None where the turn is unknown.
+    [
+        (MANY, 5000, [(904, 1000, True), (904, 1010, False), (904, 1020, False)], [None] * 3),
+        (MANY, 5000, [(9000, 3000, False)], [9000]),
+        # Torque switched on in position control: no restart, and the count begins again.
+        *((MANY, 5000, [(5000 + n * TURN, 10, False)], [5000]) for n in (1, -1, 3)),
+        (MANY, 1000, [(2000, 10, False), (2000, 20, False)], [None] * 2),
+        (MANY, 2**31 - 10, [(-(2**31) + 10, 10, False)], [None]),
+        (ONE, 1000, [(3000, 2000, True), (3001, 2010, False)], [None, 3001]),
+        (ONE, 5000, [(904, 1000, False)], [None]),
+    ],
+    ids=[
+        "a restart in a long silence",
+        "a long silence without a restart",
+        *("a leap by a turn", "a leap back by a turn", "a leap by three turns"),
+        "a leap faster than any joint",
+        "a count beyond the column",
+        "a joint of one turn is known at its second answer",
+        "torque may have been switched on in a silence",
+    ],
+)
+def test_a_turn_is_known_or_unknown_after(
+    count_range: CountRange,
+    first: int,
+    later: list[tuple[int, int, bool]],
+    expected: list[int | None],
+) -> None:
+    unwrapper = TurnUnwrapper()
+    unwrapper.unwrap(reading(first, 0, count_range=count_range))
+    for (counts, t_ms, restarted), position in zip(later, expected, strict=True):
+        found = unwrapper.unwrap(
+            reading(counts, t_ms, restarted=restarted, count_range=count_range)
+        )
+        assert found.is_turn_known == (position is not None)
+        assert found.counts == (counts if position is None else position)

@@ -1,54 +1,103 @@
-"""The emulated servo of Protocol 2.0, byte by byte."""
+"""The emulated servo of both protocols, byte by byte."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import struct
 import threading
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
+import serial
 
-from devices.chips.dynamixel.protocol import PROTOCOL_2, Instruction
+from devices.chips.dynamixel.protocol import (
+    PROTOCOL_1,
+    PROTOCOL_2,
+    ErrorFlag,
+    Instruction,
+    PacketDecoder,
+)
 from devices.clock import VirtualClock
 from devices.errors import UsageError
 from tests.builders.servo import FaultyServo
-from tests.devices.emulation.chips.servo_lines import PING, PING_1, Line, line_to, spoiled
 
+PING, READ = Instruction.PING, Instruction.READ
+# hardware.md 5.1
+PING_1 = bytes.fromhex("FFFF 01 02 01 FB")
+READ_1 = bytes.fromhex("FFFF 01 04 02 24 02 D2")
+PING_2 = bytes.fromhex("FFFFFD00 01 0300 01 194E")
+READ_2 = PROTOCOL_2.encode_read_request(1, 132, 4)
 SYNC_READ_1_2 = bytes.fromhex("FFFFFD00 FE 0900 82 84000400 0102 CEFA")
-PONG = bytes.fromhex("37 01 2A")  # model number 311, firmware 42
+PONG_2 = bytes.fromhex("37 01 2A")  # model number 311, firmware 42
+FIVE_BELOW = struct.pack("<i", -5)
+both_protocols = pytest.mark.parametrize("protocol", [1, 2])
+
+encode_1, encode_2 = PROTOCOL_1.encode_packet, PROTOCOL_2.encode_packet
 
 
-@pytest.fixture
-def servo() -> Iterator[FaultyServo]:
-    with FaultyServo(lambda _: -5, VirtualClock()) as servo:
-        yield servo
+class Line:
+    """Raw bytes to and from a servo. A missing answer is an error after five seconds."""
+
+    def __init__(
+        self, servo: FaultyServo, clock: VirtualClock, protocol: int, baudrate: int
+    ) -> None:
+        self.servo = servo
+        self.clock = clock
+        self.protocol = PROTOCOL_1 if protocol == 1 else PROTOCOL_2
+        self.port = serial.Serial(servo.port, baudrate, timeout=5, write_timeout=5)
+
+    def ask(self, request: bytes) -> tuple[int, int, bytes]:
+        """Return id, error byte and data of the first status after a request."""
+        self.port.write(request)
+        decoder = PacketDecoder(self.protocol)
+        while True:
+            data = self.port.read(decoder.min_missing_bytes)
+            assert data, "no answer"
+            for packet in decoder.decode_bytes(data):
+                assert packet.is_intact
+                if self.protocol is PROTOCOL_1:
+                    return packet.servo_id, packet.instruction, packet.parameters
+                assert packet.instruction == Instruction.STATUS
+                return packet.servo_id, packet.parameters[0], packet.parameters[1:]
 
 
-@pytest.fixture
-def line(servo: FaultyServo) -> Iterator[Line]:
-    with line_to(servo) as line:
-        yield line
+@contextlib.contextmanager
+def line_to(
+    counts: int = -5, *, protocol: int = 2, baudrate: int = 1_000_000, **options: Any
+) -> Iterator[Line]:
+    clock = VirtualClock(1_000)
+    with FaultyServo(
+        lambda _: counts, clock, protocol=protocol, baudrate=baudrate, **options
+    ) as servo:
+        line = Line(servo, clock, protocol, baudrate)
+        with contextlib.closing(line.port):
+            yield line
 
 
-def test_a_ping_returns_model_and_firmware(line: Line) -> None:
-    assert line.ask(PING_1) == (1, 0, PONG)
-    assert line.ask(PROTOCOL_2.encode_packet(0xFE, PING)) == (1, 0, PONG)
+def damage(packet: bytes) -> bytes:
+    return packet[:-1] + bytes([packet[-1] ^ 1])
 
 
-def test_the_control_table_says_how_the_servo_is_set_up() -> None:
-    with (
-        FaultyServo(
-            lambda _: 0,
-            VirtualClock(),
-            servo_id=7,
-            model="MX-28",
-            baudrate=57_600,
-            return_delay_us=20,
-            status_return_level=1,
-        ) as servo,
-        line_to(servo, 57_600) as line,
-    ):
+# Answers
+
+
+def test_a_ping_returns_model_and_firmware_in_protocol_2_only() -> None:
+    with line_to(protocol=1) as line:
+        assert line.ask(PING_1) == line.ask(encode_1(0xFE, PING)) == (1, 0, b"")
+    with line_to() as line:
+        assert line.ask(PING_2) == line.ask(encode_2(0xFE, PING)) == (1, 0, PONG_2)
+
+
+def test_the_control_table_has_the_settings_of_the_servo() -> None:
+    options: dict[str, Any] = {"model": "MX-28", "return_delay_us": 20, "status_return_level": 1}
+    with line_to(protocol=1, servo_id=253, **options) as line:
+        _, _, table = line.ask(PROTOCOL_1.encode_read_request(253, 0, 74))
+    assert table[:6] == bytes([29, 0, 42, 253, 1, 10])
+    assert table[16] == 1
+    assert table[36:38] == struct.pack("<h", -5)
+    with line_to(servo_id=7, baudrate=57_600, **options) as line:
         _, _, table = line.ask(PROTOCOL_2.encode_read_request(7, 0, 147))
     assert table[:2] == bytes([30, 0])
     assert table[6:10] == bytes([42, 7, 1, 10])
@@ -56,136 +105,180 @@ def test_the_control_table_says_how_the_servo_is_set_up() -> None:
     assert table[68] == 1
 
 
-def test_the_position_is_read_afresh_at_the_end_of_the_return_delay() -> None:
+def test_the_position_is_sampled_at_the_end_of_the_return_delay() -> None:
     clock = VirtualClock(1_000)
-    with FaultyServo(lambda t_ns: t_ns, clock) as servo, line_to(servo) as line:
-        _, _, data = line.ask(PROTOCOL_2.encode_read_request(1, 132, 4))
-        assert struct.unpack("<i", data) == (1_000 + 140_000 + 500_000,)
-        assert clock.now_ns() == 1_000 + 140_000 + 500_000 + 150_000
-        _, _, high_half = line.ask(PROTOCOL_2.encode_read_request(1, 134, 2))
-        later = 1_000 + 790_000 + 640_000
-        assert high_half == struct.pack("<i", later)[2:]
+    with FaultyServo(lambda t_ns: t_ns, clock) as servo:
+        line = Line(servo, clock, 2, 1_000_000)
+        with contextlib.closing(line.port):
+            _, _, data = line.ask(READ_2)
+            assert struct.unpack("<i", data) == (1_000 + 140_000 + 500_000,)
+            assert clock.now_ns() == 1_000 + 140_000 + 500_000 + 150_000
+            _, _, high_half = line.ask(PROTOCOL_2.encode_read_request(1, 134, 2))
+            later = 1_000 + 790_000 + 640_000
+            assert high_half == struct.pack("<i", later)[2:]
 
 
-def test_a_sync_read_is_answered_by_those_it_names(line: Line) -> None:
-    minus_five = (1, 0, struct.pack("<i", -5))
-    assert line.ask(SYNC_READ_1_2) == minus_five
+def test_an_answer_of_protocol_1_takes_the_time_of_the_wire() -> None:
+    with line_to(protocol=1) as line:
+        assert line.ask(READ_1) == (1, 0, struct.pack("<h", -5))
+        assert line.clock.now_ns() == 1_000 + 80_000 + 500_000 + 80_000
+
+
+@pytest.mark.parametrize(("counts", "seen"), [(28_673, 28_672), (-(2**31), -28_672), (-1, -1)])
+def test_a_servo_of_protocol_1_counts_seven_turns(counts: int, seen: int) -> None:
+    with line_to(counts, protocol=1) as line:
+        assert line.ask(READ_1) == (1, 0, struct.pack("<h", seen))
+
+
+def test_a_sync_read_is_answered_by_the_servos_that_it_names() -> None:
     position = struct.pack("<HH", 132, 4)
-    others = PROTOCOL_2.encode_packet(0xFE, Instruction.SYNC_READ, position + b"\x02\x03")
-    nobody = PROTOCOL_2.encode_packet(0xFE, Instruction.SYNC_READ, position)
-    assert line.ask(others + nobody + PING_1) == (1, 0, PONG)
+    others = encode_2(0xFE, Instruction.SYNC_READ, position + b"\x02\x03")
+    none = encode_2(0xFE, Instruction.SYNC_READ, position)
+    with line_to() as line:
+        assert line.ask(SYNC_READ_1_2) == (1, 0, FIVE_BELOW)
+        assert line.ask(others + none + PING_2) == (1, 0, PONG_2)
 
 
 @pytest.mark.parametrize(
-    "request_",
+    ("protocol", "requests"),
     [
-        b"\x00\x01\x02\xff\xff",
-        bytes.fromhex("FFFF 01 02 01 FB"),
-        PROTOCOL_2.encode_packet(2, PING),
-        PROTOCOL_2.encode_packet(1, Instruction.STATUS, b"\x00"),
-        spoiled(PROTOCOL_2.encode_packet(2, PING)),
-        spoiled(PROTOCOL_2.encode_packet(0xFE, PING)),
-        spoiled(SYNC_READ_1_2),
-        PROTOCOL_2.encode_read_request(0xFE, 132, 4),
-        PROTOCOL_2.encode_packet(0xFE, 0x03, bytes([64, 0, 1])),
-        PROTOCOL_2.encode_packet(0xFE, 0x8A, bytes([132, 0, 4, 0, 1])),
-        PROTOCOL_2.encode_packet(0xFE, 0x77),
-    ],
-    ids=[
-        "garbage",
-        "protocol 1 ping",
-        "another id",
-        "a status",
-        "another id, wrong CRC",
-        "broadcast ping, wrong CRC",
-        "sync read, wrong CRC",
-        "broadcast read",
-        "broadcast write",
-        "fast sync read",
-        "unknown broadcast",
+        (
+            1,
+            {
+                "garbage": b"\x00\x01\x02\xff",
+                "a ping of protocol 2": PING_2,
+                "another id": encode_1(2, PING),
+                "another id, wrong sum": damage(encode_1(2, PING)),
+                "broadcast ping, wrong sum": damage(encode_1(0xFE, PING)),
+                "broadcast read": PROTOCOL_1.encode_read_request(0xFE, 36, 2),
+                "bulk read": encode_1(0xFE, 0x92, bytes([0, 2, 1, 36])),
+            },
+        ),
+        (
+            2,
+            {
+                "garbage": b"\x00\x01\x02\xff\xff",
+                "a ping of protocol 1": PING_1,
+                "another id": encode_2(2, PING),
+                "a status": encode_2(1, Instruction.STATUS, b"\x00"),
+                "another id, wrong CRC": damage(encode_2(2, PING)),
+                "broadcast ping, wrong CRC": damage(encode_2(0xFE, PING)),
+                "sync read, wrong CRC": damage(SYNC_READ_1_2),
+                "broadcast read": PROTOCOL_2.encode_read_request(0xFE, 132, 4),
+                "broadcast write": encode_2(0xFE, 0x03, bytes([64, 0, 1])),
+                "fast sync read": encode_2(0xFE, 0x8A, bytes([132, 0, 4, 0, 1])),
+                "unknown broadcast": encode_2(0xFE, 0x77),
+            },
+        ),
     ],
 )
-def test_what_does_not_concern_it_is_ignored(line: Line, request_: bytes) -> None:
-    # so that the first answer is that to the next request
-    assert line.ask(request_ + PROTOCOL_2.encode_read_request(1, 7, 1)) == (1, 0, b"\x01")
+def test_a_request_to_other_servos_is_not_answered(
+    protocol: int, requests: dict[str, bytes]
+) -> None:
+    with line_to(protocol=protocol) as line:
+        own = line.protocol.encode_read_request(1, {1: 3, 2: 7}[protocol], 1)
+        for name, request in requests.items():
+            assert line.ask(request + own) == (1, 0, b"\x01"), name
 
 
 @pytest.mark.parametrize(
     ("request_", "error"),
     [
-        (PROTOCOL_2.encode_packet(1, 0x77), 2),
-        (PROTOCOL_2.encode_packet(1, 0x03, bytes([64, 0, 1])), 2),
-        (PROTOCOL_2.encode_packet(1, Instruction.SYNC_READ, bytes([132, 0, 4, 0, 1])), 2),
-        (spoiled(PING_1), 3),
-        (spoiled(PROTOCOL_2.encode_read_request(1, 132, 4)), 3),
+        (encode_1(1, 0x77), ErrorFlag.INSTRUCTION),
+        (encode_1(1, 0x03, bytes([24, 1])), ErrorFlag.INSTRUCTION),
+        (encode_1(1, 0x92, bytes([0, 2, 1, 36])), ErrorFlag.INSTRUCTION),
+        (damage(PING_1), ErrorFlag.CHECKSUM),
+        (damage(READ_1), ErrorFlag.CHECKSUM),
+        (PROTOCOL_1.encode_read_request(1, 73, 2), ErrorFlag.RANGE),
+        (PROTOCOL_1.encode_read_request(1, 36, 0), ErrorFlag.RANGE),
+        (encode_1(1, READ, b"\x24"), ErrorFlag.RANGE),
+        (encode_2(1, 0x77), 2),
+        (encode_2(1, 0x03, bytes([64, 0, 1])), 2),
+        (encode_2(1, Instruction.SYNC_READ, bytes([132, 0, 4, 0, 1])), 2),
+        (damage(PING_2), 3),
+        (damage(READ_2), 3),
         (PROTOCOL_2.encode_read_request(1, 660, 4), 4),
         (PROTOCOL_2.encode_read_request(1, 0xFFFF, 0xFFFF), 4),
         (PROTOCOL_2.encode_read_request(1, 132, 0), 5),
-        (PROTOCOL_2.encode_packet(1, Instruction.READ, b"\x84\x00"), 5),
+        (encode_2(1, READ, b"\x84\x00"), 5),
     ],
 )
-def test_what_it_cannot_do_is_answered_with_an_error_number(
-    line: Line, request_: bytes, error: int
-) -> None:
-    assert line.ask(request_) == (1, error, b"")
+def test_an_unsupported_request_is_answered_with_an_error(request_: bytes, error: int) -> None:
+    protocol = 2 if request_.startswith(PROTOCOL_2.header) else 1
+    alert = ErrorFlag.VOLTAGE if protocol == 1 else 0x80
+    with line_to(protocol=protocol) as line:
+        assert line.ask(request_) == (1, error, b"")
+        with line.servo.alert():
+            assert line.ask(request_) == (1, error | alert, b"")
 
 
-def test_an_alert_shows_in_the_error_byte_and_in_the_hardware_error_status(
-    servo: FaultyServo, line: Line
-) -> None:
-    with servo.alert():
-        assert line.ask(PROTOCOL_2.encode_read_request(1, 70, 1)) == (1, 0x80, b"\x01")
-        assert line.ask(PROTOCOL_2.encode_packet(1, 0x77)) == (1, 0x82, b"")
-    assert line.ask(PROTOCOL_2.encode_read_request(1, 70, 1)) == (1, 0, b"\x00")
+def test_an_alert_of_protocol_2_shows_in_the_hardware_error_status() -> None:
+    with line_to() as line:
+        with line.servo.alert():
+            assert line.ask(PROTOCOL_2.encode_read_request(1, 70, 1)) == (1, 0x80, b"\x01")
+        assert line.ask(PROTOCOL_2.encode_read_request(1, 70, 1)) == (1, 0, b"\x00")
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
 @pytest.mark.parametrize(
-    ("request_", "from_level", "answer"),
+    ("protocol", "request_", "from_level", "answer"),
     [
-        (PROTOCOL_2.encode_read_request(1, 132, 4), 1, (1, 0, struct.pack("<i", -5))),
-        (SYNC_READ_1_2, 1, (1, 0, struct.pack("<i", -5))),
-        (PROTOCOL_2.encode_packet(1, 0x77), 2, (1, 2, b"")),
+        (1, READ_1, 1, (1, 0, struct.pack("<h", -5))),
+        (1, encode_1(1, 0x77), 2, (1, ErrorFlag.INSTRUCTION, b"")),
+        (1, encode_1(1, 0x82), 2, (1, ErrorFlag.INSTRUCTION, b"")),
+        (2, READ_2, 1, (1, 0, FIVE_BELOW)),
+        (2, SYNC_READ_1_2, 1, (1, 0, FIVE_BELOW)),
+        (2, encode_2(1, 0x77), 2, (1, 2, b"")),
     ],
-    ids=["read", "sync read", "unknown"],
+    ids=[
+        *("read in 1.0", "unknown in 1.0", "sync read, which 1.0 has not"),
+        *("read", "sync read", "unknown"),
+    ],
 )
-def test_the_status_return_level_says_what_is_answered(
-    level: int, request_: bytes, from_level: int, answer: tuple[int, int, bytes]
+def test_a_request_is_answered_from_its_status_return_level_on(
+    level: int, protocol: int, request_: bytes, from_level: int, answer: tuple[int, int, bytes]
 ) -> None:
-    with (
-        FaultyServo(lambda _: -5, VirtualClock(), status_return_level=level) as servo,
-        line_to(servo) as line,
-    ):
-        first = line.ask(request_ + PING_1)
-    assert first == (answer if level >= from_level else (1, 0, PONG))
+    ping, pong = (PING_1, b"") if protocol == 1 else (PING_2, PONG_2)
+    with line_to(protocol=protocol, status_return_level=level) as line:
+        first = line.ask(request_ + ping)
+    assert first == (answer if level >= from_level else (1, 0, pong))
 
 
-def test_a_rate_that_no_servo_has_is_refused() -> None:
-    with pytest.raises(UsageError, match="no emulated servo runs at 123456 baud"):
-        FaultyServo(lambda _: 0, VirtualClock(), baudrate=123_456)
+# Opening and closing
+
+
+@pytest.mark.parametrize(
+    ("protocol", "baudrate", "text"),
+    [
+        (2, 123_456, "no emulated servo runs at 123456 baud"),
+        (1, 4_000_000, "at 4000000 baud in protocol 1"),
+    ],
+)
+def test_a_baud_rate_of_no_servo_is_refused(protocol: int, baudrate: int, text: str) -> None:
+    with pytest.raises(UsageError, match=text):
+        FaultyServo(lambda _: 0, VirtualClock(), protocol=protocol, baudrate=baudrate)
 
 
 def test_closing_leaves_neither_thread_nor_descriptor() -> None:
-    def open_descriptors() -> set[str]:
-        return set(os.listdir("/proc/self/fd"))
-
-    descriptors, threads = open_descriptors(), threading.active_count()
+    descriptors, threads = set(os.listdir("/proc/self/fd")), threading.active_count()
     for _ in range(3):
-        with FaultyServo(lambda _: 0, VirtualClock()) as servo, line_to(servo) as line:
-            assert line.ask(PING_1) == (1, 0, PONG)
-        servo.close()
-    assert open_descriptors() == descriptors
+        with line_to() as line:
+            assert line.ask(PING_2) == (1, 0, PONG_2)
+        line.servo.close()
+    assert set(os.listdir("/proc/self/fd")) == descriptors
     assert threading.active_count() == threads
 
 
-def test_nobody_need_listen_for_the_servo_to_close(servo: FaultyServo, line: Line) -> None:
-    with servo.garbage_before_reply(bytes(1_000_000)):
-        line.port.write(PING_1)
+def test_a_servo_with_an_unread_answer_can_be_closed() -> None:
+    with line_to() as line, line.servo.garbage_before_reply(bytes(1_000_000)):
+        line.port.write(PING_2)
         assert line.port.read(1) == b"\x00"
-        servo.close()
+        line.servo.close()
 
 
-def test_a_reader_may_come_again(servo: FaultyServo) -> None:
-    for _ in range(3):
-        with line_to(servo) as line:
-            assert line.ask(PING_1) == (1, 0, PONG)
+def test_a_port_can_be_opened_again() -> None:
+    with line_to() as line:
+        for _ in range(3):
+            line.port.close()
+            line.port.open()
+            assert line.ask(PING_2) == (1, 0, PONG_2)

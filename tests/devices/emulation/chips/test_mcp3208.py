@@ -1,4 +1,4 @@
-"""One emulated MCP3208, clocked as its three wires would clock it."""
+"""One emulated MCP3208, clocked as its three wires clock it."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ def chip(volts: InputVoltages, *, floats_high: bool = True) -> EmulatedMcp3208:
     return EmulatedMcp3208(volts, VirtualClock(), vref_v=VREF_V, floats_high=floats_high)
 
 
-def holding(counts: int, *, floats_high: bool = True) -> EmulatedMcp3208:
+def with_counts(counts: int, *, floats_high: bool = True) -> EmulatedMcp3208:
     return chip(lambda channel, t_ns: counts / 1000, floats_high=floats_high)
 
 
 def ramp(channel: int, t_ns: int) -> float:
-    """Input n is at n tenths of a volt and a bit."""
+    """Return n tenths of a volt and a bit for input n."""
     return 0.1 * channel + 0.017
 
 
@@ -44,10 +44,10 @@ def test_both_framings_give_the_same_value(channel: int, counts: int) -> None:
 def test_the_framing_of_an_mcp3008_loses_two_bits(channel: int, counts: int) -> None:
     # hardware.md 6, the trap: its mask widened from 3 to 15 makes it look right, and it is not
     request = [1, (8 + channel) << 4, 0]
-    rx = holding(counts, floats_high=False).xfer2(list(request))
+    rx = with_counts(counts, floats_high=False).xfer2(list(request))
     assert (rx[1] & 15) << 8 | rx[2] == counts >> 2
-    # The widened mask takes in the sampling clock too, in which nobody drives the line.
-    rx = holding(counts, floats_high=True).xfer2(list(request))
+    # The widened mask includes the sampling clock, in which the line is not driven.
+    rx = with_counts(counts, floats_high=True).xfer2(list(request))
     assert (rx[1] & 15) << 8 | rx[2] == 2048 + (counts >> 2)
 
 
@@ -55,7 +55,7 @@ def test_the_framing_of_an_mcp3008_loses_two_bits(channel: int, counts: int) -> 
 def test_the_start_bit_may_stand_anywhere(zeros: int, channel: int, counts: int) -> None:
     bits = f"{'0' * zeros}11{channel:03b}".ljust(88, "0")
     sent = [int(bits[i : i + 8], 2) for i in range(0, len(bits), 8)]
-    received = "".join(f"{byte:08b}" for byte in holding(counts).xfer2(sent))
+    received = "".join(f"{byte:08b}" for byte in with_counts(counts).xfer2(sent))
     driven = zeros + 6  # start, four of configuration, one of sampling
     assert received[:driven] == "1" * driven, "the chip drives nothing before the null bit"
     msb_first = f"{counts:012b}"
@@ -65,16 +65,16 @@ def test_the_start_bit_may_stand_anywhere(zeros: int, channel: int, counts: int)
 
 
 @pytest.mark.parametrize("data", [[0, 0, 0], [0] * 40, [0, 0, 1], [0, 0, 0x1F]])
-def test_without_a_start_bit_or_without_enough_clocks_behind_it_nothing_is_driven(
+def test_the_line_is_not_driven_without_a_start_bit_and_enough_clocks_after_it(
     data: list[int],
 ) -> None:
-    assert holding(1234).xfer2(list(data)) == [0xFF] * len(data)
-    assert holding(1234, floats_high=False).xfer2(list(data)) == [0] * len(data)
+    assert with_counts(1234).xfer2(list(data)) == [0xFF] * len(data)
+    assert with_counts(1234, floats_high=False).xfer2(list(data)) == [0] * len(data)
 
 
-def test_a_new_chip_select_begins_anew() -> None:
-    device = holding(0xABC)
-    device.xfer2([0x06])  # broken off in its configuration
+def test_a_chip_select_begins_a_new_conversion() -> None:
+    device = with_counts(0xABC)
+    device.xfer2([0x06])  # interrupted in its configuration
     assert device.xfer2([0x06, 0, 0])[1:] == [0xEA, 0xBC]
 
 
@@ -94,7 +94,9 @@ def test_differential_inputs_are_pairs_and_negative_ones_read_zero(
     ("volts", "counts"),
     [(-3.0, 0), (0.0, 0), (0.00049, 0), (0.00051, 1), (4.0951, 4095), (9.0, 4095)],
 )
-def test_codes_change_half_a_count_below_their_voltage_and_clip(volts: float, counts: int) -> None:
+def test_a_count_begins_half_a_step_below_its_voltage_and_is_limited(
+    volts: float, counts: int
+) -> None:
     rx = chip(lambda channel, t_ns: volts).xfer2([0x06, 0, 0])
     assert (rx[1] & 15) << 8 | rx[2] == counts
 
@@ -118,9 +120,9 @@ def test_a_transfer_takes_its_bits_and_samples_at_the_end_of_the_sampling_clock(
     assert asked[1] == (0, 29_000 + 14_000)
 
 
-def test_received_bytes_are_written_into_the_list_as_spidev_does() -> None:
+def test_received_bytes_replace_the_list_as_in_spidev() -> None:
     data = [0x06, 0, 0]
-    assert holding(0x123).xfer2(data) is data
+    assert with_counts(0x123).xfer2(data) is data
     assert data[1:] == [0xE1, 0x23]
 
 

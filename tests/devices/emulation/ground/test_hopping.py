@@ -1,4 +1,4 @@
-"""Three hops on ground that gives way, as truth: what domes, plate and reference tile see."""
+"""Three hops on soft ground: the truth of domes, plate and reference tile."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LEAD_S = 1.0
 WEIGHT_N = 0.909 * 9.81
 
 
-def changed(scene: Scene, **keys: Any) -> Scene:
+def with_ground(scene: Scene, **keys: Any) -> Scene:
     facts = scene.model_dump()
     facts["ground"] |= keys
     return Scene.model_validate(facts)
@@ -50,14 +50,14 @@ def all_of(ground: Hopping, step_s: float = STEP_S) -> Floats:
     return np.arange(0.0, ground.duration_s, step_s)
 
 
-def bound(ground: Hopping, t_s: Floats) -> npt.NDArray[np.bool_]:
-    """In the ground, from first touch to last."""
+def is_in_ground(ground: Hopping, t_s: Floats) -> npt.NDArray[np.bool_]:
+    """Return whether the foot is in the ground, from first touch to last."""
     stances = zip(ground.touch_down_s, ground.lift_off_s, strict=True)
     return np.asarray(np.any([(t_s >= a) & (t_s <= b) for a, b in stances], axis=0))
 
 
 @BOTH
-def test_the_leg_hops_three_times_and_is_in_the_air_before_between_and_after(name: str) -> None:
+def test_a_leg_hops_three_times_and_is_in_the_air_between_the_hops(name: str) -> None:
     world, ground = hopping(name)
     assert len(ground.touch_down_s) == len(ground.lift_off_s) == HOPS == 3
     # Galileo: 143 ms for 10 cm
@@ -68,7 +68,7 @@ def test_the_leg_hops_three_times_and_is_in_the_air_before_between_and_after(nam
     assert ground.duration_s - ground.lift_off_s[-1] >= 1.5
     t_s = all_of(ground)
     truth = truth_at(world, t_s)
-    in_the_air = ~bound(ground, t_s)
+    in_the_air = ~is_in_ground(ground, t_s)
     np.testing.assert_allclose(truth.true_force_n[in_the_air], 0.0, atol=1e-9)
     np.testing.assert_allclose(truth.true_plate_n[in_the_air], 0.0, atol=1e-9)
     assert np.isnan(truth.true_cop_x_m[in_the_air]).mean() > 0.999
@@ -101,23 +101,25 @@ def test_the_grounds_impulse_between_two_tops_is_weight_times_time(name: str) ->
 
 
 @BOTH
-def test_standing_it_weighs_what_it_weighs(name: str) -> None:
+def test_a_standing_leg_has_its_weight(name: str) -> None:
     world, ground = hopping(name)
     stand_s = np.linspace(ground.touch_down_s[0] + 0.45, ground.touch_down_s[0] + 0.49, 50)
     assert truth_at(world, stand_s).true_plate_n.mean() == pytest.approx(WEIGHT_N, rel=0.15)
 
 
 @BOTH
-def test_no_dome_is_ever_pulled(name: str) -> None:
-    for seed in (0, 1):
-        world, ground = hopping(name, seed)
-        forces_n = truth_at(world, all_of(ground)).true_force_n
-        assert (forces_n >= 0.0).all()
-        assert np.isfinite(forces_n).all()
+@pytest.mark.parametrize("seed", [0, 1])
+def test_no_dome_is_pulled_or_pressed_beyond_its_range(name: str, seed: int) -> None:
+    world, ground = hopping(name, seed)
+    forces_n = truth_at(world, all_of(ground)).true_force_n
+    assert (forces_n >= 0.0).all()
+    assert np.isfinite(forces_n).all()
+    # paper III-A: 25 to 35 N wanted
+    assert 4.0 < forces_n.max() < 25.0
 
 
 @BOTH
-def test_a_plate_sees_domes_and_the_rest_of_the_sole(name: str) -> None:
+def test_a_plate_bears_domes_and_the_rest_of_the_sole(name: str) -> None:
     world, ground = hopping(name)
     t_s = all_of(ground)
     truth = truth_at(world, t_s)
@@ -144,7 +146,7 @@ def test_only_mud_pulls_and_only_at_lift_off() -> None:
     assert ground.forces_n(t_s[pulled]).max() < 1e-3, "then no dome bears anything"
     rising = np.diff(ground.compute_depth_m(t_s)[:, 4]) < 0
     assert rising[pulled[:-1]].all()
-    without = world_of(changed(load_scene("mud"), suction_kpa=0.0))
+    without = world_of(with_ground(load_scene("mud"), suction_kpa=0.0))
     least_n = truth_at(without, t_s).true_plate_n.min()
     assert truth_at(world, t_s).true_plate_n.min() < least_n - 3.0
 
@@ -158,12 +160,12 @@ def test_the_foot_sinks_about_5_cm_in_mud_and_less_in_poppy_seeds() -> None:
     assert 0.01 < sunk_m["poppy"] < 0.04
 
 
-def test_the_head_follows_the_depth_of_each_tile() -> None:
+def test_the_head_is_proportional_to_the_depth_of_each_tile() -> None:
     world, ground = hopping("mud")
     t_s = all_of(ground, 0.001)
     head_kpa, depth_m = ground.compute_head_kpa(t_s), ground.compute_depth_m(t_s)
     np.testing.assert_allclose(head_kpa, 16.5 * np.maximum(depth_m, 0.0))
-    assert (head_kpa[~bound(ground, t_s)] < 0.02).all()
+    assert (head_kpa[~is_in_ground(ground, t_s)] < 0.02).all()
     assert head_kpa.max() == pytest.approx(0.8, abs=0.2)
     poppy = hopping("poppy")[1]
     assert (poppy.compute_head_kpa(t_s) == 0).all(), "grains are no liquid"
@@ -207,15 +209,6 @@ def test_the_load_travels_forward_over_the_foot(name: str) -> None:
         assert late - early > 0.010
 
 
-@BOTH
-def test_tiles_are_pressed_within_their_range(name: str) -> None:
-    # paper III-A: 25 to 35 N wanted
-    for seed in (0, 1):
-        world, ground = hopping(name, seed)
-        peak_n = truth_at(world, all_of(ground)).true_force_n.max()
-        assert 4.0 < peak_n < 25.0
-
-
 @pytest.mark.slow
 @BOTH
 def test_the_same_seed_is_the_same_hop_to_the_bit_and_another_is_not(name: str) -> None:
@@ -241,7 +234,7 @@ def test_truth_is_the_same_however_its_times_are_split(name: str, cuts: list[int
 
 
 @BOTH
-def test_a_leg_that_is_dropped_again_and_again_does_the_same_each_time(name: str) -> None:
+def test_a_leg_that_is_dropped_repeatedly_hops_the_same_each_time(name: str) -> None:
     world, once = world_of(load_scene(name), is_repeated=True), hopping(name)[1]
     ground = world.ground
     assert isinstance(ground, Hopping)
@@ -276,7 +269,7 @@ def test_a_flat_insole_does_not_hop() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(
     st.fixed_dictionaries(
         {
@@ -292,9 +285,9 @@ def test_a_flat_insole_does_not_hop() -> None:
         }
     )
 )
-def test_whatever_a_scene_asks_for_it_hops_or_says_why_not(keys: dict[str, float]) -> None:
+def test_a_leg_of_any_scene_hops_or_is_refused(keys: dict[str, float]) -> None:
     try:
-        world = world_of(changed(load_scene("mud"), **keys))
+        world = world_of(with_ground(load_scene("mud"), **keys))
     except SceneError:
         return
     ground = world.ground
@@ -302,5 +295,5 @@ def test_whatever_a_scene_asks_for_it_hops_or_says_why_not(keys: dict[str, float
     truth = truth_at(world, all_of(ground, 0.002))
     assert (truth.true_force_n >= 0).all()
     assert np.isfinite(truth.true_plate_n).all()
-    # Nothing blows up: no force is beyond what a fall on a hard stop could give.
+    # No force is beyond that of a fall on a hard stop.
     assert np.abs(truth.true_plate_n).max() < 300 * keys["mass_kg"] * 9.81

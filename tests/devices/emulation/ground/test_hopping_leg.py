@@ -1,4 +1,4 @@
-"""A leg that hops obeys mechanics, whatever it hops on."""
+"""A hopping leg obeys mechanics on any ground."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def upright(t_s: float) -> float:
 
 
 def dropped(ground: SoftGround, *, stand_s: float = 2.0, leg: LegProperties = LEG) -> LegSimulation:
-    """Dropped from 10 cm, and left alone."""
+    """Return a leg that was dropped from 10 cm and then left to itself."""
     hopping = LegSimulation(leg, 0.10, 0.0)
     hopping.simulate_fall(ground, upright)
     hopping.simulate_stance(ground, upright, hopping.motion.t_s + stand_s)
@@ -41,7 +41,7 @@ def column(hopping: LegSimulation, name: str) -> Floats:
 
 
 def ground_n(hopping: LegSimulation) -> Floats:
-    """Vertical force of the ground on an upright leg."""
+    """Return the vertical force of the ground on an upright leg."""
     shares = [s.area_m2 * -s.z_m / s.radius_m for s in hopping.leg.strips]
     return column(hopping, "stress_pa") @ shares + column(hopping, "force_beside_strips_n")
 
@@ -60,7 +60,7 @@ def energy_j(hopping: LegSimulation) -> Floats:
 
 
 @BOTH
-def test_it_falls_as_galileo_says(ground: SoftGround) -> None:
+def test_a_leg_falls_as_galileo_says(ground: SoftGround) -> None:
     hopping = LegSimulation(LEG, 0.10, 0.0)
     hopping.simulate_fall(ground, upright)
     assert hopping.motion.t_s == pytest.approx((2 * 0.10 / 9.81) ** 0.5, abs=0.001)
@@ -70,7 +70,7 @@ def test_it_falls_as_galileo_says(ground: SoftGround) -> None:
 
 
 @BOTH
-def test_left_alone_it_comes_to_rest_on_its_weight(ground: SoftGround) -> None:
+def test_a_leg_left_to_itself_rests_on_its_weight(ground: SoftGround) -> None:
     hopping = dropped(ground)
     assert abs(hopping.motion.body_m_s) < 1e-3
     assert ground_n(hopping)[-1] == pytest.approx(0.909 * 9.81, rel=0.01)
@@ -80,7 +80,7 @@ def test_left_alone_it_comes_to_rest_on_its_weight(ground: SoftGround) -> None:
 def test_without_push_off_energy_decreases(ground: SoftGround) -> None:
     hopping = dropped(ground)
     energy = energy_j(hopping)
-    # What the ground gives back is what it has stored: force squared over twice its stiffness.
+    # The ground returns the energy that it stored: force squared over twice its stiffness.
     sole_m2 = sum(strip.area_m2 for strip in LEG.strips)
     stiffness = ground.strength_pa_m * ground.unloading_stiffness_ratio * sole_m2
     stored = ground_n(hopping).max() ** 2 / (2 * stiffness)
@@ -107,7 +107,7 @@ def test_the_grounds_impulse_is_weight_and_change_of_momentum(ground: SoftGround
 
 
 @BOTH
-def test_a_push_off_gets_it_as_high_as_it_should(ground: SoftGround) -> None:
+def test_a_push_off_reaches_its_height(ground: SoftGround) -> None:
     strokes = []
     for higher_m in (0.0, 0.02):
         hopping = dropped(ground, stand_s=0.5)
@@ -119,7 +119,7 @@ def test_a_push_off_gets_it_as_high_as_it_should(ground: SoftGround) -> None:
     assert strokes[1] > strokes[0] > 0.03
 
 
-def test_a_leg_that_is_held_too_fast_says_so() -> None:
+def test_a_leg_that_cannot_leave_the_ground_is_refused() -> None:
     glue = SoftGround.from_scene(MudGround(kind="mud", suction_kpa=50.0))
     hopping = dropped(glue, stand_s=0.5)
     with pytest.raises(SceneError, match="does not get out of this ground"):
@@ -127,16 +127,16 @@ def test_a_leg_that_is_held_too_fast_says_so() -> None:
 
 
 @pytest.mark.parametrize("suction_kpa", [8.0, 10.0, 20.0])
-def test_a_leg_that_stands_stretched_in_the_mud_has_not_hopped(suction_kpa: float) -> None:
+def test_a_leg_that_stands_stretched_in_mud_has_not_hopped(suction_kpa: float) -> None:
     # As high as a stretched leg reaches without leaving: that is not a hop.
     glue = SoftGround.from_scene(MudGround(kind="mud", suction_kpa=suction_kpa))
     hopping = dropped(glue, stand_s=0.5)
-    with contextlib.suppress(SceneError):  # that it does not get out is an honest answer, too
+    with contextlib.suppress(SceneError):  # it may be refused, too
         hopping.simulate_push_off(glue, upright, hopping.compute_centre_m(hopping.motion) + 0.06)
         assert ground_n(hopping)[-1] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_leg_that_is_too_soft_folds_up_and_says_so() -> None:
+def test_a_leg_that_is_too_soft_is_refused() -> None:
     with pytest.raises(SceneError, match="folds up") as caught:
         dropped(POPPY, leg=LegProperties(20.0, 100.0, LEG.strips))
     assert "leg_n_per_m" in caught.value.expected

@@ -1,4 +1,4 @@
-"""The mill's force sensor behind its emulated converter."""
+"""The force sensor of the indenter behind its emulated converter."""
 
 from __future__ import annotations
 
@@ -32,10 +32,12 @@ def sensor_of(world: World, clock: VirtualClock, scene: ReferenceSection) -> Ref
     return ReferenceForceSensor(Mcp3208(device, where=scene.port), scene)
 
 
-def test_a_force_that_passes_through_the_converter_is_the_spindles(
+def test_the_force_through_the_converter_is_that_of_the_spindle(
     world: World, clock: VirtualClock
 ) -> None:
     sensor = sensor_of(world, clock, PLUS_MINUS_50_N)
+    clock.sleep_until_ns(world.epoch_ns + 500_000_000)
+    assert sensor.read_force_n() == pytest.approx(0.0, abs=0.15), "before the first stroke"
     # The first stroke of 4 s to 30 N begins after the lead of 1 s and 0.3 s of rest.
     begins_ns = world.epoch_ns + np.linspace(1.31e9, 5.29e9, 2_000).astype(np.int64)
     measured = []
@@ -51,12 +53,7 @@ def test_a_force_that_passes_through_the_converter_is_the_spindles(
     assert np.diff(np.unique(np.round(steps))).min() == 1
 
 
-def test_a_sensor_under_no_spindle_reads_about_zero(world: World, clock: VirtualClock) -> None:
-    clock.sleep_until_ns(world.epoch_ns + 500_000_000)
-    assert sensor_of(world, clock, PLUS_MINUS_50_N).read_force_n() == pytest.approx(0.0, abs=0.15)
-
-
-def test_a_force_beyond_the_converters_range_is_not_known(
+def test_a_force_beyond_the_range_of_the_converter_is_unknown(
     world: World, clock: VirtualClock
 ) -> None:
     scene = ReferenceSection(zero_v=1.65, n_per_v=10.0)  # +-16.5 N, and the stroke goes to 30 N

@@ -1,4 +1,4 @@
-"""How a recorded load is shared among tiles: against an exhaustive search and by hand."""
+"""Shares of a recorded load among tiles, against an exhaustive search and by hand."""
 
 from __future__ import annotations
 
@@ -66,14 +66,14 @@ def pressed(
 
 
 def shares(cop_m: tuple[float, float], positions_m: Floats) -> tuple[Floats, int]:
-    """Shares of one newton with its COP at a place of the foot, and how many COPs were moved."""
+    """Return shares of one newton with its COP at a place, and the number of moved COPs."""
     # One sample is its own mean, so the place is given as the offset.
     one = pressed(trace_of([1.0], [(0.0, 0.0)]), positions_m, offset_m=cop_m)
     return one.forces_n[1], one.moved_samples
 
 
 def exhaustive(cop_m: Floats, positions_m: Floats) -> Floats | None:
-    """The least sum of squares, by trying every set of tiles that may bear load."""
+    """Return the least sum of squares of all sets of tiles."""
     best: Floats | None = None
     n = len(positions_m)
     wanted = np.append(1.0, cop_m)
@@ -91,20 +91,6 @@ def exhaustive(cop_m: Floats, positions_m: Floats) -> Floats | None:
 
 
 # Sharing
-
-
-def test_in_the_middle_of_four_tiles_each_bears_a_quarter() -> None:
-    force, moved = shares((0.0, 0.0), SQUARE)
-    np.testing.assert_allclose(force, 0.25, atol=1e-7)
-    assert moved == 0
-
-
-def test_inside_the_hull_the_shares_are_those_of_the_pseudo_inverse() -> None:
-    cop = (0.01, -0.005)
-    rows = np.vstack([np.ones(4), SQUARE.T])
-    expected = np.linalg.pinv(rows) @ np.array([1.0, *cop])
-    assert expected.min() > 0
-    np.testing.assert_allclose(shares(cop, SQUARE)[0], expected, atol=1e-6)
 
 
 places = st.tuples(st.integers(-20, 20), st.integers(-20, 20)).map(
@@ -137,7 +123,7 @@ def test_sum_and_moment_are_exact_and_the_sum_of_squares_is_the_least(
 
 
 def nearest_on_hull(cop_m: Floats, positions_m: Floats) -> Floats:
-    """The nearest point of the hull's edge: of all segments between two tiles."""
+    """Return the nearest point of all segments between two tiles."""
     candidates = []
     for a, b in combinations(positions_m, 2):
         along = np.clip((cop_m - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
@@ -159,7 +145,7 @@ def test_a_cop_outside_the_tiles_is_moved_to_the_nearest_edge_and_counted(
 
 
 @pytest.mark.parametrize("tile", range(4))
-def test_a_cop_on_a_corner_is_borne_by_the_tile_there_and_not_counted(tile: int) -> None:
+def test_a_cop_on_a_corner_loads_the_tile_there_and_is_not_counted(tile: int) -> None:
     force, moved = shares((float(SQUARE[tile, 0]), float(SQUARE[tile, 1])), SQUARE)
     np.testing.assert_allclose(force, np.eye(4)[tile], atol=1e-5)
     assert moved == 0
@@ -171,18 +157,14 @@ def test_each_moved_sample_is_counted_once_and_unloaded_ones_are_not() -> None:
     assert result.moved_samples == 2
 
 
-def test_a_line_of_tiles_drops_the_other_axis() -> None:
-    straight = pressed(trace_of([10, 10], [(-0.01, 0.0), (0.01, 0.0)]), LINE)
-    aslant = pressed(trace_of([10, 10], [(-0.01, -0.4), (0.01, 0.4)]), LINE)
+@pytest.mark.parametrize("beside_m", [0.0, 0.03])
+def test_a_line_of_tiles_ignores_the_cop_across_it(beside_m: float) -> None:
+    line = LINE + np.array([0.0, beside_m])
+    straight = pressed(trace_of([10, 10], [(-0.01, 0.0), (0.01, 0.0)]), line)
+    aslant = pressed(trace_of([10, 10], [(-0.01, -0.4), (0.01, 0.4)]), line)
     np.testing.assert_allclose(aslant.forces_n, straight.forces_n, atol=1e-9)
-    assert aslant.moved_samples == 0
-    np.testing.assert_allclose(straight.forces_n[1:-1] @ LINE[:, 0] / 10, [-0.01, 0.01], atol=1e-6)
-
-
-def test_a_line_of_tiles_beside_the_axis_drops_it_too() -> None:
-    beside = LINE + np.array([0.0, 0.03])
-    result = pressed(trace_of([10, 10], [(-0.01, 0.0), (0.01, 0.0)]), beside)
-    assert result.moved_samples == 0
+    assert aslant.moved_samples == straight.moved_samples == 0
+    np.testing.assert_allclose(straight.forces_n[1:-1] @ line[:, 0] / 10, [-0.01, 0.01], atol=1e-6)
 
 
 def test_a_single_tile_bears_everything() -> None:
@@ -191,19 +173,21 @@ def test_a_single_tile_bears_everything() -> None:
     assert result.moved_samples == 0
 
 
-def test_a_reference_tile_bears_nothing() -> None:
+def test_a_reference_tile_bears_nothing_and_is_no_cell() -> None:
     bears = [True, False, True, True, True]
     positions = np.insert(SQUARE, 1, (0.0, 0.0), axis=0)
     result = pressed(trace_of([8.0], [(0, 0)]), positions, bears=bears)
     np.testing.assert_allclose(result.forces_n[1], [2, 0, 2, 2, 2], atol=1e-6)
     cells = pressed(trace_of(cells_n=[[1.0, 2.0, 3.0, 4.0]]), positions, bears=bears)
     np.testing.assert_allclose(cells.forces_n[1], [1, 0, 2, 3, 4])
+    with pytest.raises(LoadTraceError, match=r"4 cell columns.* 3 tiles"):
+        pressed(trace_of(cells_n=[[1.0] * 4]), bears=[True, True, True, False])
 
 
 # The centre of pressure
 
 
-def test_the_cop_used_is_scaled_about_its_force_weighted_mean_and_then_moved() -> None:
+def test_a_cop_is_scaled_about_its_force_weighted_mean_and_then_moved() -> None:
     fz = np.array([10.0, 30.0, 20.0])
     cop = np.array([(0.30, 0.10), (0.32, 0.10), (0.28, 0.13)])
     centre = fz @ cop / fz.sum()
@@ -236,7 +220,7 @@ def test_axes_of_the_trace_become_axes_of_the_foot(
 
 
 @pytest.mark.parametrize("axes", ["", "x", "xx", "yy", "-x-x", "xz", "xyz", "x y", "--xy", "XY"])
-def test_axes_that_are_no_two_axes_are_refused(axes: str) -> None:
+def test_a_text_of_no_two_axes_is_refused(axes: str) -> None:
     with pytest.raises(UsageError) as caught:
         pressed(trace_of([1.0], [(0, 0)]), axes=axes)
     assert repr(axes) in str(caught.value)
@@ -271,28 +255,24 @@ def test_a_missing_cop_does_not_shift_the_mean() -> None:
     assert (result.forces_n[1] @ SQUARE / 10)[0] == pytest.approx(0.01, abs=1e-6)
 
 
-@pytest.mark.parametrize("fz", [[0.0, 0.0], [-5.0, -1.0]])
-def test_a_trace_that_never_loads_the_foot_is_refused(fz: list[float]) -> None:
-    with pytest.raises(LoadTraceError, match=r"walk\.csv: the trace never loads"):
-        pressed(trace_of(fz, [(0.0, 0.0)] * 2))
-
-
-def test_a_pull_presses_nothing() -> None:
+def test_a_trace_that_never_loads_the_foot_is_refused_and_a_pull_bears_nothing() -> None:
+    for fz in ([0.0, 0.0], [-5.0, -1.0]):
+        with pytest.raises(LoadTraceError, match=r"walk\.csv: the trace never loads"):
+            pressed(trace_of(fz, [(0.0, 0.0)] * 2))
     result = pressed(trace_of([10.0, -3.0], [(0.0, 0.0)] * 2))
     np.testing.assert_allclose(result.forces_n[2], 0.0)
 
 
-def test_a_trace_without_any_load_column_is_refused() -> None:
-    trace = trace_of([1.0])
+def test_a_trace_without_a_load_column_is_refused() -> None:
     with pytest.raises(LoadTraceError) as caught:
-        pressed(trace)
+        pressed(trace_of([1.0]))
     assert "cop_x_m and cop_y_m" in caught.value.expected
 
 
 # Cells
 
 
-def test_cells_win_over_the_total_force() -> None:
+def test_cells_replace_the_total_force() -> None:
     cells = [[1.0, 2.0, 3.0, 4.0], [4.0, 3.0, 2.0, 0.0]]
     result = pressed(trace_of([99.0, 99.0], [(0, 0)] * 2, cells), load_scale=2.0)
     np.testing.assert_allclose(result.forces_n[1:-1], 2 * np.array(cells))
@@ -308,15 +288,10 @@ def test_another_number_of_cells_than_tiles_is_refused_with_both(n: int) -> None
     assert caught.value.where == "walk.csv"
 
 
-def test_a_reference_tile_is_no_cell() -> None:
-    with pytest.raises(LoadTraceError, match=r"4 cell columns.* 3 tiles"):
-        pressed(trace_of(cells_n=[[1.0] * 4]), bears=[True, True, True, False])
-
-
 # Limits and time
 
 
-def test_more_than_a_tile_bears_is_limited_and_counted_by_sample() -> None:
+def test_the_force_on_a_tile_is_limited_and_counted_by_sample() -> None:
     cells = [[10.0, 121.0, 180.0, 0.0], [120.0, 120.0, 120.0, 120.0], [0.0, 0.0, 0.0, 120.1]]
     result = pressed(trace_of(cells_n=cells))
     assert FORCE_LIMIT_N == 120.0  # four times 30 N, the middle of paper III-A's range
@@ -343,7 +318,7 @@ def test_a_trace_begins_after_the_lead_and_ends_unloaded(lead_s: float) -> None:
     np.testing.assert_allclose(result.forces_n[:, 0], [0, 5, 6, 0])
 
 
-def test_the_angle_goes_with_the_trace_and_is_held_at_its_ends() -> None:
+def test_the_angle_is_that_of_the_trace_and_constant_beyond_its_ends() -> None:
     trace = trace_of(cells_n=[[1.0] * 4] * 2, angle_rad=np.array([-0.1, 0.2]))
     angle_rad = pressed(trace).angle_rad
     assert angle_rad is not None

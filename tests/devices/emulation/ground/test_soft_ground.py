@@ -1,4 +1,4 @@
-"""Ground that gives way: what it does to a strip of a sole, and to the whole foot."""
+"""Soft ground: its forces on a strip of a sole and on the whole foot."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ SPEEDS = st.floats(-3.0, 3.0)
 SOLE_M2 = 0.004
 
 
-def test_poppy_seeds_are_as_strong_as_they_were_measured() -> None:
+def test_the_strength_of_poppy_seeds_is_the_measured_one() -> None:
     # Li, Zhang and Goldman 2013: of the order of 0.3 N/cm^3, so 0.9 N/cm^2 at 3 cm
     stress_pa, _ = POPPY.compute_stress_pa(0.03, 0.0, 0.0)
     assert stress_pa * 1e-4 == pytest.approx(0.9)
 
 
-def test_poppy_seeds_weigh_what_poppy_seeds_weigh_and_mud_what_mud_weighs() -> None:
+def test_poppy_seeds_and_mud_have_their_weight() -> None:
     assert 0 < POPPY.inertia_kg_m3 < 2 * 1000, "grains of 1 g/cm^3 and a drag coefficient near 1"
     assert POPPY.head_pa_m == 0.0
     # hardware.md 9: 1.5 to 1.8 kPa per 0.1 m
@@ -63,22 +63,20 @@ def test_ground_never_pulls_at_a_strip(
 
 
 @BOTH
-def test_what_was_pressed_in_stays_pressed_in(ground: SoftGround) -> None:
+def test_a_compacted_ground_stays_compacted(ground: SoftGround) -> None:
     loaded_pa, set_m = ground.compute_stress_pa(0.04, 0.0, 0.0)
     risen_m = 0.04 / ground.unloading_stiffness_ratio
     assert ground.compute_stress_pa(0.04 - 0.5 * risen_m, -0.1, set_m)[0] == pytest.approx(
         0.5 * loaded_pa
     )
     assert ground.compute_stress_pa(0.04 - 1.1 * risen_m, -0.1, set_m) == (0.0, set_m)
-    assert ground.compute_stress_pa(0.04, 0.0, set_m)[0] == pytest.approx(loaded_pa), "found again"
+    assert ground.compute_stress_pa(0.04, 0.0, set_m)[0] == pytest.approx(loaded_pa)
     assert ground.compute_stress_pa(0.05, 0.0, set_m)[0] == pytest.approx(loaded_pa * 5 / 4)
 
 
 @BOTH
 @given(st.lists(st.floats(-0.01, 0.08), min_size=2, max_size=8))
-def test_going_in_and_out_takes_energy_and_never_gives_any(
-    ground: SoftGround, turns_m: list[float]
-) -> None:
+def test_no_path_in_the_ground_gains_energy(ground: SoftGround, turns_m: list[float]) -> None:
     path_m = np.concatenate(
         [np.linspace(a, b, 400) for a, b in zip([0.0, *turns_m], [*turns_m, 0.0], strict=True)]
     )
@@ -91,13 +89,15 @@ def test_going_in_and_out_takes_energy_and_never_gives_any(
     assert np.trapezoid(stresses, path_m) >= -1e-3 * max(stresses) * 0.08
 
 
-def test_dry_grains_do_nothing_to_the_foot_but_press_its_sole() -> None:
+def test_dry_grains_press_the_sole_only() -> None:
     for depth_m, sinking_m_s, gap_m in ((0.03, 1.0, 0.0), (0.03, -1.0, 0.01)):
         assert POPPY.compute_foot_force_n(depth_m, sinking_m_s, gap_m, SOLE_M2) == 0.0
 
 
 @given(st.floats(-0.05, 0.0), SPEEDS, st.floats(0.0, 0.1))
-def test_mud_lets_go_of_a_foot_above_it(depth_m: float, speed_m_s: float, gap_m: float) -> None:
+def test_mud_exerts_no_force_on_a_foot_above_it(
+    depth_m: float, speed_m_s: float, gap_m: float
+) -> None:
     assert MUD.compute_foot_force_n(depth_m, speed_m_s, gap_m, SOLE_M2) == 0.0
 
 
@@ -110,7 +110,7 @@ def test_mud_sucks_only_at_a_sole_that_comes_off_its_bed(
 
     sucked_n = force_n(-speed_m_s, 0.0) - force_n(-speed_m_s, gap_m)
     assert 0.0 < sucked_n <= 2_500 * SOLE_M2 * 1.000001
-    assert force_n(speed_m_s, gap_m) == force_n(speed_m_s, 0.0), "and never while it sinks"
+    assert force_n(speed_m_s, gap_m) == force_n(speed_m_s, 0.0), "none while it sinks"
 
 
 def test_suction_is_over_when_the_gap_has_filled() -> None:

@@ -1,4 +1,4 @@
-"""Attempts to open a device that went away: one a second, and nobody waits for them."""
+"""Attempts to reopen a lost device: one a second, and no caller waits for them."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from tests.waiting import until
 
 
 class Device:
-    """A device that is there when it is told to be; its opening may block."""
+    """A device that can be missing, and that can block when it is opened."""
 
     def __init__(self) -> None:
-        self.is_there = False
+        self.is_present = False
         self.answers = threading.Event()
         self.answers.set()
         self.attempts_ns: list[int] = []
@@ -27,7 +27,7 @@ class Device:
     def open(self) -> Device:
         self.attempts_ns.append(self.now_ns)
         self.answers.wait()
-        if not self.is_there:
+        if not self.is_present:
             raise BusSetupError("not there", where="/dev/i2c-3", errno=2)
         return self
 
@@ -38,24 +38,24 @@ class Device:
 @given(
     steps_ns=st.lists(st.integers(0, 3 * ATTEMPT_INTERVAL_NS), max_size=60), back=st.integers(0, 60)
 )
-def test_one_attempt_a_second_until_one_succeeds(steps_ns: list[int], back: int) -> None:
+def test_a_device_is_reopened_by_one_attempt_a_second(steps_ns: list[int], back: int) -> None:
     device = Device()
     reopener = DeviceReopener(device.open, is_synchronous=True)
     for i, step_ns in enumerate(steps_ns):
-        device.is_there = i >= back
+        device.is_present = i >= back
         before = len(device.attempts_ns)
         device.now_ns += step_ns
         opened = reopener.poll_opened_device(device.now_ns)
-        assert (opened is device) == (device.is_there and len(device.attempts_ns) > before)
-        assert ("not there" in reopener.last_error) == (not device.is_there) or opened is None
+        assert (opened is device) == (device.is_present and len(device.attempts_ns) > before)
+        assert ("not there" in reopener.last_error) == (not device.is_present) or opened is None
     assert all(b - a >= ATTEMPT_INTERVAL_NS for a, b in pairwise(device.attempts_ns))
     if steps_ns:
         assert device.attempts_ns, "the first attempt is at once"
 
 
-def test_an_opening_that_blocks_delays_nobody_and_is_not_doubled() -> None:
+def test_an_opening_that_blocks_delays_no_caller_and_is_not_repeated() -> None:
     device = Device()
-    device.is_there = True
+    device.is_present = True
     device.answers.clear()
     reopener = DeviceReopener(device.open)
     for now_ns in range(0, 5 * ATTEMPT_INTERVAL_NS, ATTEMPT_INTERVAL_NS // 10):
@@ -65,9 +65,9 @@ def test_an_opening_that_blocks_delays_nobody_and_is_not_doubled() -> None:
     assert until(lambda: reopener.poll_opened_device(5 * ATTEMPT_INTERVAL_NS)) is device
 
 
-def test_a_device_that_was_opened_for_nobody_is_closed() -> None:
+def test_a_device_opened_after_the_last_poll_is_closed() -> None:
     device = Device()
-    device.is_there = True
+    device.is_present = True
     reopener = DeviceReopener(device.open, is_synchronous=True)
     reopener._open()  # an attempt that ended between two polls
     reopener.close()
