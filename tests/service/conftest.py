@@ -9,14 +9,11 @@ from typing import Any
 
 import pytest
 
-import service.server.server
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.patient import be_patient
 from tests.service.process import Process, Start
 from tests.service.running import Running, ServeWith
 from tests.waiting import PATIENCE_S, until
-
-TICK_S = 0.02
 
 
 @pytest.fixture
@@ -33,7 +30,7 @@ def no_threads_left() -> Iterator[None]:
 
 @pytest.fixture
 def silence_s() -> float:
-    """How long a server listens in vain: a node in a test's thread may wait for its turn."""
+    """Seconds of silence after which a server lets a node go: nodes of tests wait for a core."""
     return PATIENCE_S
 
 
@@ -41,9 +38,8 @@ def silence_s() -> float:
 def serve_with(
     no_threads_left: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, silence_s: float
 ) -> Iterator[ServeWith]:
-    """A server with this token and these names; its ticks are quick, and so the tests are."""
-    monkeypatch.setattr(service.server.server, "TICK_S", TICK_S)
-    # The scripted node sends what passes a stop only when that was answered.
+    """Start a server of the test's own, with any options of `Running`."""
+    # A fake node sends the frames that pass a stop only after the stop was answered.
     be_patient(monkeypatch, settle_s=0.02, silence_s=silence_s)
     started: list[Running] = []
 
@@ -86,7 +82,7 @@ def node(running: Running, node_of: NodeOf) -> FakeNode:
 
 @pytest.fixture
 def tared(node: FakeNode) -> FakeNode:
-    """A connected node with a tare, all of whose 70 frames have come and are acknowledged."""
+    """A connected node with a tare; its 70 frames are acknowledged."""
     node.connect()
     node.tared()
     node.acknowledged(69)

@@ -16,7 +16,6 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
-import service.server.server
 from tests.service.patient import be_patient, patient_server
 from tests.service.running import Running
 from tests.waiting import PATIENCE_S
@@ -167,7 +166,6 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
 @pytest.fixture
 def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Scripted]]:
     """Starts a server, of these options, and the node of a test."""
-    monkeypatch.setattr(service.server.server, "TICK_S", 0.05)
     be_patient(monkeypatch)
     started: list[Scripted] = []
 

@@ -1,18 +1,22 @@
-"""Servers and sessions that several modules ask for."""
+"""Servers and sessions for several modules."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import pytest
 
 from service.api.connection_limits import LimitSettings
+from tests.service.api.access import TOKEN
 from tests.service.api.sealed import Sealed
 from tests.service.fake_node import FakeNode
+from tests.service.patient import patient_server
 from tests.service.running import Running, ServeWith
 
 
 @pytest.fixture
 def strict(serve_with: ServeWith) -> Running:
-    """A server that is soon out of patience and of places."""
+    """A server with short time-outs and few places."""
     bounds = LimitSettings(
         max_connections=3,
         max_header_bytes=4096,
@@ -23,13 +27,31 @@ def strict(serve_with: ServeWith) -> Running:
     return serve_with(bounds=bounds)
 
 
-@pytest.fixture
-def sealed(running: Running, tared: FakeNode) -> Sealed:
-    """Of 300 frames; a second one is recorded."""
-    session = tared.record()
-    tared.deliver(300, [20.0, 60.0])
-    tared.finish(session)
-    recording = tared.record()
-    tared.deliver(50, [5.0, 0.0])
-    content = (session.folder / "frames.parquet").read_bytes()
-    return Sealed(running, session, content, recording)
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    """A server of a module whose tests leave nothing behind that another test sees."""
+    with patient_server(tmp_path_factory.mktemp("shared") / "data") as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    """A server whose requests show no token but those that a test gives."""
+    with patient_server(tmp_path_factory.mktemp("guarded") / "data", token=TOKEN) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def sealed(shared: Running) -> Iterator[Sealed]:
+    """A sealed session of 300 frames, and one of 50 frames that is still recorded."""
+    node = FakeNode(shared)
+    node.connect()
+    node.tared()
+    node.acknowledged(69)
+    session = node.record()
+    node.deliver(300, [20.0, 60.0])
+    node.finish(session)
+    recording = node.record(name="Ünder/..\\ 3rd trial")
+    node.deliver(50, [5.0, 0.0])
+    yield Sealed(shared, session, (session.folder / "frames.parquet").read_bytes(), recording)
+    node.close()

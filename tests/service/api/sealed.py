@@ -1,8 +1,7 @@
-"""A sealed session of a server that runs, and how its data are asked for."""
+"""A sealed session of a running server, and its downloads."""
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +13,7 @@ from tests.service.running import Running
 
 @dataclass(frozen=True)
 class Sealed:
-    """A sealed session of 300 frames at 20 and 60 N, and one that is still recorded."""
+    """A sealed session of 300 frames at 20 and 60 N, its file, and a session that is recorded."""
 
     running: Running
     session: Recording
@@ -25,15 +24,12 @@ class Sealed:
     def id(self) -> str:
         return self.session.id
 
-    @property
-    def sha256(self) -> str:
-        return hashlib.sha256(self.content).hexdigest()
+    def get_file(self, **headers: str) -> httpx.Response:
+        """Get the stored file."""
+        headers = {"Accept-Encoding": "identity"} | headers
+        return self.running.http.get(f"{self.session.url}/data", headers=headers)
 
-    def get(self, method: str = "GET", **headers: str) -> httpx.Response:
-        return self.running.http.request(
-            method, f"{self.session.url}/data", headers={"Accept-Encoding": "identity"} | headers
-        )
-
-    def made(self, session: Recording | None = None, **query: Any) -> httpx.Response:
+    def export(self, session: Recording | None = None, **query: Any) -> httpx.Response:
+        """Get a session in a format, by default the sealed one."""
         url = f"{(session or self.session).url}/data"
         return self.running.http.get(url, params=query)

@@ -1,10 +1,13 @@
-"""Where a server is found is known before there is one."""
+"""Addresses of a server: its names, its URLs in the networks of the field, and its token."""
 
 from __future__ import annotations
 
+import json
 import socket
+import stat
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,14 +19,16 @@ from service.api.address import (
     InterfaceAddress,
     list_own_names,
     list_urls,
+    load_or_create_token,
     open_listening_socket,
     parse_advertised_url,
     sort_addresses,
 )
+from tests.service.networks import needs_networks, run_in_network
 
 
-def test_where_a_server_will_be_is_known_without_importing_what_it_is_made_of() -> None:
-    # `foottile demo` starts its node by it, which looks for its tiles while the server is prepared.
+def test_an_address_needs_no_heavy_import() -> None:
+    # `foottile demo` starts its node with it, which looks for tiles while the server is prepared.
     code = (
         "import sys, service.api.address, service.cli.commands.demo\n"
         "print([name for name in ('fastapi', 'uvicorn', 'numba') if name in sys.modules])"
@@ -39,55 +44,44 @@ def test_where_a_server_will_be_is_known_without_importing_what_it_is_made_of() 
         ("Laptop", ("laptop", "laptop.local")),
         ("laptop.lab.example.org", ("laptop.lab.example.org", "laptop", "laptop.local")),
         ("laptop.local", ("laptop.local", "laptop")),
-        ("", ()),
-        ("127", ()),
-        ("a b", ()),
-        ("evil/..", ()),
-        ("*", ()),
-        ("x" * 65, ()),
+        *[(wrong, ()) for wrong in ("", "127", "a b", "evil/..", "*", "x" * 65)],
     ],
 )
-def test_a_machine_goes_by_its_own_name_and_no_other(
+def test_a_machine_has_its_own_names_only(
     name: str, names: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(socket, "gethostname", lambda: name)
     assert list_own_names() == names
 
 
-def addresses(*listed: str) -> list[str]:
-    """Addresses in their order; each is listed as `interface address [no-carrier] [first]`."""
+def sort_lines(*lines: str) -> list[str]:
+    """Sort the addresses of lines `interface address [no-carrier] [first]`."""
     found = [
-        InterfaceAddress(
-            line.split()[0],
-            line.split()[1],
-            has_carrier="no-carrier" not in line,
-            is_first_host="first" in line,
-        )
-        for line in listed
+        InterfaceAddress(name, address, "no-carrier" not in notes, "first" in notes)
+        for name, address, *notes in map(str.split, lines)
     ]
     return [each.address for each in sort_addresses(found)]
 
 
-def test_the_address_that_a_phone_reaches_comes_first() -> None:
-    expected = ["192.168.4.1", "10.1.2.3", "fd00::2", "203.0.113.5", "2001:db8::5"]
-    expected += ["169.254.7.7", "fe80::1%eth0", "192.168.7.1", "172.18.0.1", "10.8.0.2"]
-    listed = [
-        *(
-            "br-0123456789ab 172.18.0.1 first",
-            "docker0 172.17.0.1 first no-carrier",
-            "tun0 10.8.0.2",
-        ),
-        *("lo 127.0.0.1", "lo ::1", "eth0 203.0.113.5", "eth0 2001:db8::5", "eth0 fe80::1%eth0"),
-        *("eth1 169.254.7.7", "eth2 192.168.7.1 first no-carrier", "eth3 10.1.2.3", "eth3 fd00::2"),
-        "wlan0 192.168.4.1 first",
+LINES = [
+    *("br-0123456789ab 172.18.0.1 first", "docker0 172.17.0.1 first no-carrier"),
+    *("tun0 10.8.0.2", "lo 127.0.0.1", "lo ::1", "eth0 203.0.113.5", "eth0 2001:db8::5"),
+    *("eth0 fe80::1%eth0", "eth1 169.254.7.7", "eth2 192.168.7.1 first no-carrier"),
+    *("eth3 10.1.2.3", "eth3 fd00::2", "wlan0 192.168.4.1 first"),
+]
+
+
+@given(st.permutations(LINES))
+def test_the_address_for_a_phone_comes_first(lines: list[str]) -> None:
+    assert sort_lines(*lines) == [
+        *("192.168.4.1", "10.1.2.3", "fd00::2", "203.0.113.5", "2001:db8::5"),
+        *("169.254.7.7", "fe80::1%eth0", "192.168.7.1", "172.18.0.1", "10.8.0.2"),
     ]
-    for order in (listed, listed[::-1], sorted(listed)):
-        assert addresses(*order) == expected
 
 
-@given(st.permutations(["eth0 10.1.2.3", "ap0 10.42.0.1 first", "docker0 172.17.0.1 first"]))
-def test_no_bridge_comes_before_a_network(listed: list[str]) -> None:
-    assert addresses(*listed) == ["10.42.0.1", "10.1.2.3", "172.17.0.1"]
+def test_a_container_bridge_comes_behind_networks() -> None:
+    lines = ("docker0 172.17.0.1 first", "eth0 10.1.2.3", "ap0 10.42.0.1 first")
+    assert sort_lines(*lines) == ["10.42.0.1", "10.1.2.3", "172.17.0.1"]
 
 
 @pytest.mark.parametrize(
@@ -104,34 +98,34 @@ def test_no_bridge_comes_before_a_network(listed: list[str]) -> None:
         ("https://lab.example:8443", "https://lab.example:8443"),
     ],
 )
-def test_an_address_to_show_is_a_host_a_port_too_or_all_of_it(advertised: str, url: str) -> None:
+def test_an_advertised_address_is_a_host_with_or_without_port_or_a_url(
+    advertised: str, url: str
+) -> None:
     assert parse_advertised_url(advertised, 8000) == url
 
 
 @pytest.mark.parametrize(
     "wrong", ["", " ", "a b", "ftp://x", "x:y", "x@y", "lab/path", "[fd00", "x:99999", "http://"]
 )
-def test_what_is_no_address_to_show_is_refused(wrong: str) -> None:
+def test_a_wrong_advertised_address_is_refused(wrong: str) -> None:
     with pytest.raises(UsageError, match="--advertise"):
         parse_advertised_url(wrong, 8000)
 
 
-def test_localhost_is_shown_as_the_address_that_is_listened_on(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Its name leads to ::1 first on many machines, where another program may listen."""
-    real = socket.getaddrinfo
+def test_localhost_is_shown_as_its_address(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On many machines its name leads to ::1 first, where another program may listen."""
+    find = socket.getaddrinfo
 
-    def both(host: str, port: int, **options: Any) -> list[Any]:
-        return [*real("::1", port, **options), *real("127.0.0.1", port, **options)]
+    def find_both(host: str, port: int, **options: Any) -> list[Any]:
+        return [*find("::1", port, **options), *find("127.0.0.1", port, **options)]
 
-    monkeypatch.setattr(socket, "getaddrinfo", both)
+    monkeypatch.setattr(socket, "getaddrinfo", find_both)
     with open_listening_socket("localhost", 0) as listening:
         port = listening.getsockname()[1]
         assert list_urls(listening, "localhost") == [f"http://127.0.0.1:{port}"]
 
 
-def test_everywhere_is_ipv4_too() -> None:
+def test_a_socket_on_all_addresses_accepts_ipv4_and_ipv6() -> None:
     with open_listening_socket("::", 0) as listening:
         port = listening.getsockname()[1]
         assert list_urls(listening, "::")[-1] == f"http://127.0.0.1:{port}"
@@ -142,6 +136,128 @@ def test_everywhere_is_ipv4_too() -> None:
 @pytest.mark.parametrize(
     ("host", "word"), [("192.0.2.77", "--host"), ("fe80::1", "zone"), ("no-host.invalid", "--host")]
 )
-def test_an_address_that_is_not_this_machines_is_said(host: str, word: str) -> None:
+def test_an_address_of_another_machine_is_refused(host: str, word: str) -> None:
     with pytest.raises(LinkError, match=word):
         open_listening_socket(host, 0)
+
+
+def test_a_token_is_created_once_for_its_owner(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    token = load_or_create_token(None, data)
+    assert len(token) >= 20
+    assert stat.S_IMODE((data / "token").stat().st_mode) == 0o600
+    assert load_or_create_token(None, data) == token
+    assert load_or_create_token("given", data) == "given"
+
+
+@pytest.mark.parametrize("given", ["", None], ids=["in the environment", "in the file"])
+def test_an_empty_token_is_replaced(tmp_path: Path, given: str | None) -> None:
+    # FOOTTILE_TOKEN= must not open the server; a power cut leaves a file created and not written.
+    if given is None:
+        (tmp_path / "token").touch(mode=0o600)
+    assert load_or_create_token(given, tmp_path)
+
+
+# --- in namespaces of networks --------------------------------------------------------------------
+
+URLS = """
+import json
+from service.api.address import open_listening_socket, list_urls
+host, advertised = %r, %r
+with open_listening_socket(host, 8000) as listening:
+    print(json.dumps(list_urls(listening, host, advertised)))
+"""
+
+
+def list_urls_in(
+    interfaces: dict[str, str],
+    host: str = "0.0.0.0",  # noqa: S104  # in a namespace
+    advertised: str | None = None,
+) -> list[str]:
+    urls: list[str] = json.loads(run_in_network(interfaces, URLS % (host, advertised)))
+    return [url.removeprefix("http://").removesuffix(":8000") for url in urls]
+
+
+@needs_networks
+@pytest.mark.parametrize(
+    ("interfaces", "expected"),
+    [
+        ({"wlan0": "192.168.4.1/24"}, ["192.168.4.1"]),
+        ({"eth0": "169.254.10.20/16"}, ["169.254.10.20"]),
+        (
+            {"docker0": "172.17.0.1/16", "eth0": "203.0.113.5/24", "ap0": "10.42.0.1/24"},
+            ["10.42.0.1", "203.0.113.5", "172.17.0.1"],
+        ),
+        ({}, []),
+    ],
+    ids=[
+        "a hotspot alone",
+        "a cable between two machines",
+        "hotspot, Internet, containers",
+        "none",
+    ],
+)
+def test_every_address_is_shown(interfaces: dict[str, str], expected: list[str]) -> None:
+    assert list_urls_in(interfaces) == [*expected, "127.0.0.1"]
+
+
+@needs_networks
+def test_a_cable_without_ipv4_has_an_address_with_its_zone() -> None:
+    first, *others = list_urls_in({"eth7": ""}, "::")
+    assert first.startswith("[fe80::")
+    assert first.endswith("%25eth7]")
+    assert others == ["127.0.0.1"]
+
+
+@needs_networks
+def test_an_advertised_address_replaces_the_others() -> None:
+    urls = list_urls_in({"eth0": "172.17.0.2/16"}, advertised="robot.local")
+    assert urls == ["robot.local", "127.0.0.1"]
+
+
+SERVED = """
+import asyncio, os, subprocess, sys
+import foottile
+from service.node.server_connection import connect_tcp, make_ingest_url
+
+os.environ.pop("FOOTTILE_TOKEN", None)
+words = [sys.executable, "-c", "from service.cli.main import main; main()"]
+serve = subprocess.Popen(
+    [*words, "serve", "--host", "::", "--port", "8000", "--data", os.environ["DATA"]],
+    stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+)
+try:
+    urls = [serve.stdout.readline().split()[-1].rstrip("/") for _ in range(3)]
+    print(*urls)
+    token = open(os.environ["DATA"] + "/token").read()
+    for url in urls:
+        with foottile.connect(url, token) as server:
+            print(server.nodes(), len(server.create_invite()["urls"]))
+            try:
+                next(server.live("nobody"))
+            except foottile.UsageError as error:
+                print("no node" if "nobody" in str(error) else error)
+        asyncio.run(connect_tcp(make_ingest_url(url))).close()
+    ticket = subprocess.run(
+        [*words, "invite", "--data", os.environ["DATA"]], capture_output=True, text=True
+    )
+    print(ticket.stdout.partition("#")[0])
+finally:
+    serve.terminate()
+    print(serve.communicate(timeout=60.0)[1])
+"""
+
+
+@needs_networks
+@pytest.mark.process
+def test_client_and_node_reach_every_address(tmp_path: Path) -> None:
+    lines = run_in_network(
+        {"wlan0": "192.168.4.1/24"}, SERVED, DATA=str(tmp_path / "data")
+    ).splitlines()
+    hotspot, cable, own = lines[0].split()
+    assert hotspot == "http://192.168.4.1:8000"
+    assert cable.startswith("http://[fe80::")
+    assert cable.endswith("%25wlan0]:8000")
+    assert own == "http://127.0.0.1:8000"
+    assert lines[1:7] == ["[] 3", "no node"] * 3
+    assert lines[7] == "http://192.168.4.1:8000/"  # of a ticket

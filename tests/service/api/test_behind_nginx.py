@@ -1,4 +1,4 @@
-"""A server behind a real nginx on its own machine: bare, and as docs/security.md has it."""
+"""A real nginx in front of a server: bare, and with the configuration of docs/security.md."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def free_port() -> int:
 
 @pytest.fixture
 def nginx(tmp_path: Path) -> Iterator[Proxy]:
-    """Starts nginx with these servers in its configuration, once it answers at a port."""
+    """Start nginx with servers in its configuration, and wait until it answers at a port."""
     started: list[subprocess.Popen[bytes]] = []
 
     def start(servers: str, port: int) -> int:
@@ -74,8 +74,8 @@ def answers(port: int) -> bool:
     return False
 
 
-def documented(folder: Path, *, listen: int, port: int) -> str:
-    """The configuration of docs/security.md, with this test's ports and certificate."""
+def make_configuration(folder: Path, *, listen: int, port: int) -> str:
+    """Return the configuration of docs/security.md with this test's ports and certificate."""
     text = (ROOT / "docs" / "security.md").read_text("utf-8")
     (found,) = re.findall(r"```nginx\n(.*?)```", text, re.DOTALL)
     for old, new in (
@@ -97,24 +97,22 @@ def bare(running: Running, nginx: Proxy) -> str:
     return f"http://127.0.0.1:{nginx(servers, port)}"
 
 
-def test_through_a_bare_proxy_nobody_changes_anything_without_the_token(
-    running: Running, bare: str
-) -> None:
-    with httpx.Client(base_url=f"{bare}/api/v1", trust_env=False) as anybody:
-        assert_refused(anybody.delete("/trash"), 401, "token", "foottile invite")
-        assert anybody.post("/sessions", json={"node": "x", "name": "x"}).status_code == 401
-        assert anybody.post("/tickets", json={}).status_code == 401
-        assert anybody.get("/sessions").status_code == 200
+def test_a_bare_proxy_gives_no_right(running: Running, bare: str) -> None:
+    with httpx.Client(base_url=f"{bare}/api/v1", trust_env=False) as client:
+        assert_refused(client.delete("/trash"), 401, "token", "foottile invite")
+        assert client.post("/sessions", json={"node": "x", "name": "x"}).status_code == 401
+        assert client.post("/tickets", json={}).status_code == 401
+        assert client.get("/sessions").status_code == 200
         # A page's change names the proxy's own address, which the proxy does not pass on.
         headers = SHARED_BEARER | {"Origin": bare}
-        assert_refused(anybody.delete("/trash", headers=headers), 403, "Host header")
-        assert anybody.delete("/trash", headers=SHARED_BEARER).status_code == 200
+        assert_refused(client.delete("/trash", headers=headers), 403, "Host header")
+        assert client.delete("/trash", headers=SHARED_BEARER).status_code == 200
     assert running.http.get("/trash").json()["items"] == []
 
 
 @pytest.fixture
 def tls(tmp_path: Path) -> ssl.SSLContext:
-    """Trusts the certificate that is made for the proxy."""
+    """A context that trusts the certificate of the proxy."""
     certificate = tmp_path / "foottile.pem"
     words = ("req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
     named = ("-subj", "/CN=foottile", "-addext", "subjectAltName=IP:127.0.0.1", "-days", "2")
@@ -125,7 +123,7 @@ def tls(tmp_path: Path) -> ssl.SSLContext:
 
 @pytest.fixture
 def behind(serve_with: ServeWith) -> Running:
-    """A server that trusts the proxy on its own machine, as the document has it started."""
+    """A server that trusts the proxy, with the options of the document."""
     return serve_with(bounds=LimitSettings.model_validate({"trusted_proxy": ["127.0.0.1"]}))
 
 
@@ -133,33 +131,34 @@ def behind(serve_with: ServeWith) -> Running:
 def site(behind: Running, nginx: Proxy, tls: ssl.SSLContext, tmp_path: Path) -> str:
     """Address of the documented proxy."""
     port = free_port()
-    return f"https://127.0.0.1:{nginx(documented(tmp_path, listen=port, port=behind.port), port)}"
+    servers = make_configuration(tmp_path, listen=port, port=behind.port)
+    return f"https://127.0.0.1:{nginx(servers, port)}"
 
 
-def test_as_documented_people_log_in_record_watch_and_download(
+def test_a_documented_proxy_passes_logins_recordings_live_data_and_downloads(
     behind: Running, site: str, tls: ssl.SSLContext, node_of: NodeOf
 ) -> None:
     node = node_of(behind)
     node.connect()
     node.tared()
     ticket = behind.link().partition("#ticket=")[2]
-    with httpx.Client(base_url=f"{site}/api/v1", verify=tls, trust_env=False) as anybody:
-        assert_refused(anybody.delete("/trash"), 401, "token")
-        anybody.headers["Origin"] = site
-        answer = anybody.post("/login", json={"ticket": ticket})
+    with httpx.Client(base_url=f"{site}/api/v1", verify=tls, trust_env=False) as client:
+        assert_refused(client.delete("/trash"), 401, "token")
+        client.headers["Origin"] = site
+        answer = client.post("/login", json={"ticket": ticket})
         assert answer.status_code == 200, answer.text
         assert "Secure" in answer.headers["set-cookie"]
-        begun = anybody.post("/sessions", json={"node": "bench", "name": "through the proxy"})
+        begun = client.post("/sessions", json={"node": "bench", "name": "through the proxy"})
         assert begun.status_code == 201, begun.text
         recording = behind.session(begun.json()["id"])
         node.deliver(50)
-        assert anybody.post(f"{recording.url}/stop").status_code == 200
+        assert client.post(f"{recording.url}/stop").status_code == 200
         node.send(10, now=True)
         recording.sealed()
-        downloaded = anybody.get(f"{recording.url}/data", params={"format": "parquet"})
+        downloaded = client.get(f"{recording.url}/data", params={"format": "parquet"})
         assert downloaded.content[:4] == b"PAR1"
         assert_refused(
-            anybody.delete("/trash", headers={"Origin": site.replace("https", "http")}),
+            client.delete("/trash", headers={"Origin": site.replace("https", "http")}),
             *(403, "another site"),
         )
     address = site.replace("https", "wss")
@@ -173,12 +172,12 @@ def test_as_documented_people_log_in_record_watch_and_download(
     assert refused.value.response.status_code == 401
 
 
-def test_as_documented_a_client_cannot_choose_its_own_address(
+def test_a_client_of_a_documented_proxy_cannot_choose_its_address(
     serve_with: ServeWith, nginx: Proxy, tls: ssl.SSLContext, tmp_path: Path
 ) -> None:
     one = {"max_connections_per_address": 1, "trusted_proxy": ["127.0.0.1"]}
     running, port = serve_with(bounds=LimitSettings.model_validate(one)), free_port()
-    nginx(documented(tmp_path, listen=port, port=running.port), port)
+    nginx(make_configuration(tmp_path, listen=port, port=running.port), port)
     address = f"wss://127.0.0.1:{port}{LIVE_PATH}"
     with connect(address, ssl=tls, proxy=None) as live:
         assert "hello" in live.recv(timeout=PATIENCE_S)

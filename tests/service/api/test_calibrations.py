@@ -1,4 +1,4 @@
-"""Calibrations over REST: uploaded, listed, downloaded, fitted here, and used for a node."""
+"""Calibrations over REST: uploaded, assigned to a node, and fitted from sessions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from service.estimation.calibration import UNPROVEN_SUFFIX, Calibration
-from service.server import calibrations as book
+from service.server import calibrations
 from service.sessions.calibration_file import encode_calibration, parse_calibration
 from service.sessions.sealing import rebuild_damaged_session_json
 from storage.sessions.folder import SessionsFolder
@@ -22,179 +22,158 @@ from tests.service.recording import Recording
 from tests.service.running import Running, ServeWith, assert_refused
 from tests.waiting import until
 
-NONE = "0" * 16
+UNKNOWN = "0" * 16
+ASSIGNED = "/nodes/bench/calibration"
 
 
 def stiffer(*serials: str, name: str = "stiffer") -> Calibration:
-    """Twice the newtons for a pressure."""
+    """Return a calibration with twice the force of the usual one."""
     made = make_calibration(*serials)
     tiles = tuple(tile.model_copy(update={"f_scale_n": 2 * tile.f_scale_n}) for tile in made.tiles)
     return made.model_copy(update={"tiles": tiles, "name": name})
 
 
 def upload(running: Running, content: bytes | Calibration) -> httpx.Response:
-    sent = encode_calibration(content) if isinstance(content, Calibration) else content
+    if isinstance(content, Calibration):
+        content = encode_calibration(content)
     headers = {"Content-Type": "application/json"}
-    return running.http.post("/calibrations", content=sent, headers=headers)
+    return running.http.post("/calibrations", content=content, headers=headers)
 
 
-def listed(running: Running) -> list[dict[str, Any]]:
+def list_all(running: Running) -> list[dict[str, Any]]:
     items: list[dict[str, Any]] = running.http.get("/calibrations").json()["items"]
     return items
 
 
-def test_a_file_is_uploaded_listed_and_downloaded_as_it_was_also_after_a_restart(
-    running: Running, tmp_path: Path
-) -> None:
+def damage(path: Path) -> None:
+    path.write_bytes(path.read_bytes().replace(b"stiffer", b"stiffes"))
+
+
+def test_an_uploaded_file_is_listed_and_downloaded_unchanged(running: Running) -> None:
     calibration = stiffer("T01", "T02")
     answer = upload(running, calibration)
     assert answer.status_code == 201, answer.text
     url = f"/calibrations/{calibration.id}"
     assert answer.headers["location"] == f"/api/v1{url}"
-    said = answer.json()
-    assert (said["id"], said["name"], said["serials"]) == (
-        calibration.id,
-        "stiffer",
-        ["T01", "T02"],
-    )
-    assert upload(running, calibration).json() == said
+    facts = answer.json()
+    expected = {"id": calibration.id, "name": "stiffer", "serials": ["T01", "T02"]}
+    assert {name: facts[name] for name in expected} == expected
+    assert upload(running, calibration).json() == facts
     running.restart()
-    assert listed(running) == [said]
+    assert list_all(running) == [facts]
     got = running.http.get(url)
     assert got.content == encode_calibration(calibration)
     assert parse_calibration(got.content, where="here") == calibration
-    matching = {"If-None-Match": got.headers["etag"]}
-    assert running.http.get(url, headers=matching).status_code == 304
+    known = {"If-None-Match": got.headers["etag"]}
+    assert running.http.get(url, headers=known).status_code == 304
     assert running.http.delete(url).status_code == 204
-    assert listed(running) == []
+    assert list_all(running) == []
     for method in ("GET", "DELETE"):
         assert_refused(running.http.request(method, url), 404, calibration.id)
+    by_hand = json.dumps(stiffer("T01").model_dump(mode="json")).encode()
+    assert upload(running, by_hand).json()["name"] == "stiffer" + UNPROVEN_SUFFIX
 
 
-def test_one_that_was_written_by_hand_is_called_unproven(running: Running) -> None:
-    content = json.dumps(stiffer("T01").model_dump(mode="json")).encode()
-    assert upload(running, content).json()["name"] == "stiffer" + UNPROVEN_SUFFIX
+WHOLE = encode_calibration(stiffer("T01"))
+PLAIN = stiffer("T01").model_dump(mode="json")
+TILE = PLAIN["tiles"][0]
 
 
-def broken() -> dict[str, bytes]:
-    whole = encode_calibration(stiffer("T01"))
-    plain = stiffer("T01").model_dump(mode="json")
-    tile = plain["tiles"][0]
-    return {
-        "nothing": b"",
-        "no JSON": b"{",
-        "a list": b"[]",
-        "a flipped bit": whole.replace(b"stiffer", b"stiffes"),
-        "cut off": whole[:-40],
-        "an unknown field": json.dumps(plain | {"colour": "red"}).encode(),
-        "an unknown field of a tile": json.dumps(
-            plain | {"tiles": [tile | {"gain": 2.0}]}
-        ).encode(),
-        "a number that is none": json.dumps(
-            plain | {"tiles": [tile | {"f_scale_n": float("nan")}]}
-        ).encode(),
-        "no text": json.dumps(plain | {"name": 5}).encode(),
-        "a deep one": b"[" * 100_000,
-        "bytes": bytes(range(256)),
-        "another id": json.dumps(plain | {"id": NONE}).encode(),
-    }
+@pytest.mark.parametrize(
+    "content",
+    [
+        *(b"", b"{", b"[]", b"[" * 100_000, bytes(range(256)), WHOLE[:-40]),
+        WHOLE.replace(b"stiffer", b"stiffes"),
+        PLAIN | {"colour": "red"},
+        PLAIN | {"tiles": [TILE | {"gain": 2.0}]},
+        PLAIN | {"tiles": [TILE | {"f_scale_n": float("nan")}]},
+        PLAIN | {"name": 5},
+        PLAIN | {"id": UNKNOWN},
+    ],
+    ids=[
+        *("empty", "a part of JSON", "a list", "nested", "bytes", "cut off", "a flipped bit"),
+        *("an unknown field", "an unknown field of a tile", "NaN", "a number as name", "its id"),
+    ],
+)
+def test_a_wrong_file_is_refused(shared: Running, content: bytes | dict[str, Any]) -> None:
+    is_wrong_id = isinstance(content, dict) and content.get("id") == UNKNOWN
+    answer = upload(shared, content if isinstance(content, bytes) else json.dumps(content).encode())
+    assert_refused(answer, 422, "its id says" if is_wrong_id else "not a calibration")
+    assert list_all(shared) == []
+    assert not (shared.data / "calibrations").exists()
 
 
-def test_what_is_no_calibration_is_refused_and_leaves_nothing(running: Running) -> None:
-    for what, content in broken().items():
-        answer = upload(running, content)
-        says = "its id says" if what == "another id" else "not a calibration"
-        assert_refused(answer, 422, says)
-    assert listed(running) == []
-    assert not (running.data / "calibrations").exists()
-
-
-def test_files_that_are_too_long_or_too_many_are_refused(
+def test_size_and_number_of_files_are_limited(
     running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert upload(running, b" " * (book.CONTENT_BYTES_MAX + 1)).status_code == 413
-    monkeypatch.setattr(book, "CALIBRATIONS_MAX", 1)
+    assert upload(running, b" " * (calibrations.CONTENT_BYTES_MAX + 1)).status_code == 413
+    monkeypatch.setattr(calibrations, "CALIBRATIONS_MAX", 1)
     assert upload(running, stiffer("T01")).status_code == 201
     assert_refused(upload(running, stiffer("T02")), 409, "keeps 1 calibrations")
     assert upload(running, stiffer("T01")).status_code == 201
 
 
-def test_one_that_is_damaged_on_the_disk_is_set_aside_and_said(running: Running) -> None:
+def test_a_damaged_file_is_set_aside_and_reported(running: Running) -> None:
     calibration = stiffer("T01")
     upload(running, calibration)
-    path = running.data / "calibrations" / f"{calibration.id}.json"
-    path.write_bytes(path.read_bytes().replace(b"stiffer", b"stiffes"))
-    assert_refused(running.http.get(f"/calibrations/{calibration.id}"), 409, "Upload it again")
+    damage(running.data / "calibrations" / f"{calibration.id}.json")
+    answer = running.http.get(f"/calibrations/{calibration.id}")
+    assert_refused(answer, 409, "Upload it again")
     running.restart()
-    assert listed(running) == []
+    assert list_all(running) == []
     (problem,) = running.http.get("/health").json()["problems"]
     assert "damaged" in problem
     assert upload(running, calibration).status_code == 201
 
 
-# --- a node's ---------------------------------------------------------------------------------
+# --- assigned to a node ---------------------------------------------------------------------------
 
 
 def assign(running: Running, calibration: Calibration, **headers: str) -> httpx.Response:
     upload(running, calibration)
-    body = {"id": calibration.id}
-    return running.http.put("/nodes/bench/calibration", json=body, headers=headers)
+    return running.http.put(ASSIGNED, json={"id": calibration.id}, headers=headers)
 
 
-def middle_n(session: Recording) -> float:
-    """Of the last frames, which are all the same but for the least count."""
+def median_n(session: Recording) -> float:
+    """Return the force of the last frames, which differ by a count at most."""
     return float(np.median(session.column("grf_n")[-50:-10]))
 
 
-def test_what_is_assigned_counts_from_then_on_and_what_is_being_recorded_keeps_its_own(
+def test_an_assigned_calibration_counts_for_later_sessions(
     running: Running, tared: FakeNode
 ) -> None:
-    own = running.node()["calibration"]["id"]
+    node = running.node()
+    own, tare = node["calibration"]["id"], node["tare"]["id"]
     before = tared.record(name="before")
+    tared.deliver(300, [0.0, 0.0], alive=True)
     tared.deliver(100, [20.0, 60.0], alive=True)
     calibration = stiffer("T01", "T02")
-    said = assign(running, calibration)
-    assert said.status_code == 200, said.text
-    view = said.json()
-    assert (view["source"], view["calibration"]["id"], view["own_id"]) == (
-        "server",
-        calibration.id,
-        own,
-    )
+    answer = assign(running, calibration)
+    assert answer.status_code == 200, answer.text
+    view = answer.json()
+    ids = (view["source"], view["calibration"]["id"], view["own_id"])
+    assert ids == ("server", calibration.id, own)
+    node = running.node()
+    assert (node["tare"]["id"], node["calibration_problem"]) == (tare, None)
     after = tared.record(name="after")
     tared.deliver(200, [20.0, 60.0], alive=True)
     first, second = tared.finish(before), tared.finish(after)
     assert (first["calibration_id"], first["calibration_source"]) == (own, "node")
     assert (second["calibration_id"], second["calibration_source"]) == (calibration.id, "server")
-    assert middle_n(after) == pytest.approx(2 * middle_n(before), rel=0.01)
-    made_again = restore_of(running, after)
-    assert (made_again["calibration_source"], made_again["calibration_id"]) == (
-        "server",
-        calibration.id,
-    )
+    assert median_n(after) == pytest.approx(2 * median_n(before), rel=0.01)
+    (after.folder / "session.json").unlink()
+    rebuilt = rebuild_damaged_session_json(SessionsFolder(running.data / "sessions"), after.id)
+    assert rebuilt is not None
+    assert (rebuilt.calibration_source, rebuilt.calibration_id) == ("server", calibration.id)
 
 
-def restore_of(running: Running, session: Recording) -> dict[str, Any]:
-    """What is made again of it from its sealed file alone."""
-    (session.folder / "session.json").unlink()
-    made = rebuild_damaged_session_json(SessionsFolder(running.data / "sessions"), session.id)
-    assert made is not None
-    return made.model_dump()
-
-
-def test_the_tare_and_the_last_seconds_outlive_the_change(
-    running: Running, tared: FakeNode
-) -> None:
-    tare = running.node()["tare"]["id"]
+def test_a_tare_needs_no_frame_after_an_assignment(running: Running, tared: FakeNode) -> None:
     tared.deliver(300, alive=True)
     assert assign(running, stiffer("T01", "T02")).status_code == 200
-    node = running.node()
-    assert (node["tare"]["id"], node["calibration_problem"]) == (tare, None)
-    # No frame has come since.
     assert running.http.post("/nodes/bench/tare").status_code == 201
 
 
-def test_the_choice_outlives_restarts_and_its_file_and_is_taken_back(
+def test_an_assignment_survives_restarts_and_its_file_until_it_is_undone(
     running: Running, tared: FakeNode
 ) -> None:
     own, calibration = running.node()["calibration"]["id"], stiffer("T01", "T02")
@@ -206,16 +185,15 @@ def test_the_choice_outlives_restarts_and_its_file_and_is_taken_back(
     tared.restart()
     tared.connect()
     assert running.node()["calibration"]["id"] == calibration.id
-    url = "/nodes/bench/calibration"
     for _ in range(2):
-        view = running.http.delete(url).json()
+        view = running.http.delete(ASSIGNED).json()
         assert (view["source"], view["calibration"]["id"]) == ("node", own)
     tared.leave()
     running.restart()
-    assert running.http.get(url).json()["calibration"]["id"] == own
+    assert running.http.get(ASSIGNED).json()["calibration"]["id"] == own
 
 
-def test_a_node_without_a_calibration_of_its_own_gets_one(
+def test_a_node_without_calibration_is_tared_from_its_lead_after_an_assignment(
     running: Running, node_of: NodeOf
 ) -> None:
     node = node_of(running, calibration=None)
@@ -224,129 +202,124 @@ def test_a_node_without_a_calibration_of_its_own_gets_one(
     node.send(20)
     node.taken_in()
     assert running.node()["calibration_problem"] == "for this test"
-    refused = assign(running, stiffer("T01", "T02"), **{"If-Match": NONE})
+    refused = assign(running, stiffer("T01", "T02"), **{"If-Match": UNKNOWN})
     assert_refused(refused, 412, "changed by another client")
     view = assign(running, stiffer("T01", "T02"), **{"If-Match": "none"}).json()
     assert (view["problem"], view["own_id"]) == (None, None)
     node.send(20)
-    until(lambda: running.node()["tare"])  # by the lead, which nobody could look at before
+    until(lambda: running.node()["tare"])
 
 
-def test_two_people_do_not_overwrite_each_others_choice(running: Running, tared: FakeNode) -> None:
-    seen = running.node()["calibration"]["id"]
-    first = stiffer("T01", "T02", name="first")
-    assert assign(running, first, **{"If-Match": f'"{seen}"'}).status_code == 200
-    second = assign(running, stiffer("T01", "T02", name="second"), **{"If-Match": seen})
-    assert_refused(second, 412, "changed by another client")
-    back = running.http.delete("/nodes/bench/calibration", headers={"If-Match": seen})
-    assert_refused(back, 412, "changed by another client")
-    assert running.node()["calibration"]["name"] == "first"
-
-
-def test_what_does_not_fit_the_tiles_is_refused_and_changes_nothing(
+def test_an_assignment_needs_a_fitting_calibration_and_the_one_that_its_client_saw(
     running: Running, tared: FakeNode
 ) -> None:
     before = running.node()["calibration"]
-    assert_refused(
-        assign(running, stiffer("T01")), 422, "does not fit", "it covers T01, but not T02"
-    )
-    body = {"id": NONE}
-    assert_refused(running.http.put("/nodes/bench/calibration", json=body), 404, NONE)
+    refused = assign(running, stiffer("T01"))
+    assert_refused(refused, 422, "does not fit", "it covers T01, but not T02")
+    body = {"id": UNKNOWN}
+    assert_refused(running.http.put(ASSIGNED, json=body), 404, UNKNOWN)
     assert_refused(running.http.put("/nodes/nobody/calibration", json=body), 404, "nobody")
     assert running.node()["calibration"] == before
     assert not (running.data / "nodes" / "bench" / "assigned.json").exists()
+    first = stiffer("T01", "T02", name="first")
+    assert assign(running, first, **{"If-Match": f'"{before["id"]}"'}).status_code == 200
+    late = {"If-Match": before["id"]}
+    second = assign(running, stiffer("T01", "T02", name="second"), **late)
+    assert_refused(second, 412, "changed by another client")
+    undone = running.http.delete(ASSIGNED, headers=late)
+    assert_refused(undone, 412, "changed by another client")
+    assert running.node()["calibration"]["name"] == "first"
 
 
-def test_a_choice_that_is_damaged_is_no_other_ones(running: Running, tared: FakeNode) -> None:
+def test_a_damaged_assignment_is_replaced_by_no_other(running: Running, tared: FakeNode) -> None:
     assign(running, stiffer("T01", "T02"))
     tared.leave()
     running.stop()
-    path = running.data / "nodes" / "bench" / "assigned.json"
-    path.write_bytes(path.read_bytes().replace(b"stiffer", b"stiffes"))
-    for _ in range(2):  # set aside by the first start, missed by the second
+    damage(running.data / "nodes" / "bench" / "assigned.json")
+    for _ in range(2):  # the first start sets it aside, the second one misses it
         running.start()
-        view = running.http.get("/nodes/bench/calibration").json()
+        view = running.http.get(ASSIGNED).json()
         assert (view["source"], view["calibration"]) == ("server", None)
         assert "lost" in view["problem"]
         assert any("assigned" in text for text in running.http.get("/health").json()["problems"])
         running.stop()
     running.start()
-    back = running.http.delete("/nodes/bench/calibration").json()
-    assert (back["source"], back["problem"]) == ("node", None)
+    view = running.http.delete(ASSIGNED).json()
+    assert (view["source"], view["problem"]) == ("node", None)
     running.restart()
     assert running.node()["calibration_problem"] is None
 
 
-# --- fitted here ------------------------------------------------------------------------------
+# --- fitted from sessions -------------------------------------------------------------------------
 
 
 @pytest.fixture
-def with_bench(bench_cache: Path, tmp_path: Path, serve_with: ServeWith) -> Running:
-    """A server with a bench recording, sealed, with the mill's steps as markers."""
+def with_rig(bench_cache: Path, tmp_path: Path, serve_with: ServeWith) -> Running:
+    """A server with a sealed rig recording, whose steps are markers."""
     benches.put(benches.pressed(bench_cache), tmp_path / "data-0")
     return serve_with()
 
 
 def fit(running: Running, **body: object) -> httpx.Response:
-    asked = {"sessions": [benches.SESSION_ID], "name": "left, =leg", "reference": "the mill"}
-    return running.http.post("/calibrations/jobs", json=asked | body)
+    body = {"sessions": [benches.SESSION_ID], "name": "left, =leg", "reference": "a mill"} | body
+    return running.http.post("/calibrations/jobs", json=body)
 
 
-def ended(running: Running, begun: httpx.Response) -> dict[str, Any]:
-    assert begun.status_code == 202, begun.text
-    url = begun.headers["location"].removeprefix("/api/v1")
+def url_of(job: httpx.Response) -> str:
+    assert job.status_code == 202, job.text
+    return job.headers["location"].removeprefix("/api/v1")
+
+
+def wait_for_end(running: Running, job: httpx.Response) -> dict[str, Any]:
+    url = url_of(job)
     until(lambda: running.http.get(url).json()["state"] != "running", timeout_s=300.0)
-    said: dict[str, Any] = running.http.get(url).json()
-    return said
+    ended: dict[str, Any] = running.http.get(url).json()
+    return ended
 
 
 @pytest.mark.slow
 @pytest.mark.process
-def test_a_bench_session_is_fitted_here_and_what_cannot_be_says_why(with_bench: Running) -> None:
-    running = with_bench
-    begun = fit(running)
+def test_a_rig_session_is_fitted_or_the_fit_has_a_reason(with_rig: Running) -> None:
+    running = with_rig
+    job = fit(running)
     assert_refused(fit(running), 409, "left, =leg", "being fitted")
-    done = ended(running, begun)
+    done = wait_for_end(running, job)
     assert (done["state"], done["problem"]) == ("done", None), done
     assert any(line.startswith("tile T01, 1 of 1: curve to") for line in done["log"])
-    (kept,) = listed(running)
-    assert (kept["id"], kept["name"]) == (done["calibration_id"], "left, =leg")
-    assert (kept["reference"], kept["serials"]) == ("the mill", ["T01"])
-
-    session = running.http.get(f"/sessions/{benches.SESSION_ID}/markers").json()["items"]
-    step = next(marker for marker in session if marker["label"] == "T01 load")
-    url = f"/sessions/{benches.SESSION_ID}/markers/{step['id']}"
-    running.http.patch(url, json={"label": "T01 laod"})
-    failed = ended(running, fit(running))
+    (stored,) = list_all(running)
+    assert (stored["id"], stored["name"]) == (done["calibration_id"], "left, =leg")
+    assert (stored["reference"], stored["serials"]) == ("a mill", ["T01"])
+    url = f"/sessions/{benches.SESSION_ID}/markers"
+    markers = running.http.get(url).json()["items"]
+    step = next(marker for marker in markers if marker["label"] == "T01 load")
+    running.http.patch(f"{url}/{step['id']}", json={"label": "T01 laod"})
+    failed = wait_for_end(running, fit(running))
     assert failed["state"] == "failed"
     assert "'T01 laod' is no calibration step" in failed["problem"]
-    assert len(listed(running)) == 1
-    assert [one["state"] for one in running.http.get("/calibrations/jobs").json()["items"]] == [
-        "failed",
-        "done",
-    ]
+    assert len(list_all(running)) == 1
+    jobs = running.http.get("/calibrations/jobs").json()["items"]
+    assert [job["state"] for job in jobs] == ["failed", "done"]
 
 
 @pytest.mark.process
-def test_a_fit_is_cancelled_by_hand_and_by_the_end_of_the_server(with_bench: Running) -> None:
-    running = with_bench
-    begun = fit(running)
-    url = begun.headers["location"].removeprefix("/api/v1")
+def test_a_fit_is_cancelled_by_hand_and_by_the_end_of_the_server(with_rig: Running) -> None:
+    running = with_rig
+    url = url_of(fit(running))
     for _ in range(2):
         assert running.http.delete(url).json()["state"] == "cancelled"
     assert fit(running).status_code == 202
-    running.restart()  # which fails if a task or a thread is left over
-    assert listed(running) == []
+    running.restart()  # fails if a task or a thread is left over
+    assert list_all(running) == []
     assert_refused(running.http.get(url), 404, "since the server was started")
 
 
-def test_what_cannot_be_fitted_is_refused_at_once(
-    with_bench: Running, monkeypatch: pytest.MonkeyPatch
+def test_an_impossible_fit_is_refused_at_once(
+    with_rig: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    running, twice = with_bench, [benches.SESSION_ID] * 2
-    assert_refused(fit(running, sessions=twice), 422, "named twice")
+    running = with_rig
+    assert_refused(fit(running, sessions=[benches.SESSION_ID] * 2), 422, "named twice")
     assert_refused(fit(running, sessions=["20200101T000000Z-000000"]), 404, "20200101")
-    wrongs: tuple[dict[str, Any], ...] = (
+    wrong: tuple[dict[str, Any], ...] = (
         {"sessions": []},
         {"sessions": ["x"] * 33},
         {"name": ""},
@@ -354,8 +327,8 @@ def test_what_cannot_be_fitted_is_refused_at_once(
         {"reference_delay_ms": 1e9},
         {"out": "/etc/passwd"},
     )
-    for wrong in wrongs:
-        assert fit(running, **wrong).status_code == 422, wrong
-    monkeypatch.setattr("service.server.calibrations.FRAMES_MAX", 10)
+    for body in wrong:
+        assert fit(running, **body).status_code == 422, body
+    monkeypatch.setattr(calibrations, "FRAMES_MAX", 10)
     assert_refused(fit(running), 422, "at most 10 in one fit")
     assert running.http.get("/calibrations/jobs").json()["items"] == []

@@ -1,4 +1,4 @@
-"""Connected is who was heard of in the last five seconds, whatever happened to him."""
+"""Silent nodes: disconnected after five seconds, however the link ends."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from websockets.sync.client import ClientConnection
 from service.protocol import LINK_TIMEOUT_S
 from tests.faults.proxy import Proxy
 from tests.service.fake_node import FakeNode
-from tests.service.running import Running
+from tests.service.running import Running, assert_refused
 from tests.waiting import until
 
 pytestmark = pytest.mark.real_time
 
-LOOKING_S = 5.0
-"""What looking takes, beside other tests."""
+LOOK_S = 5.0
+"""A look takes this long beside other tests."""
 
 
 class Through:
-    """A server as it is reached over a link that may fail."""
+    """A server behind a link that may fail."""
 
     def __init__(self, running: Running, link: Proxy) -> None:
         self._running = running
@@ -38,7 +38,7 @@ class Through:
 
 @pytest.fixture
 def silence_s() -> float:
-    """As in a server that people use."""
+    """The product's own time-out."""
     return LINK_TIMEOUT_S
 
 
@@ -50,8 +50,8 @@ def link(running: Running) -> Iterator[Proxy]:
 
 @pytest.fixture
 def far(running: Running, link: Proxy) -> Iterator[FakeNode]:
-    """A tared node behind that link."""
-    node = FakeNode(Through(running, link))  # type: ignore[arg-type]  # reached another way
+    """A tared node behind the link."""
+    node = FakeNode(Through(running, link))  # type: ignore[arg-type]  # over the link
     node.connect()
     node.tared()
     yield node
@@ -59,48 +59,45 @@ def far(running: Running, link: Proxy) -> Iterator[FakeNode]:
     node.close()
 
 
-def away_after_s(running: Running, begin_s: float) -> float:
-    """Seconds from an instant on until the node is said to be away."""
+def wait_until_away_s(running: Running, begin_s: float) -> float:
+    """Return the seconds from an instant until the node is disconnected."""
     until(lambda: not running.node()["connected"], 2 * LINK_TIMEOUT_S)
     return time.monotonic() - begin_s
 
 
-def test_a_node_out_of_reach_is_away_five_seconds_after_its_last_word(
+def test_a_node_out_of_reach_is_away_five_seconds_after_its_last_message(
     running: Running, link: Proxy, far: FakeNode
 ) -> None:
     begin_s = time.monotonic()
     far.send(10)
     far.taken_in()
     link.black_hole()
-    assert LINK_TIMEOUT_S <= away_after_s(running, begin_s) < LINK_TIMEOUT_S + LOOKING_S
+    assert LINK_TIMEOUT_S <= wait_until_away_s(running, begin_s) < LINK_TIMEOUT_S + LOOK_S
     node = running.node()
     assert node["rate_hz"] is None
     refused = running.http.post("/sessions", json={"node": "bench", "name": "late"})
-    assert refused.status_code == 409
-    assert "sends no frames" in refused.json()["detail"]
+    assert_refused(refused, 409, "sends no frames")
 
 
-def test_a_node_that_takes_nothing_in_is_away_as_soon(
+def test_a_node_that_does_not_read_is_away_as_soon(
     running: Running, link: Proxy, far: FakeNode
 ) -> None:
-    # What the server owes it does not get through either: closing must not be waited for.
+    # The server's messages do not arrive, either, so the server must not wait for its close.
     far.send(200)
     running.call(lambda: running.server.links["bench"].queue_ack("0" * 32, far.acked))
     link.black_hole()
-    assert away_after_s(running, time.monotonic()) < LINK_TIMEOUT_S + LOOKING_S
+    assert wait_until_away_s(running, time.monotonic()) < LINK_TIMEOUT_S + LOOK_S
 
 
 def test_a_node_whose_process_is_killed_is_away_at_once(
     running: Running, link: Proxy, far: FakeNode
 ) -> None:
     begin_s = time.monotonic()
-    link.cut()  # the kernel of a killed process says RST
-    assert away_after_s(running, begin_s) < 0.5 + LOOKING_S
+    link.cut()  # the kernel of a killed process sends a reset
+    assert wait_until_away_s(running, begin_s) < 0.5 + LOOK_S
 
 
-def test_a_rate_is_of_the_last_second_and_none_when_nothing_comes(
-    running: Running, far: FakeNode
-) -> None:
+def test_a_rate_is_that_of_the_last_second(running: Running, far: FakeNode) -> None:
     far.send(200)
     far.taken_in()
     assert running.node()["rate_hz"] > 0.0

@@ -1,10 +1,14 @@
-"""Downloads: the stored file by ranges, and other formats as streams."""
+"""Downloads: the stored file by ranges, and every other format as a stream."""
 
 from __future__ import annotations
 
 import hashlib
 import io
+import threading
 from base64 import b64encode
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -14,11 +18,16 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
 
+from storage.formats.export import Export
+from storage.formats.writers.registry import FORMATS
 from tests.service.api.sealed import Sealed
-from tests.service.running import assert_refused
+from tests.service.fake_node import NodeOf
+from tests.service.running import Running, assert_refused
+from tests.storage.formats.writers.readers import said_in
+from tests.waiting import until
 
 
-def table_of(answer: httpx.Response, to: str) -> pa.Table:
+def read_table(answer: httpx.Response, to: str) -> pa.Table:
     assert answer.status_code == 200, answer.text
     match to:
         case "parquet":
@@ -29,161 +38,105 @@ def table_of(answer: httpx.Response, to: str) -> pa.Table:
             return pacsv.read_csv(io.BytesIO(answer.content))
 
 
-def test_the_whole_file_comes_as_it_is_stored(sealed: Sealed) -> None:
-    answer = sealed.get()
+def test_a_download_is_the_stored_file(sealed: Sealed) -> None:
+    answer = sealed.get_file()
     assert answer.status_code == 200
     assert answer.content == sealed.content
-    assert answer.headers["etag"] == f'"{sealed.sha256}"'
-    digest = b64encode(hashlib.sha256(answer.content).digest()).decode()
-    assert answer.headers["repr-digest"] == f"sha-256=:{digest}:"
-    assert answer.headers["content-length"] == str(len(sealed.content))
-    assert answer.headers["accept-ranges"] == "bytes"
-    assert answer.headers["foottile-complete"] == "true"
-    assert answer.headers["content-type"] == "application/vnd.apache.parquet"
+    sha256 = hashlib.sha256(answer.content)
+    assert sealed.session.now()["sha256"] == sha256.hexdigest()
+    expected = {
+        "etag": f'"{sha256.hexdigest()}"',
+        "repr-digest": f"sha-256=:{b64encode(sha256.digest()).decode()}:",
+        "content-length": str(len(sealed.content)),
+        "accept-ranges": "bytes",
+        "foottile-complete": "true",
+        "content-type": "application/vnd.apache.parquet",
+    }
+    assert {name: answer.headers[name] for name in expected} == expected
     assert f'filename="trial_{sealed.id}.parquet"' in answer.headers["content-disposition"]
     assert "immutable" in answer.headers["cache-control"]
-    assert sealed.session.now()["sha256"] == sealed.sha256
 
 
-def test_one_range_is_that_part_of_the_file(sealed: Sealed) -> None:
+def test_a_range_is_a_part_of_the_file(sealed: Sealed) -> None:
     size = len(sealed.content)
-    for asked, begin, end in (
-        ("bytes=0-0", 0, 1),
-        ("bytes=0-99", 0, 100),
-        ("bytes=100-199", 100, 200),
-        (f"bytes={size - 1}-", size - 1, size),
-        ("bytes=1000-", 1000, size),
-        ("bytes=0-", 0, size),
-        ("bytes=-1", size - 1, size),
-        ("bytes=-100", size - 100, size),
-        (f"bytes=-{size * 2}", 0, size),
-        (f"bytes=10-{size * 2}", 10, size),
+    for requested, begin, end in (
+        ("0-0", 0, 1),
+        ("100-199", 100, 200),
+        (f"{size - 1}-", size - 1, size),
+        ("0-", 0, size),
+        ("-1", size - 1, size),
+        ("-100", size - 100, size),
+        (f"-{size * 2}", 0, size),
+        (f"10-{size * 2}", 10, size),
     ):
-        answer = sealed.get(Range=asked)
-        assert answer.status_code == 206, asked
-        assert answer.content == sealed.content[begin:end], asked
-        assert answer.headers["content-range"] == f"bytes {begin}-{end - 1}/{size}", asked
-        assert answer.headers["content-length"] == str(end - begin), asked
-        assert answer.headers["etag"] == f'"{sealed.sha256}"', asked
+        answer = sealed.get_file(Range=f"bytes={requested}")
+        assert answer.status_code == 206, requested
+        assert answer.content == sealed.content[begin:end], requested
+        assert answer.headers["content-range"] == f"bytes {begin}-{end - 1}/{size}", requested
+        assert answer.headers["content-length"] == str(end - begin), requested
+        assert answer.headers["etag"] == f'"{sealed.session.now()["sha256"]}"', requested
 
 
-def test_a_range_outside_the_file_is_a_problem_that_says_its_size(sealed: Sealed) -> None:
+def test_a_range_outside_the_file_is_refused_with_its_size(sealed: Sealed) -> None:
     size = len(sealed.content)
-    for asked in (f"bytes={size}-", f"bytes={size + 5}-{size + 9}", "bytes=-0"):
-        answer = sealed.get(Range=asked)
-        assert answer.status_code == 416, asked
+    for requested in (f"bytes={size}-", f"bytes={size + 5}-{size + 9}", "bytes=-0"):
+        answer = sealed.get_file(Range=requested)
+        assert_refused(answer, 416, str(size))
         assert answer.headers["content-range"] == f"bytes */{size}"
-        assert answer.headers["content-type"] == "application/problem+json"
-        assert str(size) in answer.json()["detail"]
 
 
-def test_a_range_that_is_not_understood_or_several_is_ignored(sealed: Sealed) -> None:
-    for asked in (
-        "bytes=0-1,5-6",
-        "bytes=9-2",
-        "bytes=a-b",
-        "bytes=-",
-        "bytes",
-        "bytes=",
-        "lines=0-5",
-        "bytes=0-5-9",
-        "bytes=--5",
-        "bytes=\xb2-",
-        "bytes=" + "9" * 300 + "-",
-        "",
+@pytest.mark.parametrize(
+    "requested",
+    [
+        *("bytes=0-1,5-6", "bytes=9-2", "bytes=a-b", "bytes=-", "bytes", "bytes=", "lines=0-5", ""),
+        *("bytes=0-5-9", "bytes=--5", "bytes=\xb2-", "bytes=" + "9" * 300 + "-"),
+    ],
+)
+def test_a_wrong_range_and_several_ranges_are_ignored(sealed: Sealed, requested: str) -> None:
+    answer = sealed.get_file(Range=requested.encode("latin-1"))  # type: ignore[arg-type]  # no text
+    assert (answer.status_code, answer.content) == (200, sealed.content)
+
+
+def test_if_range_and_if_none_match_name_the_file(sealed: Sealed) -> None:
+    sha256 = sealed.session.now()["sha256"]
+    right = f'"{sha256}"'
+    for tag, is_range in (
+        (right, True),
+        ('"' + "0" * 64 + '"', False),
+        ("W/" + right, False),
+        ("Wed, 21 Oct 2015 07:28:00 GMT", False),
     ):
-        answer = sealed.get(Range=asked.encode("latin-1"))  # type: ignore[arg-type]  # no text
-        assert answer.status_code == 200, asked
-        assert answer.content == sealed.content, asked
-
-
-def test_a_range_holds_only_for_the_file_that_if_range_names(sealed: Sealed) -> None:
-    right = f'"{sealed.sha256}"'
-    for given, status in (
-        (right, 206),
-        ('"' + "0" * 64 + '"', 200),
-        ("W/" + right, 200),
-        ("Wed, 21 Oct 2015 07:28:00 GMT", 200),
+        answer = sealed.get_file(Range="bytes=0-9", **{"If-Range": tag})
+        assert answer.status_code == (206 if is_range else 200), tag
+        assert answer.content == (sealed.content[:10] if is_range else sealed.content), tag
+    for tags, is_known in (
+        (right, True),
+        (f"W/{right}", True),
+        (f'"a",W/{right} , "b"', True),
+        ("*", True),
+        (sha256, False),
+        ('"a", "b"', False),
     ):
-        answer = sealed.get(Range="bytes=0-9", **{"If-Range": given})
-        assert answer.status_code == status, given
-        assert answer.content == (sealed.content[:10] if status == 206 else sealed.content), given
-
-
-def test_what_one_has_already_is_not_sent(sealed: Sealed) -> None:
-    right = f'"{sealed.sha256}"'
-    for given, status in (
-        (right, 304),
-        (f"W/{right}", 304),
-        (f'"a", {right}', 304),
-        (f'"a",W/{right} , "b"', 304),
-        ("*", 304),
-        ('"a"', 200),
-        (sealed.sha256, 200),
-        ('"a", "b"', 200),
-    ):
-        answer = sealed.get(**{"If-None-Match": given})
-        assert answer.status_code == status, given
+        answer = sealed.get_file(**{"If-None-Match": tags})
+        assert answer.status_code == (304 if is_known else 200), tags
         assert answer.headers["etag"] == right
-        assert answer.content == (b"" if status == 304 else sealed.content)
-
-
-def test_head_says_what_get_would_and_sends_nothing(sealed: Sealed) -> None:
-    got, head = sealed.get(), sealed.get("HEAD")
-    assert head.status_code == 200
-    assert head.content == b""
-    ignored = {"date"}
-    assert {k: v for k, v in head.headers.items() if k not in ignored} == {
-        k: v for k, v in got.headers.items() if k not in ignored
-    }
-
-
-def test_head_of_what_is_made_says_what_get_would(sealed: Sealed) -> None:
-    url = f"/sessions/{sealed.id}/data?format=csv"
-    got, head = sealed.running.http.get(url), sealed.running.http.head(url)
-    assert head.status_code == 200
-    assert head.content == b""
-    for name in ("etag", "content-type", "content-disposition", "foottile-complete"):
-        assert head.headers[name] == got.headers[name]
+        assert answer.content == (b"" if is_known else sealed.content)
 
 
 @pytest.mark.parametrize("to", ["parquet", "arrow", "csv"])
-def test_a_slice_has_the_rows_and_columns_asked_for(sealed: Sealed, to: str) -> None:
+def test_a_slice_has_the_requested_rows_and_columns(sealed: Sealed, to: str) -> None:
     whole = pq.read_table(io.BytesIO(sealed.content))
-    answer = sealed.made(format=to, start_s=0.1, end_s=0.2, columns="seq,force_n, pressure_raw_1")
-    found = table_of(answer, to)
+    answer = sealed.export(format=to, start_s=0.1, end_s=0.2, columns="seq,force_n, pressure_raw_1")
+    found = read_table(answer, to)
     assert found.column_names == ["seq", "force_n_0", "force_n_1", "pressure_raw_1"]
     assert found["seq"].to_pylist() == list(range(70 + 50, 70 + 100))
     for name in found.column_names:
-        np.testing.assert_allclose(
-            found[name].to_numpy(), whole[name].to_numpy()[50:100], rtol=1e-6, err_msg=name
-        )
+        np.testing.assert_allclose(found[name], whole[name][50:100], rtol=1e-6, err_msg=name)
     assert answer.headers["etag"].startswith('"')
     assert answer.headers["accept-ranges"] == "none"
 
 
-@pytest.mark.parametrize("to", ["arrow", "csv"])
-def test_another_format_of_the_whole_has_the_same_values(sealed: Sealed, to: str) -> None:
-    whole = pq.read_table(io.BytesIO(sealed.content))
-    found = table_of(sealed.made(format=to), to)
-    made = ["marker", "time_s", "time_utc", *(["about"] if to == "csv" else [])]
-    assert sorted(found.column_names) == sorted([*whole.column_names, *made])
-    for name in ("seq", "t_ns", "pressure_raw_0", "part", "force_n_1", "grf_n"):
-        np.testing.assert_allclose(
-            found[name].to_numpy(), whole[name].to_numpy(), rtol=1e-6, err_msg=name
-        )
-
-
-def test_a_slice_that_begins_after_the_end_or_ends_before_it_begins_is_refused(
-    sealed: Sealed,
-) -> None:
-    for to in ("parquet", "arrow", "csv"):
-        assert_refused(sealed.made(format=to, start_s=100), 422, "starts at 100 s", "ends at")
-        assert_refused(sealed.made(format=to, start_s=2, end_s=1), 422, "ends at 1 s")
-    assert_refused(sealed.made(sealed.recording, format="csv", start_s=100), 422, "starts at")
-
-
-def test_queries_that_ask_for_different_data_have_different_tags(sealed: Sealed) -> None:
+def test_different_data_have_different_tags(sealed: Sealed) -> None:
     queries: tuple[dict[str, Any], ...] = (
         {"format": "csv"},
         {"format": "arrow"},
@@ -191,104 +144,123 @@ def test_queries_that_ask_for_different_data_have_different_tags(sealed: Sealed)
         {"format": "csv", "end_s": 0.1},
         {"format": "csv", "start_s": 0.1},
     )
-    tags = [sealed.made(**query).headers["etag"] for query in queries]
+    tags = [sealed.export(**query).headers["etag"] for query in queries]
     assert len(set(tags)) == len(queries)
-    assert sealed.made(**queries[0]).headers["etag"] == tags[0]
-    answer = sealed.running.http.get(
-        f"/sessions/{sealed.id}/data", params=queries[0], headers={"If-None-Match": tags[0]}
-    )
-    assert answer.status_code == 304
+    assert sealed.export(**queries[0]).headers["etag"] == tags[0]
+    url, known = f"{sealed.session.url}/data", {"If-None-Match": tags[0]}
+    assert sealed.running.http.get(url, params=queries[0], headers=known).status_code == 304
 
 
-def test_parquet_of_a_recording_session_is_not_there_yet(sealed: Sealed) -> None:
-    for query in ({}, {"format": "parquet"}, {"columns": "seq"}):
-        assert_refused(sealed.made(sealed.recording, **query), 409, "csv")
+def test_a_file_has_the_name_and_seconds_of_its_trial(sealed: Sealed) -> None:
+    answer = sealed.export(sealed.recording, format="csv", start_s=0.05, columns="grf_n")
+    name = f"nder-..-3rd-trial_{sealed.recording.id}_0.050s-to-end.csv"
+    assert answer.headers["content-disposition"] == f'attachment; filename="{name}"'
 
 
-def test_a_file_is_named_after_the_trial_and_its_seconds(sealed: Sealed) -> None:
-    changed = {"name": "Ünder/..\\ 3rd trial\r\n"}
-    answer = sealed.session.running.http.patch(
-        sealed.session.url,
-        json=changed,
-        headers={"If-Match": f'"{sealed.session.now()["revision"]}"'},
-    )
-    assert answer.status_code == 200, answer.text
-    made = sealed.made(sealed.session, format="csv", start_s=0.25, columns="grf_n")
-    name = f"nder-..-3rd-trial_{sealed.id}_0.250s-to-end.csv"
-    assert made.headers["content-disposition"] == f'attachment; filename="{name}"'
-
-
-@pytest.mark.parametrize("to", ["arrow", "csv"])
-def test_a_recording_session_gives_what_there_is(sealed: Sealed, to: str) -> None:
-    answer = sealed.made(sealed.recording, format=to)
+@pytest.mark.parametrize("to", FORMATS)
+def test_a_recording_session_is_incomplete_in_a_format_or_waits(sealed: Sealed, to: str) -> None:
+    answer = sealed.export(sealed.recording, format=to)
+    if FORMATS[to].needs_sealed:
+        assert_refused(answer, 409, "is recording", "when it is sealed", "Stop it")
+        return
+    (facts,) = said_in(to, answer.content)
+    assert facts["complete"].lower().startswith(("false", "not complete"))
     assert answer.headers["foottile-complete"] == "false"
     assert answer.headers["etag"].startswith('W/"')
-    found = table_of(answer, to)
-    assert found["seq"].to_pylist() == list(range(380, 430))
-    assert found["force_n_0"].to_numpy()[20:40] == pytest.approx(np.full(20, 5.0), abs=0.1)
+    if to in ("arrow", "csv"):
+        found = read_table(answer, to)
+        assert found["seq"].to_pylist() == list(range(380, 430))
+        assert found["force_n_0"].to_numpy()[20:40] == pytest.approx(np.full(20, 5.0), abs=0.1)
 
 
-@pytest.mark.parametrize(("to", "ending"), [("c3d", "c3d"), ("opensim", "opensim.zip")])
-def test_files_of_motion_laboratories_are_of_sealed_and_of_recording_sessions(
-    sealed: Sealed, to: str, ending: str
+def test_parquet_waits_for_the_seal(sealed: Sealed) -> None:
+    for query in ({}, {"format": "parquet"}, {"columns": "seq"}):
+        assert_refused(sealed.export(sealed.recording, **query), 409, "csv")
+
+
+def test_a_session_with_losses_or_without_forces_is_so_in_every_format(
+    running: Running, node_of: NodeOf
 ) -> None:
-    for session in (sealed.session, sealed.recording):
-        answer = sealed.made(session, format=to)
-        assert answer.status_code == 200, answer.text
-        begin = {"c3d": b"\x02\x50", "opensim": b"PK\x03\x04"}[to]
-        assert answer.content.startswith(begin)
-        name = f'filename="trial_{session.id}.{ending}"'
-        assert name in answer.headers["content-disposition"]
-    for query, said in (
-        ({"columns": "grf_n"}, "fixed columns"),
-        ({"start_s": 100}, "starts at 100 s"),
-        ({"decimal": "comma"}, "no option"),
-    ):
-        assert_refused(sealed.made(format=to, **query), 422, said)
+    raw, lossy = node_of(running, "raw", calibration=None), node_of(running, "lossy")
+    raw.connect()
+    raw.deliver(70)
+    lossy.connect()
+    lossy.tared()
+    sessions = {node: node.record() for node in (raw, lossy)}
+    raw.deliver(100, [20.0, 60.0])
+    lossy.deliver(50, [20.0, 60.0])
+    lossy.say_lost(disk_full=[[lossy.seq, lossy.seq + 19]])
+    lossy.frames(20)
+    lossy.deliver(50, [20.0, 60.0])
+    for node, session in sessions.items():
+        node.finish(session)
+    for to, known in FORMATS.items():
+        answer = sessions[lossy].data(format=to, markers=True)
+        assert answer.headers["foottile-complete"] == "lossy"
+        url = f"{sessions[raw].url}/data"
+        answer = running.http.get(url, params={"format": to, "markers": "true"})
+        if known.needs_forces:
+            assert_refused(answer, 422, "this session has none", "ask for its counts")
+        else:
+            assert answer.headers["foottile-complete"] == "true"
+
+
+def test_an_aborted_download_ends_its_encoder(
+    sealed: Sealed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended = threading.Event()
+
+    def encode_endlessly(_: Export) -> Iterator[bytes]:
+        try:
+            while True:
+                yield bytes(1 << 20)
+        finally:
+            ended.set()
+
+    monkeypatch.setitem(FORMATS, "csv", replace(FORMATS["csv"], encoder=encode_endlessly))
+    url, query = f"{sealed.session.url}/data", {"format": "csv", "start_s": "0.1"}
+    with sealed.running.http.stream("GET", url, params=query) as answer:
+        next(answer.iter_bytes())
+        assert not ended.is_set()
+    until(ended.is_set)
 
 
 @pytest.mark.parametrize(
-    "query",
+    ("query", "reason"),
     [
-        {"formats": "csv"},
-        {"format": "xlsx"},
-        {"format": "csv", "columns": "nonsense"},
-        {"format": "csv", "columns": "force_n_2"},
-        {"start_s": "-1"},
-        {"start_s": "nan"},
-        {"end_s": "inf"},
-        {"end_s": "0"},
-        {"start_s": "soon"},
-        {"start_s": "1e300"},
+        ({"formats": "csv"}, "formats"),
+        ({"format": "xlsx"}, "format"),
+        ({"format": "csv", "columns": "nonsense"}, "nonsense"),
+        ({"format": "csv", "columns": "force_n_2"}, "force_n_2"),
+        ({"format": "c3d", "columns": "grf_n"}, "fixed columns"),
+        ({"format": "c3d", "decimal": "comma"}, "no option"),
+        *[({"format": to, "start_s": 100}, "starts at 100 s") for to in FORMATS],
+        *[({"format": to, "start_s": 2, "end_s": 1}, "ends at 1 s") for to in FORMATS],
+        *[({"start_s": value}, "start_s") for value in ("-1", "nan", "soon", "1e300")],
+        *[({"end_s": value}, "end_s") for value in ("inf", "0")],
     ],
     ids=str,
 )
-def test_a_query_that_is_none_is_refused(sealed: Sealed, query: dict[str, Any]) -> None:
-    answer = sealed.made(**query)
-    assert answer.status_code == 422
-    assert answer.headers["content-type"] == "application/problem+json"
+def test_a_wrong_query_is_refused(sealed: Sealed, query: dict[str, Any], reason: str) -> None:
+    assert_refused(sealed.export(**query), 422, reason)
 
 
-def test_an_odd_id_is_not_found(sealed: Sealed) -> None:
-    for odd in (
-        "%2e%2e",
-        "%2e%2e%2f%2e%2e%2fetc%2fpasswd",
-        "..%5c..",
-        "20200101T000000Z-000000",
-        "20200101T000000Z-000000%00",
-        f"{sealed.id}%0a",
-        "x" * 5000,
-        "%ff",
+@pytest.mark.parametrize("rest", ["", "/data", "/markers", "/ledger"])
+def test_an_unknown_id_is_not_found(sealed: Sealed, rest: str) -> None:
+    for wrong in (
+        *("%2e%2e", "%2e%2e%2f%2e%2e%2fetc%2fpasswd", "..%5c..", "20200101T000000Z-000000"),
+        *("20200101T000000Z-000000%00", f"{sealed.id}%0a", "x" * 5000, "%ff"),
     ):
-        for rest in ("", "/data", "/markers", "/ledger"):
-            answer = sealed.running.http.get(f"/sessions/{odd}{rest}")
-            assert answer.status_code in (400, 404), odd
-            assert answer.headers["content-type"] == "application/problem+json"
+        answer = sealed.running.http.get(f"/sessions/{wrong}{rest}")
+        assert answer.status_code in (400, 404), wrong
+        assert answer.headers["content-type"] == "application/problem+json"
 
 
-def test_a_file_that_was_taken_away_is_said_to_be(sealed: Sealed) -> None:
+def test_a_missing_file_is_named(sealed: Sealed, tmp_path: Path) -> None:
     path = sealed.session.folder / "frames.parquet"
-    path.unlink()
-    assert_refused(sealed.get(), 404, "is missing")
-    assert sealed.made(format="csv").status_code in (404, 500)
-    assert sealed.running.http.get("/health").status_code == 200
+    away = path.rename(tmp_path / path.name)
+    try:
+        assert_refused(sealed.get_file(), 404, "is missing")
+        assert sealed.export(format="csv").status_code in (404, 500)
+    finally:
+        away.rename(path)

@@ -1,4 +1,4 @@
-"""A node's connection: what is acknowledged is on disk, and what is lacking is asked for."""
+"""Connections of nodes: acknowledged frames are on disk, and missing ones are requested."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from starlette.websockets import WebSocket
 from websockets.exceptions import ConnectionClosed
 
 import service.api.routes.sockets.ingest
-import service.server
-import service.server.streams
+import service.server.server
 from devices.frames import FrameBatch
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
@@ -25,25 +25,25 @@ from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import FakeNode, NodeOf, Play
 from tests.service.process import Start
 from tests.service.running import Running, closed
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 
-def test_a_new_node_is_asked_for_everything(node: FakeNode) -> None:
+def assert_all_stored(node: FakeNode) -> None:
+    """The journal has every frame of the node's stream."""
+    assert_same_bits(node.running.held(node.stream_id), node.all_sent())
+
+
+def test_a_new_node_is_asked_for_every_frame_that_it_has(running: Running, node: FakeNode) -> None:
     assert node.connect() == [(0, None)]
-
-
-def test_a_new_node_is_not_asked_for_what_it_has_forgotten(node: FakeNode) -> None:
-    assert node.connect(stored=((500, 899),), next_seq=900) == [(500, None)]
-
-
-def test_what_is_acknowledged_is_readable_from_disk(running: Running, node: FakeNode) -> None:
-    node.connect()
-    sent = node.deliver(300)
+    node.deliver(300)
     assert node.acked == Intervals([(0, 299)])
-    assert_same_bits(running.held(node.stream_id), sent)
+    assert_all_stored(node)
+    node.restart()
+    assert node.connect(stored=((500, 899),), next_seq=900) == [(500, None)]
+    assert running.node()["stream_id"] == node.stream_id
 
 
-def test_a_node_that_comes_back_goes_on_where_the_server_is(
+def test_a_node_that_returns_continues_where_the_server_is(
     running: Running, node: FakeNode
 ) -> None:
     node.connect()
@@ -53,22 +53,16 @@ def test_a_node_that_comes_back_goes_on_where_the_server_is(
     assert node.connect() == [(100, None)]
     node.send_again(node.sent[1])
     node.deliver(30)
-    assert_same_bits(running.held(node.stream_id), node.all_sent())
+    assert_all_stored(node)
     assert running.node()["lost_frames"] == 0
+    running.restart()
+    assert_all_stored(node)
+    assert node.connect() == [(180, None)]
+    node.deliver(50)
+    assert_all_stored(node)
 
 
-def test_frames_that_are_sent_twice_are_held_once_and_acknowledged_again(
-    running: Running, node: FakeNode
-) -> None:
-    node.connect()
-    sent = node.deliver(100)
-    node.acked = Intervals()
-    node.send_again(sent.slice_rows(55, 100))
-    node.acknowledged(99, first=55)
-    assert_same_bits(running.held(node.stream_id), sent)
-
-
-def test_a_gap_is_asked_for_at_the_next_connection(running: Running, node: FakeNode) -> None:
+def test_a_gap_is_requested_at_the_next_connection(node: FakeNode) -> None:
     node.connect()
     node.send(40)
     gap = node.frames(25)
@@ -78,37 +72,25 @@ def test_a_gap_is_asked_for_at_the_next_connection(running: Running, node: FakeN
     assert node.connect() == [(40, 64), (100, None)]
     node.send_again(gap)
     node.acknowledged(99)
-    assert_same_bits(running.held(node.stream_id), node.all_sent())
+    assert_all_stored(node)
 
 
-def test_after_a_restart_the_server_lacks_exactly_the_rest(
+def test_a_server_that_stops_closes_connections_and_journals(
     running: Running, node: FakeNode
 ) -> None:
     node.connect()
-    node.deliver(200)
-    running.restart()
-    assert_same_bits(running.held(node.stream_id), node.all_sent())
-    assert node.connect() == [(200, None)]
-    node.deliver(50)
-    assert_same_bits(running.held(node.stream_id), node.all_sent())
-
-
-def test_a_server_that_goes_down_says_so_to_its_nodes(running: Running, node: FakeNode) -> None:
-    node.connect()
-    node.send(10)
-    running.stop()
-    code, _ = closed(node.socket)
-    assert code in (1001, 1012)
-
-
-def test_a_server_that_ends_closes_its_journals(running: Running, node: FakeNode) -> None:
-    node.connect()
-    node.deliver(10)
-    running.stop()
+    node.send(20)
+    running.stop()  # perhaps before the tick that acknowledges the frames
+    assert closed(node.socket)[0] in (1001, 1012)
     assert running.open_journals == []
+    running.start()
+    [(first, _)] = node.connect()
+    if first < 20:
+        node.send_again(node.sent[-1].slice_rows(first, 20))
+    node.deliver(10)
 
 
-def test_a_killed_server_has_every_frame_that_it_acknowledged(
+def test_a_killed_server_has_every_acknowledged_frame(
     running: Running, node_of: NodeOf, foottile: Start, tmp_path: Path
 ) -> None:
     data = tmp_path / "killed"
@@ -132,28 +114,26 @@ def test_a_killed_server_has_every_frame_that_it_acknowledged(
     shutil.copytree(data / "journal" / "bench" / node.stream_id, copy)
     journal = Journal.open_and_recover(copy)
     assert not (node.acked - journal.stored)
-    held = journal.stored.last
-    assert held is not None
-    found = FrameBatch.concatenate(list(journal.read_frames(0, held)))
-    assert_same_bits(found, node.all_sent().slice_rows(0, held + 1))
-    # What it held is what it does not ask for when it runs again.
+    last = journal.stored.last
+    assert last is not None
+    found = FrameBatch.concatenate(list(journal.read_frames(0, last)))
+    assert_same_bits(found, node.all_sent().slice_rows(0, last + 1))
+    # A new process requests only what this one had not stored.
     running.port = 0
     running.data = data
     running.start()
-    assert node.connect() == [(held + 1, None)]
+    assert node.connect() == [(last + 1, None)]
 
 
-def test_a_probe_is_answered_with_the_servers_clock(node: FakeNode) -> None:
+def test_a_probe_has_the_servers_clock_and_the_api_the_nodes_counts(
+    running: Running, node: FakeNode
+) -> None:
     node.connect()
     before_ns = time.time_ns()
     node.socket.send('{"type":"probe","id":3}')
     answer = node.receive("probe")
     assert answer.id == 3
     assert before_ns <= answer.server_t_ns <= time.time_ns()
-
-
-def test_a_clock_row_and_counts_of_a_node_are_shown(running: Running, node: FakeNode) -> None:
-    node.connect()
     node.send(10)
     node.say_clock(-77, uncertainty_ns=12)
     node.socket.send('{"type":"status","missed_slots":4}')
@@ -161,65 +141,45 @@ def test_a_clock_row_and_counts_of_a_node_are_shown(running: Running, node: Fake
     assert running.node()["clock"] == {"server_minus_node_ns": -77, "uncertainty_ns": 12}
 
 
-def test_the_same_stream_again_takes_the_place_of_its_older_connection(
+def test_a_second_connection_of_a_stream_replaces_the_first(
     running: Running, node: FakeNode
 ) -> None:
     node.connect()
     node.deliver(10)
-    older = node.socket
+    first = node.socket
     assert node.connect() == [(10, None)]
-    assert closed(older)[0] == 4010
+    assert closed(first)[0] == 4010
     node.deliver(10)
     assert running.node()["connected"]
 
 
-def test_a_node_that_has_left_may_come_back_with_another_boot(
-    running: Running, node: FakeNode
-) -> None:
-    node.connect()
-    node.deliver(10)
-    node.restart()
-    assert node.connect() == [(0, None)]
-    assert running.node()["stream_id"] == node.stream_id
-    node.deliver(10)
-
-
-@pytest.mark.parametrize("greeted", [False, True])
-def test_a_node_that_says_nothing_is_let_go(
-    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch, greeted: bool
+@pytest.mark.parametrize("is_greeted", [False, True])
+def test_a_silent_node_is_disconnected(
+    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch, is_greeted: bool
 ) -> None:
     monkeypatch.setattr(service.api.routes.sockets.ingest, "LINK_TIMEOUT_S", 0.3)
-    if greeted:
+    if is_greeted:
         node.connect()
     else:
         node.open()
     code, reason = closed(node.socket)
-    assert code == 4005
-    assert "0.3 s" in reason
-    if greeted:
+    assert (code, "0.3 s" in reason) == (4005, True)
+    if is_greeted:
         until(lambda: not running.node()["connected"])
     assert running.http.get("/health").status_code == 200
 
 
-def test_a_node_that_is_cut_off_is_away(running: Running, node: FakeNode) -> None:
-    node.connect()
-    node.deliver(10)
-    node.socket.socket.shutdown(2)
-    until(lambda: not running.node()["connected"])
-    assert node.connect() == [(10, None)]
-
-
-def test_what_was_held_and_not_acknowledged_is_so_at_the_next_connection(
+def test_frames_received_before_a_cut_are_acknowledged_or_requested(
     running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # A node forgets nothing that is not acknowledged, so it must not wait for it for ever.
+    # A node keeps every frame until it is acknowledged.
     node.connect()
     node.deliver(10)
     monkeypatch.setattr(service.server.server, "TICK_S", 0.5)
     node.send(10)
     node.acknowledged(19)  # the next tick is half a second away
     node.send(10)
-    until(lambda: running.node()["last_seq"] == 29)
+    node.taken_in()
     node.socket.socket.shutdown(2)
     until(lambda: not running.node()["connected"])
     assert not node.acked.restricted_to(20, 29)
@@ -229,43 +189,27 @@ def test_what_was_held_and_not_acknowledged_is_so_at_the_next_connection(
     node.deliver(10)
 
 
-def test_what_was_held_at_a_restart_is_acknowledged_at_the_next_connection(
-    running: Running, node: FakeNode
-) -> None:
-    node.connect()
-    node.send(20)
-    running.stop()  # perhaps before the tick that would have acknowledged it
-    node.acked = Intervals()
-    running.start()
-    [(first, _)] = node.connect()
-    if first < 20:
-        node.send_again(node.sent[-1].slice_rows(first, 20))
-    node.deliver(10)
-
-
-def test_a_node_that_goes_before_it_is_welcomed_leaves_its_name_free(
+def test_a_node_that_leaves_before_its_welcome_leaves_its_name_free(
     running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from starlette.websockets import WebSocket
+    send_text, is_gone = WebSocket.send_text, threading.Event()
 
-    send_text = WebSocket.send_text
-    gone = threading.Event()
-
-    async def failing(socket: WebSocket, data: str) -> None:
-        if '"welcome"' in data and not gone.is_set():
-            gone.set()
+    async def send_or_fail(socket: WebSocket, data: str) -> None:
+        if '"welcome"' in data and not is_gone.is_set():
+            is_gone.set()
             raise RuntimeError("the peer has gone")
         await send_text(socket, data)
 
-    monkeypatch.setattr(WebSocket, "send_text", failing)
+    monkeypatch.setattr(WebSocket, "send_text", send_or_fail)
     node.open_with_hello()
-    until(gone.is_set)
-    until(lambda: not running.node()["connected"])
+    until(is_gone.is_set)
+    # Long before its silence would disconnect it.
+    until(lambda: not running.node()["connected"], PATIENCE_S / 4)
     node.reboot()
     assert node.connect() == [(0, None)]
 
 
-def test_frames_of_an_earlier_stream_are_held_to_its_own_description(
+def test_frames_of_an_earlier_stream_fit_its_own_description(
     running: Running, node: FakeNode
 ) -> None:
     node.frames(20)
@@ -276,7 +220,7 @@ def test_frames_of_an_earlier_stream_are_held_to_its_own_description(
     node.send(10)
     node.send_earlier(before, 0, 19)
     node.deliver(10)
-    assert_same_bits(running.held(node.stream_id), node.all_sent())
+    assert_all_stored(node)
     # No session needs them: their journal is deleted as soon as they are acknowledged.
     while (0, 19) not in node.acked_of.get(before.stream_id, ()):
         node.receive("ack")

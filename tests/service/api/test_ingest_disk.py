@@ -1,4 +1,4 @@
-"""A server whose disk is full or failing acknowledges nothing that is not on it, and asks again."""
+"""Full and failing disks of a server: no frame is acknowledged that is not stored."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ import threading
 
 import pytest
 
-import service.api.routes.sockets.ingest
-import service.server
-import service.server.node
+import service.server.server
 import service.server.streams
 import storage.journal.segment_writer
 from devices.errors import StorageError
@@ -32,60 +30,70 @@ from tests.waiting import PATIENCE_S, until
 STORAGE_FULL = (StorageError, "No space left on device")
 
 
-def gated_sync(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading.Event]:
-    """Have the first sync wait: an event that says that it was asked for, and one that lets it."""
-    asked, may_sync = threading.Event(), threading.Event()
-    sync = Journal.sync
+class Gate:
+    """A method that waits until the gate opens."""
 
-    def gated(journal: Journal) -> None:
-        asked.set()
-        assert may_sync.wait(20.0)
-        sync(journal)
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, owner: type, name: str) -> None:
+        self.reached, self.opened = threading.Event(), threading.Event()
+        method = getattr(owner, name)
 
-    monkeypatch.setattr(Journal, "sync", gated)
-    return asked, may_sync
+        def wait(it: object) -> None:
+            self.reached.set()
+            assert self.opened.wait(PATIENCE_S)
+            method(it)
 
+        monkeypatch.setattr(owner, name, wait)
 
-def test_nothing_is_acknowledged_before_it_is_synced(
-    node: FakeNode, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked, may_sync = gated_sync(monkeypatch)
-    try:
-        node.connect()
-        node.send(100)
-        assert asked.wait(5.0)
-        node.socket.send('{"type":"probe","id":7}')
-        assert node.receive("probe").id == 7
-        assert not node.acked
-    finally:
-        may_sync.set()
-    node.acknowledged(99)
+    def __enter__(self) -> Gate:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.opened.set()
 
 
-def test_frames_that_come_during_a_sync_wait_for_the_next_one(
+def probe(node: FakeNode) -> None:
+    """Wait until the server has answered the messages so far."""
+    node.socket.send('{"type":"probe","id":7}')
+    assert node.receive("probe").id == 7
+
+
+def test_frames_are_acknowledged_after_their_sync(
     running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked, may_sync = gated_sync(monkeypatch)
-    try:
+    with Gate(monkeypatch, Journal, "sync") as gate:
         node.connect()
         node.send(10)
-        assert asked.wait(5.0)
+        assert gate.reached.wait(PATIENCE_S)
         node.send(10)
-        until(lambda: running.node()["last_seq"] == 19)
-    finally:
-        may_sync.set()
+        node.taken_in()
+        probe(node)
+        assert not node.acked
     first = node.receive("ack")
     assert (first.seq_first, first.seq_last) == (0, 9)
     node.acknowledged(19)
 
 
-def test_frames_that_a_full_disk_does_not_take_are_asked_for_when_it_does(
+def test_a_hello_is_stored_in_a_thread_before_its_frames_are_acknowledged(
     running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    full = threading.Event()
-    segment, is_full = storage.journal.segment_writer, lambda *_: full.is_set()
-    writes = failing_if(is_full, segment.write_all_or_none, *NO_SPACE)
-    check = failing_if(is_full, running.server.check_writable, *STORAGE_FULL)
+    path = running.data / "nodes" / "bench" / "hello.json"
+    with Gate(monkeypatch, ServerNode, "save_hello") as gate:
+        node.connect()
+        node.send(10)
+        assert gate.reached.wait(PATIENCE_S)
+        node.taken_in()
+        assert not node.acked
+        assert not path.exists()
+    node.acknowledged(9)
+    assert path.exists()
+
+
+def test_frames_that_a_full_disk_refuses_are_requested_again(
+    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full, segment = threading.Event(), storage.journal.segment_writer
+    writes = failing_if(lambda *_: full.is_set(), segment.write_all_or_none, *NO_SPACE)
+    check = failing_if(lambda *_: full.is_set(), running.server.check_writable, *STORAGE_FULL)
     monkeypatch.setattr(segment, "write_all_or_none", writes)
     monkeypatch.setattr(running.server, "check_writable", check)
     node.connect()
@@ -93,32 +101,31 @@ def test_frames_that_a_full_disk_does_not_take_are_asked_for_when_it_does(
     node.acknowledged(69)
     with running.socket("/api/v1/live?rate_hz=60") as live:
         full.set()
-        lost = node.send(30, 20.0)
+        refused = node.send(30, 20.0)
         until(lambda: running.node()["storage_problem"])
         assert "No space left" in running.node()["storage_problem"]
         shown = -1
-        while shown < 90:  # all but those that wait for their look-ahead
+        while shown < 90:  # all but the look-ahead
             message = json.loads(live.recv(timeout=PATIENCE_S))
             shown = message["seq"] if message["type"] == "frame" else shown
         assert message["force_n"] == pytest.approx([20.0, 20.0], abs=0.5)
-        node.socket.send('{"type":"probe","id":1}')
-        node.receive("probe")
+        probe(node)
         assert node.acked == Intervals([(0, 69)])
         assert running.journal(node.stream_id).stored == Intervals([(0, 69)])
     full.clear()
     assert closed(node.socket)[0] == 1012
     until(lambda: not running.node()["connected"])
     assert node.connect() == [(70, None)]
-    node.send_again(lost)
+    node.send_again(refused)
     node.deliver(10, 20.0)
     assert running.node()["storage_problem"] is None
     assert_same_bits(running.held(node.stream_id), node.all_sent())
 
 
-def test_a_disk_that_is_full_between_two_syncs_has_refused_nothing(
+def test_a_disk_that_is_full_between_two_syncs_refuses_no_frame(
     running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Who takes messages in never writes: they wait in memory for the next sync.
+    # Received messages wait in memory for the next sync.
     full, segment = threading.Event(), storage.journal.segment_writer
     writes = failing_if(lambda *_: full.is_set(), segment.write_all_or_none, *NO_SPACE)
     node.connect()
@@ -129,54 +136,41 @@ def test_a_disk_that_is_full_between_two_syncs_has_refused_nothing(
     monkeypatch.setattr(segment, "write_all_or_none", writes)
     full.set()
     node.send(20)
-    until(lambda: running.node()["last_seq"] == 39)
+    node.taken_in()
     full.clear()
     node.acknowledged(39)
     assert running.node()["storage_problem"] is None
 
 
-def test_what_a_node_says_is_written_down_in_another_thread_before_its_frames_are_promised(
-    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    begun, may_go_on, keep = threading.Event(), threading.Event(), ServerNode.save_hello
-
-    def slow(self: ServerNode) -> None:
-        begun.set()
-        assert may_go_on.wait(PATIENCE_S)
-        keep(self)
-
-    monkeypatch.setattr(ServerNode, "save_hello", slow)
-    try:
-        node.connect()
-        node.send(10)
-        assert begun.wait(PATIENCE_S)
-        until(lambda: running.node()["last_seq"] == 9)  # the picture goes on meanwhile
-        assert not node.acked
-        assert not (running.data / "nodes" / "bench" / "hello.json").exists()
-    finally:
-        may_go_on.set()
-    node.acknowledged(9)
-    assert (running.data / "nodes" / "bench" / "hello.json").exists()
-
-
-def test_a_disk_that_refuses_to_sync_acknowledges_nothing(
+def test_a_failed_sync_acknowledges_no_frame(
     running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     node.connect()
-    broken = failing_once(Journal.sync, StorageError, "Input/output error")
-    monkeypatch.setattr(Journal, "sync", broken)
-    node.send(20)
-    assert closed(node.socket)[0] == 1012
-    assert not node.acked
-    # Whatever it is asked for now, in the end everything has to be acknowledged.
-    for first, last in node.connect():
-        if last is None:
-            node.send_again(node.all_sent().slice_rows(first, 20)) if first < 20 else None
     node.deliver(10)
+    with monkeypatch.context() as patch:
+        before_each_sync_of_frames(patch, failing_once(lambda: None, *IO_ERROR))
+        refused = node.send(10)
+        assert closed(node.socket)[0] == 1012
+    assert not node.acked.restricted_to(10, 19)
+    assert node.connect() == [(10, None)]
+    node.send_again(refused)
+    node.acknowledged(19)
+    fail_once = failing_once(Journal.sync, StorageError, "Input/output error")
+    monkeypatch.setattr(Journal, "sync", fail_once)
+    node.send(10)
+    assert closed(node.socket)[0] == 1012
+    assert not node.acked.restricted_to(20, 29)
+    # Whatever the server requests, in the end it acknowledges every frame.
+    for first, _ in node.connect():
+        if first < 30:
+            node.send_again(node.all_sent().slice_rows(first, 30))
+    node.deliver(10)
+    node.acknowledged(node.seq - 1)
+    running.restart()
     assert_same_bits(running.held(node.stream_id), node.all_sent())
 
 
-def test_what_a_node_says_is_followed_although_it_cannot_be_written_down(
+def test_a_hello_counts_although_it_cannot_be_stored(
     running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     node.connect()
@@ -184,40 +178,23 @@ def test_what_a_node_says_is_followed_although_it_cannot_be_written_down(
     node.restart()
     node.tiles += 1
     with monkeypatch.context() as patch:
-        patch.setattr(service.server.node.ServerNode, "save_hello", refusing(*STORAGE_FULL))
+        patch.setattr(ServerNode, "save_hello", refusing(*STORAGE_FULL))
         node.connect()
-    shown = running.node()
+    shown, calibration = running.node(), node.hello().calibration
     assert len(shown["tiles"]) == node.tiles
-    calibration = node.hello().calibration
     assert calibration is not None
     assert shown["calibration"]["id"] == calibration.id
 
 
-def test_what_could_not_be_synced_is_sent_again(
+def test_a_disk_that_is_full_from_the_first_frame_on_is_tried_again(
     running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    node.connect()
-    node.deliver(10)
-    before_each_sync_of_frames(monkeypatch, failing_once(lambda: None, *IO_ERROR))
-    lost = node.send(10)
-    assert closed(node.socket)[0] == 1012
-    assert node.connect() == [(10, None)]
-    node.send_again(lost)
-    node.acknowledged(19)
-    running.restart()
-    assert_same_bits(running.held(node.stream_id), node.all_sent())
-
-
-def test_a_disk_that_was_full_from_the_first_frame_on_is_tried_again(
-    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    refuse = refusing(*STORAGE_FULL)
-    monkeypatch.setattr(service.server.streams, "Journal", refuse)  # not even a folder
-    monkeypatch.setattr(running.server, "check_writable", refuse)
-    node.connect()
-    node.send(10)
-    until(lambda: running.node()["storage_problem"] is not None)
-    monkeypatch.setattr(service.server.streams, "Journal", Journal)
-    monkeypatch.setattr(running.server, "check_writable", lambda: None)
+    with monkeypatch.context() as patch:
+        # Not even a folder can be created.
+        patch.setattr(service.server.streams, "Journal", refusing(*STORAGE_FULL))
+        patch.setattr(running.server, "check_writable", refusing(*STORAGE_FULL))
+        node.connect()
+        node.send(10)
+        until(lambda: running.node()["storage_problem"] is not None)
     assert closed(node.socket)[0] == 1012
     assert node.connect() == [(0, None)]

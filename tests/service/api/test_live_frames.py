@@ -1,8 +1,10 @@
-"""The live websocket for programs: every frame once, as Arrow; what is missing is said."""
+"""Live websocket for programs: every frame once, as Arrow, and every loss."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,7 +15,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection
 
 import service.api.routes.sockets.live
-import service.server.live_feed.buffer
+from tests.service.api.sealed import Sealed
 from tests.service.api.test_calibrations import assign, stiffer
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import Running, closed
@@ -23,23 +25,23 @@ LIVE = "/api/v1/live?format=arrow"
 
 
 @dataclass
-class Taken:
-    """What came on a live socket, in order."""
+class Received:
+    """Messages of a live socket, in order."""
 
     socket: ClientConnection
-    said: list[dict[str, Any]] = field(default_factory=list)
+    texts: list[dict[str, Any]] = field(default_factory=list)
     batches: list[tuple[str, Any]] = field(default_factory=list)
-    """With the stream each is of."""
+    """Each with its stream."""
     stream_id: str = ""
     schema: Any = None
 
     def next(self) -> Any:
         message = self.socket.recv(timeout=PATIENCE_S)
         if isinstance(message, str):
-            self.said.append(json.loads(message))
-            if self.said[-1]["type"] == "stream":
-                self.stream_id, self.schema = self.said[-1]["stream_id"], None
-            return self.said[-1]
+            self.texts.append(json.loads(message))
+            if self.texts[-1]["type"] == "stream":
+                self.stream_id, self.schema = self.texts[-1]["stream_id"], None
+            return self.texts[-1]
         if self.schema is None:
             self.schema = pa.ipc.read_schema(pa.py_buffer(message))
             return self.next()
@@ -47,8 +49,8 @@ class Taken:
         self.batches.append((self.stream_id, batch))
         return batch
 
-    def until(self, seq: int, stream_id: str | None = None) -> Taken:
-        """Take until this frame has come."""
+    def until(self, seq: int, stream_id: str | None = None) -> Received:
+        """Receive until this frame."""
         while not (
             self.batches
             and stream_id in (None, self.batches[-1][0])
@@ -57,11 +59,14 @@ class Taken:
             self.next()
         return self
 
-    def until_said(self, kind: str) -> dict[str, Any]:
+    def until_text(self, kind: str) -> dict[str, Any]:
         while True:
             message = self.next()
             if isinstance(message, dict) and message["type"] == kind:
                 return message
+
+    def list_texts(self, kind: str) -> list[dict[str, Any]]:
+        return [text for text in self.texts if text["type"] == kind]
 
     def table(self, stream_id: str | None = None) -> Any:
         return pa.Table.from_batches([b for of, b in self.batches if stream_id in (None, of)])
@@ -70,35 +75,49 @@ class Taken:
     def seqs(self) -> list[int]:
         return [seq for _, batch in self.batches for seq in batch["seq"].to_pylist()]
 
+    def assert_no_gap(self) -> None:
+        assert self.seqs == list(range(self.seqs[0], self.seqs[-1] + 1))
 
-def take(running: Running, query: str = "") -> Taken:
-    return Taken(running.socket(LIVE + query))
+
+@contextmanager
+def subscribe(running: Running, query: str = "") -> Iterator[Received]:
+    """Subscribe, and wait for the first message."""
+    with running.socket(LIVE + query) as socket:
+        received = Received(socket)
+        received.until_text("hello")
+        yield received
 
 
-def differing(a: Any, b: Any) -> dict[str, list[int]]:
-    """Columns whose bits differ, nulls included, and in which frames; empty if there are none."""
+def resume(node: FakeNode, seq: int, last: int) -> Received:
+    """Receive the frames of a node's stream from a number on."""
+    query = f"&stream_id={node.stream_id}&from_seq={seq}"
+    with node.running.socket(LIVE + query) as socket:
+        return Received(socket).until(last)
+
+
+def find_differences(a: Any, b: Any) -> dict[str, list[int]]:
+    """Return columns whose bits differ, nulls included, and the frames."""
     assert a["seq"].to_pylist() == b["seq"].to_pylist()
     found = {}
-    for name in a.column_names:
+    for name in set(a.column_names) - {"recomputed"}:
         pairs = zip(a[name].to_pylist(), b[name].to_pylist(), strict=True)
         rows = [seq for seq, (x, y) in zip(a["seq"].to_pylist(), pairs, strict=True) if x != y]
-        if rows and name != "recomputed":
+        if rows:
             found[name] = rows
     return found
 
 
 def test_every_frame_comes_once_with_its_estimates(running: Running, tared: FakeNode) -> None:
-    with running.socket(LIVE) as socket:
-        taken = Taken(socket)
-        hello = taken.until_said("hello")
+    with subscribe(running) as received:
         sent = tared.send(100, [20.0, 60.0], alive=True)
-        taken.until(tared.seq - 10)
+        received.until(tared.seq - 10)
+    (hello,) = received.list_texts("hello")
     assert (hello["node"], hello["policy"], hello["protocol"]) == ("bench", "lossless", 1)
-    table = taken.table()
-    assert taken.seqs == list(range(taken.seqs[0], taken.seqs[-1] + 1))
-    assert 60 <= taken.seqs[0] <= 70  # frames that waited for their look-ahead come, too
+    table = received.table()
+    received.assert_no_gap()
+    assert 60 <= received.seqs[0] <= 70  # frames in the look-ahead come, too
     assert not any(table["recomputed"].to_pylist())
-    rows = table.slice(int(sent.seq[20]) - taken.seqs[0])
+    rows = table.slice(int(sent.seq[20]) - received.seqs[0])
     assert np.median(rows["force_n_1"].to_numpy()) == pytest.approx(60.0, abs=0.05)
     assert np.median(rows["grf_n"].to_numpy()) == pytest.approx(80.0, abs=0.1)
     at = np.asarray(rows["seq"]) - int(sent.seq[0])
@@ -108,21 +127,10 @@ def test_every_frame_comes_once_with_its_estimates(running: Running, tared: Fake
     assert info["stream_id"] == tared.stream_id
 
 
-def test_only_columns_that_were_asked_for_come(running: Running, tared: FakeNode) -> None:
-    with running.socket(LIVE + "&columns=cop_x_m,force_n_1,gauge_kpa&node=bench") as socket:
-        taken = Taken(socket)
-        taken.until_said("hello")
-        tared.send(60, 20.0)
-        taken.until(tared.seq - 10)
-    assert taken.table().column_names == [
-        *("seq", "t_ns", "cop_x_m", "force_n_1", "gauge_kpa_0", "gauge_kpa_1", "recomputed")
-    ]
-
-
-def test_messages_of_a_stream_behind_each_other_are_an_arrow_stream(
+def test_a_stream_has_the_requested_columns_and_is_an_arrow_stream(
     running: Running, tared: FakeNode
 ) -> None:
-    with running.socket(LIVE + "&columns=grf_n") as socket:
+    with running.socket(LIVE + "&columns=cop_x_m,force_n_1,gauge_kpa&node=bench") as socket:
         assert isinstance(socket.recv(timeout=PATIENCE_S), str)  # hello
         tared.send(100, 20.0)
         assert json.loads(socket.recv(timeout=PATIENCE_S))["type"] == "stream"
@@ -133,169 +141,119 @@ def test_messages_of_a_stream_behind_each_other_are_an_arrow_stream(
             content += message
     table = pa.ipc.open_stream(content).read_all()
     assert len(table) >= 10
+    assert table.column_names == [
+        *("seq", "t_ns", "cop_x_m", "force_n_1", "gauge_kpa_0", "gauge_kpa_1", "recomputed")
+    ]
 
 
 @pytest.mark.parametrize(
-    ("query", "said"),
+    ("query", "word"),
     [
-        ("&columns=grf_n,colour", "'colour'"),
-        ("&columns=force_n_2", "'force_n_2'"),
-        ("&policy=all", "policy='all'"),
-        ("&policy=", "policy=''"),
-        ("&stream_id=x", "32 hex digits"),
-        ("&stream_id=" + "0" * 32, "no stream"),
-        ("&from_seq=-1", "from_seq='-1'"),
-        ("&from_seq=1e3", "from_seq='1e3'"),
-        ("&from_seq=" + "9" * 400, "from_seq="),
-        ("&node=nobody", "'nobody'"),
-        ("&rate_hz=30", "'rate_hz'"),
-        ("&colour=red", "'colour'"),
+        ("columns=grf_n,colour", "'colour'"),
+        ("columns=force_n_2", "'force_n_2'"),
+        ("policy=all", "policy='all'"),
+        ("policy=", "policy=''"),
+        ("stream_id=x", "32 hex digits"),
+        ("stream_id=" + "0" * 32, "no stream"),
+        ("from_seq=-1", "from_seq='-1'"),
+        ("from_seq=1e3", "from_seq='1e3'"),
+        ("from_seq=" + "9" * 400, "from_seq="),
+        ("node=nobody", "'nobody'"),
+        ("rate_hz=30", "'rate_hz'"),
+        ("colour=red", "'colour'"),
     ],
 )
-def test_a_query_that_is_none_closes_with_the_reason(
-    running: Running, tared: FakeNode, query: str, said: str
-) -> None:
-    with running.socket(LIVE + query) as live:
+def test_a_wrong_query_closes_with_a_reason(sealed: Sealed, query: str, word: str) -> None:
+    with sealed.running.socket(f"{LIVE}&{query}") as live:
         code, reason = closed(live)
-    assert code == (4011 if "stream_id=0" in query else 1008)
-    assert said in reason
+    assert code == (4011 if word == "no stream" else 1008)
+    assert word in reason
 
 
-def test_of_several_nodes_one_has_to_be_named(
+def test_one_of_several_nodes_has_to_be_named(
     running: Running, tared: FakeNode, node_of: NodeOf
 ) -> None:
     node_of(running, "other").connect()
     with running.socket(LIVE) as live:
         code, reason = closed(live)
-    assert code == 1008
-    assert "bench" in reason
-    assert "other" in reason
+    assert (code, "bench" in reason, "other" in reason) == (1008, True, True)
 
 
-def test_a_cut_and_a_resume_anywhere_give_the_same_bits_as_no_cut(
-    running: Running, tared: FakeNode
-) -> None:
-    with running.socket(LIVE) as socket, running.socket(LIVE) as other:
-        whole, cut = Taken(socket), Taken(other)
-        whole.until_said("hello")
-        cut.until_said("hello")
-        tared.send(40, [20.0, 60.0], alive=True)
-        cut.until(tared.seq - 25)
+def test_a_resumed_stream_has_the_same_bits(running: Running, tared: FakeNode) -> None:
+    with subscribe(running) as whole:
+        with subscribe(running) as cut:
+            tared.send(40, [20.0, 60.0], alive=True)
+            cut.until(tared.seq - 25)
         tared.send(160, [30.0, 50.0], alive=True)
         whole.until(tared.seq - 10)
-    first, last = whole.seqs[0], whole.seqs[-1]
-    parts = [cut.table()]
-    at = cut.seqs[-1] + 1
+    parts, at = [cut.table()], cut.seqs[-1] + 1
     for n in (1, 7, 30, 33):  # in the middle of a piece, and at its edge
-        with running.socket(f"{LIVE}&stream_id={tared.stream_id}&from_seq={at}") as socket:
-            taken = Taken(socket).until(at + n - 1)
-        parts.append(taken.table().slice(0, n))
+        parts.append(resume(tared, at, at + n - 1).table().slice(0, n))
         at += n
-    with running.socket(f"{LIVE}&stream_id={tared.stream_id}&from_seq={at}") as socket:
-        parts.append(Taken(socket).until(last).table())
-    table = pa.concat_tables(parts)
-    assert table["seq"].to_pylist()[: last - first + 1] == whole.seqs
-    assert differing(table.slice(0, len(whole.seqs)), whole.table()) == {}
+    parts.append(resume(tared, at, whole.seqs[-1]).table())
+    table = pa.concat_tables(parts).slice(0, len(whole.seqs))
+    assert find_differences(table, whole.table()) == {}
 
 
-def test_what_memory_has_not_any_more_is_recomputed_to_the_same_bits(
+def test_recomputed_frames_have_the_bits_tares_and_calibrations_of_live_ones(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with running.socket(LIVE) as socket:
-        whole = Taken(socket)
-        whole.until_said("hello")
-        memory = running.server.live_feeds.get_or_create("bench")
-        tared.send(300, [20.0, 60.0], alive=True)
-        whole.until(tared.seq - 10)
-        monkeypatch.setattr(memory, "_bytes_max", 20_000)
-        tared.send(300, [50.0, 10.0], alive=True)
-        whole.until(tared.seq - 10)
-    first = whole.seqs[0]
-    with running.socket(f"{LIVE}&stream_id={tared.stream_id}&from_seq={first}") as socket:
-        again = Taken(socket).until(whole.seqs[-1])
-    assert again.seqs[: len(whole.seqs)] == whole.seqs
-    table = again.table().slice(0, len(whole.seqs))
-    assert sum(table["recomputed"].to_pylist()) > 300
-    assert not table["recomputed"][-1].as_py()
-    assert differing(table, whole.table()) == {}
-
-
-def test_tare_and_calibration_are_in_force_from_the_frame_on_from_which_they_were_live(
-    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with running.socket(LIVE) as socket:
-        whole = Taken(socket)
-        whole.until_said("hello")
+    feed = running.server.live_feeds.get_or_create("bench")
+    with subscribe(running) as whole:
         tared.send(200, alive=True)
         tared.taken_in()
         assert running.http.post("/nodes/bench/tare").status_code == 201
         tared.send(100, 20.0, alive=True)
         tared.taken_in()
         assert assign(running, stiffer(*tared.info.serials)).status_code == 200
-        tared.send(100, 20.0, alive=True)
+        tared.send(100, [20.0, 60.0], alive=True)
         whole.until(tared.seq - 10)
-    monkeypatch.setattr(running.server.live_feeds.get_or_create("bench"), "_bytes_max", 1)
-    tared.send(10)
-    tared.taken_in()
-    first, last = whole.seqs[0], whole.seqs[-1]
-    with running.socket(f"{LIVE}&stream_id={tared.stream_id}&from_seq={first}") as socket:
-        again = Taken(socket).until(last)
+        monkeypatch.setattr(feed, "_bytes_max", 20_000)
+        tared.send(300, [50.0, 10.0], alive=True)
+        whole.until(tared.seq - 10)
+    again = resume(tared, whole.seqs[0], whole.seqs[-1])
     table = again.table().slice(0, len(whole.seqs))
-    assert all(table["recomputed"].to_pylist())
-    assert differing(table, whole.table()) == {}
+    assert sum(table["recomputed"].to_pylist()) > 300
+    assert not table["recomputed"][-1].as_py()
+    assert find_differences(table, whole.table()) == {}
 
 
-def test_over_a_restart_of_the_server_no_frame_is_missing_and_none_comes_twice(
+def test_a_restart_of_the_server_costs_and_repeats_no_frame(
     running: Running, tared: FakeNode
 ) -> None:
-    with running.socket(LIVE) as socket:
-        before = Taken(socket)
-        before.until_said("hello")
+    with subscribe(running) as before:
         tared.deliver(100, 20.0)
         before.until(tared.seq - 30)
     running.restart()
     tared.connect()
     tared.send(50, 20.0)
-    at = before.seqs[-1] + 1
-    with running.socket(f"{LIVE}&stream_id={tared.stream_id}&from_seq={at}") as socket:
-        after = Taken(socket).until(tared.seq - 10)
+    after = resume(tared, before.seqs[-1] + 1, tared.seq - 10)
     seqs = before.seqs + after.seqs
     assert seqs == list(range(seqs[0], seqs[-1] + 1))
-    assert [s["type"] for s in after.said] == ["hello", "stream"]
+    assert [text["type"] for text in after.texts] == ["hello", "stream"]
     assert after.table()["recomputed"][0].as_py()
 
 
-def test_frames_that_come_late_over_a_broken_link_are_waited_for(
+def test_late_frames_are_waited_for_and_lost_ones_reported(
     running: Running, tared: FakeNode
 ) -> None:
-    with running.socket(LIVE) as socket:
-        taken = Taken(socket)
-        taken.until_said("hello")
+    with subscribe(running) as received:
         tared.send(30, 20.0)
-        taken.until(tared.seq - 10)
-        missed = tared.frames(50, 20.0)
+        received.until(tared.seq - 10)
+        late = tared.frames(50, 20.0)
         tared.send(50, 20.0)
         tared.taken_in()
-        tared.send_again(missed)
+        tared.send_again(late)
         tared.send(10)
-        taken.until(tared.seq - 15)
-    assert taken.seqs == list(range(taken.seqs[0], taken.seqs[-1] + 1))
-    assert {s["type"] for s in taken.said} == {"hello", "stream"}
-
-
-def test_frames_that_will_not_come_are_said_to_be_lost_with_the_reason(
-    running: Running, tared: FakeNode
-) -> None:
-    with running.socket(LIVE) as socket:
-        taken = Taken(socket)
-        taken.until_said("hello")
-        tared.send(30, 20.0)
+        received.until(tared.seq - 15)
+        received.assert_no_gap()
+        assert {text["type"] for text in received.texts} == {"hello", "stream"}
         first = tared.seq
         tared.frames(50)
         tared.say_lost(disk_full=[[first, tared.seq - 1]])
         tared.send(50, 20.0)
-        lost = taken.until_said("lost")
-        taken.until(tared.seq - 10)
+        lost = received.until_text("lost")
+        received.until(tared.seq - 10)
     assert lost == {
         "type": "lost",
         "stream_id": tared.stream_id,
@@ -303,35 +261,29 @@ def test_frames_that_will_not_come_are_said_to_be_lost_with_the_reason(
         "to_seq": first + 49,
         "reason": "disk_full",
     }
-    assert set(taken.seqs).isdisjoint(range(first, first + 50))
+    assert set(received.seqs).isdisjoint(range(first, first + 50))
 
 
-def test_a_node_that_is_switched_on_again_goes_on_with_its_new_stream(
-    running: Running, tared: FakeNode
-) -> None:
-    with running.socket(LIVE + "&columns=grf_n") as socket:
-        taken = Taken(socket)
-        taken.until_said("hello")
+def test_a_restarted_node_continues_with_its_new_stream(running: Running, tared: FakeNode) -> None:
+    with subscribe(running, "&columns=grf_n") as received:
         tared.deliver(45, 20.0)
         before, last = tared.stream_id, tared.seq - 1
         tared.restart()
         tared.come_back()
         tared.send(60, 20.0)
-        taken.until(tared.seq - 10, tared.stream_id)
-    assert [s["stream_id"] for s in taken.said if s["type"] == "stream"] == [
-        before,
-        tared.stream_id,
-    ]
-    assert taken.table(before)["seq"][-1].as_py() == last  # its last 10 ms as well
-    assert taken.table(tared.stream_id)["seq"][0].as_py() == 0
-    assert not [s for s in taken.said if s["type"] == "lost"]
+        received.until(tared.seq - 10, tared.stream_id)
+    streams = [text["stream_id"] for text in received.list_texts("stream")]
+    assert streams == [before, tared.stream_id]
+    assert received.table(before)["seq"][-1].as_py() == last  # without a look-ahead
+    assert received.table(tared.stream_id)["seq"][0].as_py() == 0
+    assert not received.list_texts("lost")
 
 
-def test_a_lossless_client_that_does_not_read_is_told_from_where_to_resume(
+def test_a_lossless_client_that_does_not_read_is_closed_with_its_position(
     running: Running, node_of: NodeOf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(service.api.routes.sockets.live, "TOO_SLOW_S", 0.05)
-    wide = node_of(running, tiles=24)  # what kernels take in on the way is a few seconds of these
+    wide = node_of(running, tiles=24)  # a few seconds of its frames fill the kernels' buffers
     wide.connect()
     wide.tared()
     with running.socket(LIVE, small=True, max_queue=1) as stalled:
@@ -341,40 +293,30 @@ def test_a_lossless_client_that_does_not_read_is_told_from_where_to_resume(
         wide.taken_in()
         with running.socket(LIVE + "&columns=grf_n") as other:
             wide.send(60)
-            Taken(other).until(wide.seq - 10)
-        taken = Taken(stalled)
-        code, reason = _taken_until_closed(taken)
-    assert code == 4008
-    assert taken.seqs == list(range(taken.seqs[0], taken.seqs[-1] + 1))
-    assert f"resume with stream_id={wide.stream_id}&from_seq={taken.seqs[-1] + 1}" in reason
-
-
-def _taken_until_closed(taken: Taken) -> tuple[int, str]:
-    with pytest.raises(ConnectionClosed) as end:
-        taken.until(2**53)
+            Received(other).until(wide.seq - 10)
+        received = Received(stalled)
+        with pytest.raises(ConnectionClosed) as end:
+            received.until(2**53)
     assert end.value.rcvd is not None
-    return int(end.value.rcvd.code), end.value.rcvd.reason
+    assert end.value.rcvd.code == 4008
+    received.assert_no_gap()
+    position = f"stream_id={wide.stream_id}&from_seq={received.seqs[-1] + 1}"
+    assert f"resume with {position}" in end.value.rcvd.reason
 
 
-def test_latest_and_drop_oldest_say_what_they_left_out(running: Running, tared: FakeNode) -> None:
-    for policy in ("latest", "drop_oldest"):
-        first = tared.seq
-        tared.send(10)
-        tared.frames(20)  # these are late
-        tared.send(100, alive=True)
-        tared.taken_in()
-        query = f"&policy={policy}&from_seq={max(0, first - 20)}&columns=grf_n"
-        with running.socket(LIVE + query) as socket:
-            taken = Taken(socket)
-            taken.until_said("hello")
-            tared.send(30)
-            taken.until(tared.seq - 10)
-        left_out = [
-            seq
-            for said in taken.said
-            if said["type"] == "dropped"
-            for seq in range(said["from_seq"], said["to_seq"] + 1)
-        ]
-        everything = sorted([*taken.seqs, *left_out])
-        assert everything == list(range(everything[0], everything[-1] + 1))
-        assert len(taken.seqs) == len(set(taken.seqs))
+def test_a_lossy_policy_reports_dropped_frames(running: Running, tared: FakeNode) -> None:
+    tared.send(10)
+    tared.frames(20)  # these are late
+    tared.send(100, alive=True)
+    tared.taken_in()
+    with subscribe(running, "&policy=latest&from_seq=50&columns=grf_n") as received:
+        tared.send(30)
+        received.until(tared.seq - 10)
+    dropped = [
+        seq
+        for text in received.list_texts("dropped")
+        for seq in range(text["from_seq"], text["to_seq"] + 1)
+    ]
+    every = sorted([*received.seqs, *dropped])
+    assert every == list(range(every[0], every[-1] + 1))
+    assert len(received.seqs) == len(set(received.seqs))

@@ -1,4 +1,4 @@
-"""Getting in by ticket, what a login may do, and what a private server keeps to itself."""
+"""Logins: tickets, cookies, the rights of roles, and private servers."""
 
 from __future__ import annotations
 
@@ -11,34 +11,88 @@ import httpx
 import pytest
 from websockets.exceptions import InvalidStatus
 
-from service.api.logins import TICKET_S
+from service.api.logins import LOGINS_MAX, TICKET_S, TICKETS_MAX, Logins, Role, SecretStore
 from service.protocol import INGEST_PATH, LIVE_PATH
-from tests.service.api.test_guard import CHANGES, TOKEN
-from tests.service.running import Running, ServeWith, assert_refused
+from tests.service.api.access import BEARER, CHANGES, TOKEN
+from tests.service.patient import patient_server
+from tests.service.running import Running, assert_refused
 from tests.waiting import PATIENCE_S
 
-BEARER = {"Authorization": f"Bearer {TOKEN}"}
+
+class Clock:
+    now_s = 1e6
+
+    def __call__(self) -> float:
+        return self.now_s
 
 
 @pytest.fixture
-def guarded(serve_with: ServeWith) -> Running:
-    return serve_with(token=TOKEN)
+def clock() -> Clock:
+    return Clock()
 
 
 @pytest.fixture
-def private(serve_with: ServeWith) -> Running:
-    return serve_with(token=TOKEN, is_private=True)
+def logins(clock: Clock) -> Logins:
+    return Logins(TOKEN, now_s=clock)
 
 
-def ticket(running: Running, role: str = "operator") -> dict[str, Any]:
+@pytest.mark.parametrize("role", list(Role))
+def test_a_cookie_has_its_role_again_and_again(logins: Logins, role: Role) -> None:
+    cookie = logins.cookies.create(role)
+    for _ in range(2):
+        grant = logins.cookies.find_grant(cookie)
+        assert grant is not None
+        assert grant.role is role
+    assert logins.tickets.redeem(cookie) is None
+
+
+def test_a_ticket_is_valid_once_and_is_no_cookie(logins: Logins) -> None:
+    ticket = logins.tickets.create(Role.OPERATOR)
+    assert logins.cookies.find_grant(ticket) is None
+    wrong = ("", ticket[:-1], ticket + "A", ticket.swapcase(), " " + ticket, "\ud800", "x" * 99)
+    for other in wrong:
+        assert logins.tickets.redeem(other) is None
+    assert logins.tickets.redeem(ticket) is not None
+    assert logins.tickets.redeem(ticket) is None
+
+
+def test_a_ticket_is_valid_for_five_minutes(logins: Logins, clock: Clock) -> None:
+    early, late = (logins.tickets.create(Role.VIEWER) for _ in range(2))
+    clock.now_s += TICKET_S - 0.001
+    assert logins.tickets.redeem(early) is not None
+    clock.now_s += 0.002
+    assert logins.tickets.redeem(late) is None
+
+
+@pytest.mark.parametrize(("kind", "most"), [("tickets", TICKETS_MAX), ("cookies", LOGINS_MAX)])
+def test_the_oldest_of_too_many_secrets_is_forgotten(logins: Logins, kind: str, most: int) -> None:
+    store: SecretStore = getattr(logins, kind)
+    secrets = [store.create(Role.OPERATOR) for _ in range(most + 3)]
+    assert [store.find_grant(one) is not None for one in secrets] == [False] * 3 + [True] * most
+    assert len(set(secrets)) == len(secrets)
+    assert all(len(one) >= 22 for one in secrets)  # 128 bits
+    assert not any(one in repr(vars(store)) for one in secrets)
+
+
+# --- over HTTP ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def private(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    folder = tmp_path_factory.mktemp("private")
+    with patient_server(folder / "data", token=TOKEN, is_private=True) as running:
+        yield running
+
+
+def create_ticket(running: Running, role: str = "operator") -> dict[str, Any]:
     answer = running.http.post("/tickets", json={"role": role}, headers=BEARER)
     assert answer.status_code == 201, answer.text
-    given: dict[str, Any] = answer.json()
-    return given
+    ticket: dict[str, Any] = answer.json()
+    return ticket
 
 
 def browser(running: Running) -> httpx.Client:
-    """Keeps cookies, and says where it is when it changes something."""
+    """Return a client that keeps cookies and sends its origin."""
     return httpx.Client(
         base_url=running.url + "/api/v1",
         headers={"Origin": running.url},
@@ -50,68 +104,52 @@ def browser(running: Running) -> httpx.Client:
 @contextmanager
 def logged_in(running: Running, role: str = "operator") -> Iterator[httpx.Client]:
     with browser(running) as client:
-        answer = client.post("/login", json={"ticket": ticket(running, role)["ticket"]})
-        assert answer.status_code == 200, answer.text
-        assert answer.json()["role"] == role
+        answer = client.post("/login", json={"ticket": create_ticket(running, role)["ticket"]})
+        assert (answer.status_code, answer.json()["role"]) == (200, role), answer.text
         yield client
 
 
-def test_a_ticket_becomes_a_cookie_that_no_script_can_read_and_no_other_site_can_send(
-    guarded: Running,
-) -> None:
-    given = ticket(guarded)
-    assert given["urls"] == [f"{guarded.url}/#ticket={given['ticket']}"]
-    with browser(guarded) as client:
-        answer = client.post("/login", json={"ticket": given["ticket"]})
+def cookie_header(client: httpx.Client) -> dict[str, str]:
+    (cookie,) = client.cookies.jar
+    return {"Cookie": f"{cookie.name}={cookie.value}"}
+
+
+def test_a_ticket_becomes_a_cookie_of_this_site_only(guarded: Running) -> None:
+    ticket = create_ticket(guarded)
+    assert ticket["urls"] == [f"{guarded.url}/#ticket={ticket['ticket']}"]
+    with browser(guarded) as client, browser(guarded) as second:
+        answer = client.post("/login", json={"ticket": ticket["ticket"]})
         cookie = answer.headers["set-cookie"]
         name, _, value = cookie.partition(";")[0].partition("=")
         assert name == f"foottile_{guarded.port}"
-        assert value not in (given["ticket"], TOKEN)
+        assert value not in (ticket["ticket"], TOKEN)
         for word in ("HttpOnly", "SameSite=strict", "Path=/", "Max-Age=43200"):
             assert word in cookie
-        assert "Secure" not in cookie  # there is no TLS here, and a browser would not keep it
+        assert "Secure" not in cookie  # without TLS a browser would drop it
         for method, path in CHANGES:
             assert client.request(method, path, json={}).status_code in (404, 422), path
-
-
-def test_a_ticket_that_was_used_is_refused(guarded: Running) -> None:
-    one = ticket(guarded)["ticket"]
-    with browser(guarded) as first, browser(guarded) as second:
-        assert first.post("/login", json={"ticket": one}).status_code == 200
-        refused = second.post("/login", json={"ticket": one})
-        assert_refused(refused, 401, "valid once", "foottile invite")
+        refused = second.post("/login", json={"ticket": ticket["ticket"]})
+        assert_refused(refused, 401, "valid once", "five minutes", "foottile invite")
         assert "set-cookie" not in refused.headers
         assert second.post("/sessions", json={"node": "x", "name": "x"}).status_code == 401
 
 
-def test_an_old_ticket_is_refused(guarded: Running, monkeypatch: pytest.MonkeyPatch) -> None:
-    one = ticket(guarded)["ticket"]
-    now_s = guarded.logins.tickets._now_s
-    monkeypatch.setattr(guarded.logins.tickets, "_now_s", lambda: now_s() + TICKET_S)
-    with browser(guarded) as client:
-        assert_refused(client.post("/login", json={"ticket": one}), 401, "five minutes")
-
-
-def test_the_token_becomes_a_cookie_too(guarded: Running) -> None:
+def test_the_token_becomes_a_cookie(guarded: Running) -> None:
     with browser(guarded) as client:
         assert client.post("/login", json={}, headers=BEARER).json()["role"] == "operator"
         assert client.get("/login").json()["role"] == "operator"
+        assert client.post("/login", json={}).status_code == 401  # a cookie renews no cookie
 
 
-@pytest.mark.parametrize("given", [None, "Bearer x", "Bearer", f"Basic {TOKEN}"])
-def test_nothing_and_a_wrong_token_become_no_cookie(guarded: Running, given: str | None) -> None:
-    headers = {"Authorization": given} if given else {}
+@pytest.mark.parametrize("token", [None, "Bearer x", "Bearer", f"Basic {TOKEN}"])
+def test_a_wrong_token_becomes_no_cookie(guarded: Running, token: str | None) -> None:
+    headers = {"Authorization": token} if token else {}
     answer = guarded.http.post("/login", json={}, headers=headers)
     assert_refused(answer, 401, "ticket")
     assert "set-cookie" not in answer.headers
 
 
-def test_a_login_is_not_renewed_by_itself(guarded: Running) -> None:
-    with logged_in(guarded) as client:
-        assert client.post("/login", json={}).status_code == 401
-
-
-def test_a_viewer_looks_and_cannot_press(guarded: Running) -> None:
+def test_a_viewer_changes_nothing(guarded: Running) -> None:
     with logged_in(guarded, "viewer") as viewer:
         for method, path in CHANGES:
             answer = viewer.request(method, path, json={})
@@ -119,116 +157,101 @@ def test_a_viewer_looks_and_cannot_press(guarded: Running) -> None:
         assert viewer.get("/sessions").status_code == 200
 
 
-def test_a_login_gives_no_tickets_and_is_no_node(guarded: Running) -> None:
-    for role in ("viewer", "operator"):
-        with logged_in(guarded, role) as client:
-            assert_refused(client.post("/tickets", json={"role": role}), 403, "token")
-            (cookie,) = client.cookies.jar
-            headers = {"Cookie": f"{cookie.name}={cookie.value}"}
-            with (
-                pytest.raises(InvalidStatus) as refused,
-                guarded.socket(INGEST_PATH, additional_headers=headers, origin=guarded.url),
-            ):
-                pass
-            assert refused.value.response.status_code == 403
+@pytest.mark.parametrize("role", ["viewer", "operator"])
+def test_a_login_creates_no_ticket_and_is_no_node(guarded: Running, role: str) -> None:
+    with logged_in(guarded, role) as client:
+        assert_refused(client.post("/tickets", json={"role": role}), 403, "token")
+        headers = cookie_header(client)
+        with (
+            pytest.raises(InvalidStatus) as refused,
+            guarded.socket(INGEST_PATH, additional_headers=headers, origin=guarded.url),
+        ):
+            pass
+        assert refused.value.response.status_code == 403
 
 
-def test_a_cookie_changes_nothing_for_who_does_not_say_from_where(guarded: Running) -> None:
-    with logged_in(guarded) as client:
-        del client.headers["Origin"]
-        assert client.post("/sessions", json={"node": "x", "name": "x"}).status_code == 401
-        client.headers["Origin"] = "http://127.0.0.1:1"  # of another port: its cookies are sent
-        assert client.post("/sessions", json={"node": "x", "name": "x"}).status_code == 403
-
-
-def test_beside_a_wrong_token_a_cookie_does_not_count(guarded: Running) -> None:
+def test_a_cookie_needs_the_servers_origin_and_no_wrong_token(guarded: Running) -> None:
     with logged_in(guarded) as client:
         answer = client.post("/nodes/x/tare", headers={"Authorization": "Bearer wrong"})
         assert_refused(answer, 401, "not the server's token")
+        del client.headers["Origin"]
+        assert client.post("/sessions", json={"node": "x", "name": "x"}).status_code == 401
+        client.headers["Origin"] = "http://127.0.0.1:1"  # browsers send cookies to every port
+        assert client.post("/sessions", json={"node": "x", "name": "x"}).status_code == 403
 
 
-@pytest.mark.parametrize("body", [{"ticket": 1}, {"ticket": "x" * 101}, {"more": 1}, [], "x", None])
-def test_what_is_no_login_is_refused(guarded: Running, body: object) -> None:
-    assert guarded.http.post("/login", json=body).status_code == 422
-
-
-@pytest.mark.parametrize("body", [{"role": "own"}, {"role": 3}, {"role": None}, [], {"more": 1}])
-def test_what_is_no_ticket_is_not_given(guarded: Running, body: object) -> None:
-    assert guarded.http.post("/tickets", json=body, headers=BEARER).status_code == 422
+@pytest.mark.parametrize(
+    ("path", "bodies"),
+    [
+        ("/login", [{"ticket": 1}, {"ticket": "x" * 101}, {"more": 1}, [], "x", None]),
+        ("/tickets", [{"role": "own"}, {"role": 3}, {"role": None}, [], {"more": 1}]),
+    ],
+)
+def test_a_wrong_body_is_refused(guarded: Running, path: str, bodies: list[object]) -> None:
+    for body in bodies:
+        assert guarded.http.post(path, json=body, headers=BEARER).status_code == 422, body
 
 
 @pytest.mark.parametrize(
     "value", ["", '"', "x" * 5000, "a=b=c", "\xe9\xff", "%00", "{name}={name}", "; ;;=;"]
 )
-def test_cookies_that_are_none_of_ours_are_nobody(guarded: Running, value: str) -> None:
+def test_a_foreign_cookie_has_no_role(guarded: Running, value: str) -> None:
     cookie = f"foottile_{guarded.port}={value.format(name=f'foottile_{guarded.port}')}"
     headers = [(b"Cookie", cookie.encode("latin-1")), (b"Origin", guarded.url.encode())]
     assert guarded.http.get("/login", headers=headers).json()["role"] is None
-    answer = guarded.http.post("/nodes/x/tare", headers=headers)
-    assert answer.status_code == 401
+    assert guarded.http.post("/nodes/x/tare", headers=headers).status_code == 401
 
 
-def test_a_login_ends_with_the_server_and_it_says_so(guarded: Running) -> None:
+def test_a_login_ends_with_its_server(guarded: Running) -> None:
     with logged_in(guarded) as client:
         before = client.get("/login").json()
         assert before["ends_t_ns"] is not None
         assert not before["ended"]
         guarded.restart()
         after = client.get("/login").json()
-        assert after["ended"]
-        assert after["role"] is None
+        assert (after["ended"], after["role"]) == (True, None)
         assert_refused(client.post("/nodes/x/tare"), 401, "has expired", "restarted")
         assert client.get("/nodes").status_code == 200
 
 
-def test_who_logs_out_is_out(guarded: Running) -> None:
+def test_a_log_out_ends_a_login(guarded: Running) -> None:
     with logged_in(guarded) as client:
-        (cookie,) = client.cookies.jar
+        headers = cookie_header(client)
         assert client.delete("/login").status_code == 204
         assert not client.cookies
-        client.cookies.set(cookie.name, cookie.value or "", domain="127.0.0.1")
-        assert client.get("/login").json()["ended"]
+        assert client.get("/login", headers=headers).json()["ended"]
 
 
-def test_another_site_can_log_nobody_in_or_out(guarded: Running) -> None:
+def test_another_site_logs_nobody_in_or_out(guarded: Running) -> None:
     headers = {"Origin": "http://evil.example"}
     assert guarded.http.post("/login", json={}, headers=headers | BEARER).status_code == 403
     assert guarded.http.delete("/login", headers=headers).status_code == 403
 
 
-OPEN_PATHS = {"/api/v1/login", "/api/v1/ready"}
-
-
-def readable(running: Running) -> list[str]:
-    """Every path that answers a GET, with something in the place of its parameters."""
+def list_readable(running: Running) -> list[str]:
+    """Return every path of a GET, with something in the place of its parameters."""
     api = running.http.get("/openapi.json", headers=BEARER).json()
-    found = [
+    paths = [
         re.sub(r"\{[^}]*\}", "x", path) for path, item in api["paths"].items() if "get" in item
     ]
-    return [
-        *found,
-        "/api/v1/openapi.json",
-        "/api/v1/nothing",
-        "/nothing",
-        "/api/v1/../api/v1/nodes",
-    ]
-
-
-def test_a_private_server_says_nothing_to_who_has_not_logged_in(private: Running) -> None:
-    paths = readable(private)
     assert len(paths) > 20
-    for path in paths:
+    others = ("/api/v1", "/api/v1/openapi.json", "/api/v1/nothing", "/nothing")
+    return [*paths, *others, "/api/v1/../api/v1/nodes"]
+
+
+def test_a_private_server_needs_a_login_for_all_but_its_pages(private: Running) -> None:
+    for path in list_readable(private):
         for method in ("GET", "HEAD", "OPTIONS"):
-            answer = httpx.request(method, private.url + path, trust_env=False)
-            if path in OPEN_PATHS:
-                assert answer.status_code != 401, path
-            else:
-                assert answer.status_code == 401, path
-                assert answer.headers["www-authenticate"] == "Bearer"
+            answer = private.http.request(method, private.url + path)
+            is_open = path in ("/api/v1/login", "/api/v1/ready")
+            assert (answer.status_code == 401) is not is_open, path
+            assert is_open or answer.headers["www-authenticate"] == "Bearer"
     for socket in (LIVE_PATH, INGEST_PATH, LIVE_PATH + "/", "/api/v1//live", "/login", "/"):
         with pytest.raises(InvalidStatus) as refused, private.socket(socket, origin=private.url):
             pass
         assert refused.value.response.status_code == 401, socket
+    for path in ("/", "/sessions/x", "/static/app.js", "/static/style.css", "/docs"):
+        assert private.http.get(private.url + path).status_code == 200, path
 
 
 @pytest.mark.parametrize(
@@ -239,31 +262,23 @@ def test_a_private_server_says_nothing_to_who_has_not_logged_in(private: Running
         *("/API/v1/nodes", "/sessions/", "/api/v1/login/../nodes"),
     ],
 )
-def test_no_other_way_of_writing_a_path_gets_into_a_private_server(
-    private: Running, path: str
-) -> None:
+def test_no_spelling_of_a_path_opens_a_private_server(private: Running, path: str) -> None:
     answer = private.http.get(private.url + path, extensions={"target": path.encode()})
     assert answer.status_code in (401, 404)
     assert "items" not in answer.text
 
 
-def test_a_private_server_shows_pages_without_data(private: Running) -> None:
-    for path in ("/", "/sessions/x", "/static/app.js", "/static/style.css"):
-        assert httpx.get(private.url + path, trust_env=False).status_code == 200, path
-
-
 @pytest.mark.parametrize("role", ["viewer", "operator"])
-def test_who_has_logged_in_sees_a_private_server(private: Running, role: str) -> None:
+def test_a_login_opens_a_private_server(private: Running, role: str) -> None:
     with logged_in(private, role) as client:
-        for path in readable(private):
+        for path in list_readable(private):
             assert client.get(private.url + path).status_code not in (401, 403), path
-        (cookie,) = client.cookies.jar
-        headers = {"Cookie": f"{cookie.name}={cookie.value}"}
+        headers = cookie_header(client)
         with private.socket(LIVE_PATH, additional_headers=headers, origin=private.url) as live:
             assert "hello" in live.recv(timeout=PATIENCE_S)
 
 
-def test_the_token_opens_a_private_server_to_programs(private: Running) -> None:
+def test_the_token_opens_a_private_server(private: Running) -> None:
     assert private.http.get("/sessions", headers=BEARER).status_code == 200
     with private.socket(LIVE_PATH, additional_headers=BEARER) as live:
         assert "hello" in live.recv(timeout=PATIENCE_S)

@@ -1,4 +1,4 @@
-"""Settings as they come from the environment and from files."""
+"""Settings from the environment and from files."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ def no_variables(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("name", [name.upper() for name in Settings.model_fields])
-def test_an_empty_variable_counts_as_not_set(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_empty_variable_is_not_set(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     usual = load_settings(None)
     for empty in ("", "\r", '""'):
         monkeypatch.setenv(f"FOOTTILE_{name}", empty)
         assert load_settings(None) == usual
 
 
-def test_values_of_an_env_file_of_another_system_are_taken(
+def test_quotes_and_line_ends_of_an_env_file_are_removed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("FOOTTILE_TOKEN", '"0123456789abcdef"\r')
@@ -48,12 +48,12 @@ def test_the_port_that_kubernetes_sets_is_ignored(
 
 
 @pytest.mark.parametrize("value", ["robot.local,lab", "robot.local lab", '["robot.local", "lab"]'])
-def test_several_names_fit_into_one_variable(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_variable_has_several_names(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FOOTTILE_ALLOW_HOST", value)
     assert load_settings(None).allow_host == ("robot.local", "lab")
 
 
-def test_a_wrong_value_is_said_with_the_variable_that_has_it(
+def test_a_wrong_value_is_refused_with_its_variable(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("FOOTTILE_PORT", "eight")
@@ -61,7 +61,7 @@ def test_a_wrong_value_is_said_with_the_variable_that_has_it(
         load_settings(None)
 
 
-def test_a_file_may_have_a_byte_order_mark_and_no_empty_folder(tmp_path: Path) -> None:
+def test_a_file_may_have_a_byte_order_mark_and_no_wrong_key(tmp_path: Path) -> None:
     config = tmp_path / "foottile.toml"
     config.write_bytes(b"\xef\xbb\xbfport = 8001\r\nallow_host = ['robot.local']\r\n")
     settings = load_settings(config)

@@ -1,4 +1,4 @@
-"""The page's files over HTTP: compressed for who takes that, and asked for again for nothing."""
+"""Files of the pages over HTTP: compressed on request, and sent once."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def get(running: Running, path: str, **headers: str) -> httpx.Response:
     return running.http.get(running.url + path, headers=headers)
 
 
-def test_a_file_is_the_same_compressed_and_as_it_is(running: Running) -> None:
+def test_a_file_is_the_same_with_and_without_compression(shared: Running) -> None:
     for path in sorted(find_page_folder().rglob("*.*")):
         address = f"/static/{path.relative_to(find_page_folder())}"
-        plain, packed = get(running, address, **PLAIN), get(running, address, **GZIP)
+        plain, packed = get(shared, address, **PLAIN), get(shared, address, **GZIP)
         assert plain.content == packed.content == path.read_bytes(), address
         assert "content-encoding" not in plain.headers
         assert packed.headers["vary"] == plain.headers["vary"] == "Accept-Encoding"
@@ -37,20 +37,20 @@ def test_a_file_is_the_same_compressed_and_as_it_is(running: Running) -> None:
 
 
 @pytest.mark.parametrize("address", ["/", "/sessions/any", "/static/app.js", "/static/style.css"])
-def test_text_goes_compressed_and_once(running: Running, address: str) -> None:
-    first = get(running, address, **GZIP)
+def test_text_is_compressed_and_sent_once(shared: Running, address: str) -> None:
+    first = get(shared, address, **GZIP)
     assert first.headers["content-encoding"] == "gzip"
     assert first.headers["cache-control"] == "no-cache"
-    again = get(running, address, **GZIP, **{"If-None-Match": first.headers["etag"]})
+    again = get(shared, address, **GZIP, **{"If-None-Match": first.headers["etag"]})
     assert (again.status_code, again.content) == (304, b"")
     assert again.headers["etag"] == first.headers["etag"]
     assert again.headers["vary"] == "Accept-Encoding"
-    # The tag of one form is not that of the other: their bytes differ.
-    other = get(running, address, **PLAIN, **{"If-None-Match": first.headers["etag"]})
+    # The other form has other bytes, so it needs a tag of its own.
+    other = get(shared, address, **PLAIN, **{"If-None-Match": first.headers["etag"]})
     assert (other.status_code, other.content) == (200, first.content)
 
 
-def test_a_file_that_was_changed_is_sent_anew(
+def test_a_changed_file_is_sent_again(
     serve_with: ServeWith, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "web"
@@ -60,46 +60,36 @@ def test_a_file_that_was_changed_is_sent_anew(
     first = get(running, "/static/app.js", **GZIP)
     (folder / "app.js").write_text("// another\n" * 20)
     os.utime(folder / "app.js", ns=(1, 1))
-    asked = {**GZIP, "If-None-Match": first.headers["etag"]}
-    assert get(running, "/static/app.js", **asked).text == "// another\n" * 20
+    known = {**GZIP, "If-None-Match": first.headers["etag"]}
+    assert get(running, "/static/app.js", **known).text == "// another\n" * 20
 
 
-def test_a_head_has_the_headers_of_what_it_asks_for(running: Running) -> None:
-    address = f"{running.url}/static/app.js"
-    head = running.http.head(address, headers=GZIP)
+@pytest.mark.parametrize("path", ["/openapi.json", "/sessions", "/nodes"])
+def test_answers_of_the_api_are_not_compressed(shared: Running, path: str) -> None:
+    answer = shared.http.get(path, headers=GZIP)
+    assert answer.status_code == 200
+    assert "content-encoding" not in answer.headers
+
+
+def test_head_has_the_headers_of_the_compressed_file(shared: Running) -> None:
+    url = f"{shared.url}/static/app.js"
+    with shared.http.stream("GET", url, headers=GZIP) as whole:
+        assert gzip.decompress(b"".join(whole.iter_raw())) == (
+            (find_page_folder() / "app.js").read_bytes()
+        )
+    head = shared.http.head(url, headers=GZIP)
     assert head.content == b""
-    whole = get(running, "/static/app.js", **GZIP)
     for name in ("content-length", "content-encoding", "etag", "content-type"):
         assert head.headers[name] == whole.headers[name]
 
 
-def test_answers_of_the_api_are_not_compressed(running: Running) -> None:
-    for path in ("/openapi.json", "/sessions", "/nodes"):
-        answer = running.http.get(path, headers=GZIP)
-        assert answer.status_code == 200
-        assert "content-encoding" not in answer.headers
-
-
-def test_what_is_compressed_is_so_to_the_last_bit_each_time(running: Running) -> None:
-    with running.http.stream("GET", f"{running.url}/static/app.js", headers=GZIP) as answer:
-        sent = b"".join(answer.iter_raw())
-    assert gzip.decompress(sent) == (find_page_folder() / "app.js").read_bytes()
-
-
 @pytest.mark.parametrize(
-    ("accepted", "takes"),
+    ("accepted", "is_accepted"),
     [
-        ("gzip", True),
-        ("GZIP;q=0.5", True),
-        ("br;q=1.0, gzip; q=0.1", True),
-        ("", False),
-        ("br", False),
-        ("gzip;q=0", False),
-        ("gzip; q=0.000", False),
-        ("*", False),
-        ("x-gzip", False),
+        *[(header, True) for header in ("gzip", "GZIP;q=0.5", "br;q=1.0, gzip; q=0.1")],
+        *[(header, False) for header in ("", "br", "gzip;q=0", "gzip; q=0.000", "*", "x-gzip")],
         ("gzipped", False),
     ],
 )
-def test_gzip_is_sent_to_who_names_it(accepted: str, takes: bool) -> None:
-    assert accepts_gzip(accepted) is takes
+def test_gzip_is_sent_where_it_is_named(accepted: str, is_accepted: bool) -> None:
+    assert accepts_gzip(accepted) is is_accepted

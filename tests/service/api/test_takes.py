@@ -1,34 +1,31 @@
-"""Several nodes at once: one session each, with one name and one take."""
+"""Takes: one session of each node under one name, and all sessions in one file."""
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import json
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-import service.api.routes.recordings.sessions
-import service.server.recorder
+import foottile
 from devices.errors import StorageError
+from service.pull import pull_take_export
 from service.sessions.sealing import rebuild_damaged_session_json
+from storage.formats.slice import Slice
+from storage.formats.writers.registry import FORMATS, MULTI_SESSION_FORMATS, get_format
 from storage.sessions.folder import SessionsFolder
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import Running, assert_refused
-from tests.waiting import until
-
-NOBODY = "20200101T000000Z-000000"
-
-
-@pytest.fixture(autouse=True)
-def _frames_of_long_ago(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(service.server.recorder, "MAX_DELAY_S", 1e9)
-    monkeypatch.setattr(service.api.routes.recordings.sessions, "SEAL_TIMEOUT_S", 0.2)
+from tests.service.takes import Take
+from tests.storage.formats.writers.readers import said_in
 
 
 @pytest.fixture
 def feet(running: Running, node_of: NodeOf) -> dict[str, FakeNode]:
-    """Three nodes that have sent something."""
+    """Three tared nodes."""
     found = {name: node_of(running, name) for name in ("left", "right", "spare")}
     for node in found.values():
         node.connect()
@@ -37,126 +34,120 @@ def feet(running: Running, node_of: NodeOf) -> dict[str, FakeNode]:
     return found
 
 
-def take(running: Running, **body: object) -> dict[str, Any]:
+def begin_take(running: Running, **body: object) -> dict[str, Any]:
     answer = running.http.post("/takes", json={"name": "both"} | body)
     assert answer.status_code == 201, answer.text
-    made: dict[str, Any] = answer.json()
-    assert answer.headers["location"] == f"/api/v1/takes/{made['id']}"
-    return made
+    take: dict[str, Any] = answer.json()
+    assert answer.headers["location"] == f"/api/v1/takes/{take['id']}"
+    return take
 
 
-def nodes_of(view: dict[str, Any]) -> list[str]:
-    return [session["node"] for session in view["sessions"]]
+def post(running: Running, take: dict[str, Any], action: str, **body: object) -> dict[str, Any]:
+    answer = running.http.post(f"/takes/{take['id']}/{action}", json=body or None)
+    assert answer.is_success, answer.text
+    changed: dict[str, Any] = answer.json()
+    return changed
 
 
-def test_a_take_is_a_session_of_each_connected_node_with_one_name(
+def nodes_of(take: dict[str, Any]) -> list[str]:
+    return [session["node"] for session in take["sessions"]]
+
+
+def test_a_take_is_a_session_of_each_connected_node(
     running: Running, feet: dict[str, FakeNode]
 ) -> None:
     feet["spare"].leave()
-    until(lambda: not running.node("spare")["connected"])
-    made = take(running, notes="wet", subject="A", tags=["mud"])
-    assert nodes_of(made) == ["left", "right"]
-    assert made["failed"] == {}
-    for session in made["sessions"]:
-        said = {name: session[name] for name in ("name", "take", "notes", "subject", "state")}
-        assert said == {
-            "name": "both",
-            "take": made["id"],
-            "notes": "wet",
-            "subject": "A",
-            "state": "recording",
-        }
+    common = {"name": "both", "notes": "wet", "subject": "A", "tags": ["mud"]}
+    take = begin_take(running, **common)
+    assert (nodes_of(take), take["failed"]) == (["left", "right"], {})
+    for session in take["sessions"]:
+        facts = common | {"take": take["id"], "state": "recording"}
+        assert {name: session[name] for name in facts} == facts
     for name in ("left", "right"):
         feet[name].deliver(50, [5.0, 10.0])
-    stopped = running.http.post(f"/takes/{made['id']}/stop").json()
-    assert nodes_of(stopped) == ["left", "right"]
+    assert nodes_of(post(running, take, "stop")) == ["left", "right"]
     for name in ("left", "right"):
         feet[name].send(30, now=True)
-    for session in made["sessions"]:
+    for session in take["sessions"]:
         recording = running.session(session["id"])
         sealed = recording.sealed()
-        assert sealed["frames"] == 50
-        assert sealed["take"] == made["id"]
-        written = json.loads((recording.folder / "session.json").read_text())
-        assert written["take"] == made["id"]
+        assert (sealed["frames"], sealed["take"]) == (50, take["id"])
+        path = recording.folder / "session.json"
+        assert json.loads(path.read_text())["take"] == take["id"]
+    path.unlink()
+    rebuilt = rebuild_damaged_session_json(SessionsFolder(recording.folder.parent), recording.id)
+    assert rebuilt is not None
+    assert rebuilt.take == take["id"]
 
 
-def test_a_node_that_cannot_be_recorded_says_why_and_the_others_are_recorded(
-    running: Running, feet: dict[str, FakeNode]
-) -> None:
-    feet["right"].leave()
-    until(lambda: not running.node("right")["connected"])
-    made = take(running, nodes=["left", "right", "nobody", "left"])
-    assert nodes_of(made) == ["left"]
-    assert sorted(made["failed"]) == ["nobody", "right"]
-    assert "'right' sends no frames" in made["failed"]["right"]
-    assert "no node 'nobody'" in made["failed"]["nobody"]
-
-
-def test_a_disk_that_takes_one_session_and_not_the_other_is_said_of_that_node(
+def test_a_node_that_cannot_be_recorded_has_a_reason_and_the_others_are_recorded(
     running: Running, feet: dict[str, FakeNode], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    keep = running.server.sessions.save
+    feet["right"].leave()
+    take = begin_take(running, nodes=["left", "right", "nobody", "left"])
+    assert nodes_of(take) == ["left"]
+    assert sorted(take["failed"]) == ["nobody", "right"]
+    assert "'right' sends no frames" in take["failed"]["right"]
+    assert "no node 'nobody'" in take["failed"]["nobody"]
+    feet["right"].connect()
+    feet["right"].deliver(10)
+    save = running.server.sessions.save
 
-    def full_for_right(session: Any) -> Any:
+    def save_or_fail(session: Any) -> Any:
         if session.node == "right":
             raise StorageError("the disk is full", errno=errno.ENOSPC)
-        return keep(session)
+        return save(session)
 
-    monkeypatch.setattr(running.server.sessions, "save", full_for_right)
-    made = take(running, nodes=["left", "right", "spare"])
-    assert nodes_of(made) == ["left", "spare"]
-    assert "full" in made["failed"]["right"]
+    monkeypatch.setattr(running.server.sessions, "save", save_or_fail)
+    take = begin_take(running, nodes=["left", "right", "spare"])
+    assert nodes_of(take) == ["left", "spare"]
+    assert "full" in take["failed"]["right"]
     assert running.node("right")["recording"] == []
 
 
-def test_a_take_that_could_be_recorded_nowhere_is_refused(
+def test_a_take_without_any_recording_is_refused(
     running: Running, feet: dict[str, FakeNode]
 ) -> None:
     answer = running.http.post("/takes", json={"name": "x", "nodes": ["nobody", "noone"]})
     assert_refused(answer, 409, "'nobody'", "'noone'")
     for node in feet.values():
         node.leave()
-    until(lambda: not any(running.node(name)["connected"] for name in feet))
     assert_refused(running.http.post("/takes", json={"name": "x"}), 409, "no node is connected")
     assert running.sessions() == []
 
 
-def test_marking_a_take_marks_all_of_it_at_one_instant_and_once(
+def test_a_marker_of_a_take_is_in_each_session_at_one_instant_once(
     running: Running, feet: dict[str, FakeNode]
 ) -> None:
-    made = take(running)
-    event = {"label": "a stone", "t_ns": 10**18, "id": "0123456789ab"}
-    for _ in range(2):  # the answer was lost
-        answer = running.http.post(f"/takes/{made['id']}/markers", json=event)
-        assert answer.status_code == 201
-        assert nodes_of(answer.json()) == ["left", "right", "spare"]
-    for session in made["sessions"]:
-        markers = running.http.get(f"/sessions/{session['id']}/markers").json()["items"]
-        assert [{name: marker[name] for name in event} for marker in markers] == [event]
-    now = running.http.post(f"/takes/{made['id']}/markers", json={"label": "now"}).json()
+    take = begin_take(running)
+    sessions = [running.session(each["id"]) for each in take["sessions"]]
+    marker = {"label": "a stone", "t_ns": 10**18, "id": "0123456789ab"}
+    for _ in range(2):  # the first answer was lost
+        assert nodes_of(post(running, take, "markers", **marker)) == ["left", "right", "spare"]
+    for session in sessions:
+        (found,) = running.http.get(f"{session.url}/markers").json()["items"]
+        assert {name: found[name] for name in marker} == marker
+    post(running, take, "markers", label="now")
     instants = {
-        running.http.get(f"/sessions/{session['id']}/markers").json()["items"][-1]["t_ns"]
-        for session in now["sessions"]
+        running.http.get(f"{session.url}/markers").json()["items"][-1]["t_ns"]
+        for session in sessions
     }
     assert len(instants) == 1
 
 
-def test_a_node_that_is_lost_in_between_is_marked_and_stopped_with_the_others(
+def test_a_node_away_is_marked_and_stopped_with_its_take(
     running: Running, feet: dict[str, FakeNode]
 ) -> None:
-    made = take(running, nodes=["left", "right"])
+    take = begin_take(running, nodes=["left", "right"])
     feet["left"].deliver(50)
     feet["right"].deliver(50)
     feet["right"].leave()
-    until(lambda: not running.node("right")["connected"])
-    marked = running.http.post(f"/takes/{made['id']}/markers", json={"label": "gone"}).json()
-    assert nodes_of(marked) == ["left", "right"]
-    stopped = running.http.post(f"/takes/{made['id']}/stop").json()
+    assert nodes_of(post(running, take, "markers", label="gone")) == ["left", "right"]
+    stopped = post(running, take, "stop")
     assert stopped["failed"] == {}
     assert [session["state"] for session in stopped["sessions"]] == ["pending", "pending"]
     feet["left"].send(30, now=True)
-    left, right = (running.session(session["id"]) for session in made["sessions"])
+    left, right = (running.session(session["id"]) for session in take["sessions"])
     assert left.sealed()["complete"] is True
     assert right.now()["state"] == "pending"
     feet["right"].come_back()
@@ -164,43 +155,46 @@ def test_a_node_that_is_lost_in_between_is_marked_and_stopped_with_the_others(
     assert right.sealed()["complete"] is True
 
 
-def test_what_was_stopped_alone_is_not_marked_with_its_take_and_stays_as_it_was_stopped(
+def test_a_session_stopped_alone_gets_no_marker_and_keeps_its_stop(
     running: Running, feet: dict[str, FakeNode]
 ) -> None:
-    made = take(running, nodes=["left", "right"])
-    alone = running.session(made["sessions"][0]["id"]).stop()
-    marked = running.http.post(f"/takes/{made['id']}/markers", json={"label": "x"}).json()
-    assert nodes_of(marked) == ["right"]
-    stopped = running.http.post(f"/takes/{made['id']}/stop").json()
+    take = begin_take(running, nodes=["left", "right"])
+    alone = running.session(take["sessions"][0]["id"]).stop()
+    assert nodes_of(post(running, take, "markers", label="x")) == ["right"]
+    stopped = post(running, take, "stop")
     assert nodes_of(stopped) == ["left", "right"]
     assert stopped["sessions"][0]["stopped_t_ns"] == alone["stopped_t_ns"]
-    assert nodes_of(running.http.get(f"/takes/{made['id']}").json()) == ["left", "right"]
-    answer = running.http.post(f"/takes/{made['id']}/markers", json={"label": "late"})
+    assert nodes_of(running.http.get(f"/takes/{take['id']}").json()) == ["left", "right"]
+    answer = running.http.post(f"/takes/{take['id']}/markers", json={"label": "late"})
     assert_refused(answer, 409, "stopped already")
 
 
 def test_sessions_are_listed_by_take(running: Running, feet: dict[str, FakeNode]) -> None:
-    first, second = take(running, nodes=["left", "right"]), take(running, nodes=["left"])
-    alone = feet["spare"].record()
-    for made in (first, second):
-        listed = running.http.get("/sessions", params={"take": made["id"]}).json()["items"]
-        assert sorted(s["id"] for s in listed) == sorted(s["id"] for s in made["sessions"])
+    def list_ids(**query: Any) -> list[str]:
+        items = running.http.get("/sessions", params=query).json()["items"]
+        return sorted(item["id"] for item in items)
+
+    first, second = begin_take(running, nodes=["left", "right"]), begin_take(running)
+    assert feet["spare"].record().now()["take"] is None
+    for take in (first, second):
+        assert list_ids(take=take["id"]) == sorted(s["id"] for s in take["sessions"])
     page = running.http.get("/sessions", params={"take": first["id"], "limit": 1}).json()
-    more = {"take": first["id"], "limit": 1, "cursor": page["next_cursor"]}
-    assert len(running.http.get("/sessions", params=more).json()["items"]) == 1
-    assert running.http.get("/sessions", params={"take": "x"}).json()["items"] == []
-    assert alone.now()["take"] is None
+    assert len(list_ids(take=first["id"], limit=1, cursor=page["next_cursor"])) == 1
+    assert list_ids(take="x") == []
 
 
-@pytest.mark.parametrize("take_id", ["x", "0" * 12, "..", "%2e%2e", "0" * 300, NOBODY])
-def test_a_take_that_there_is_not_is_not_found(running: Running, take_id: str) -> None:
+@pytest.mark.parametrize(
+    "take_id", ["x", "0" * 12, "..", "%2e%2e", "0" * 300, "20200101T000000Z-000000"]
+)
+def test_an_unknown_take_is_not_found(shared: Running, take_id: str) -> None:
     for method, path, body in (
         ("GET", "", None),
+        ("GET", "/data?format=mcap", None),
         ("POST", "/stop", None),
         ("POST", "/markers", {"label": "x"}),
     ):
-        answer = running.http.request(method, f"/takes/{take_id}{path}", json=body)
-        is_index = answer.url.path == "/api/v1"  # of two dots a client makes that
+        answer = shared.http.request(method, f"/takes/{take_id}{path}", json=body)
+        is_index = answer.url.path == "/api/v1"  # a client makes that of two dots
         assert answer.status_code in (404, 405) or is_index, (method, path)
 
 
@@ -211,21 +205,84 @@ def test_a_take_that_there_is_not_is_not_found(running: Running, take_id: str) -
         *({"name": "x", "node": "left"}, {"name": "x", "nodes": [1]}),
         {"name": "x", "pre_roll_s": -1},
     ],
+    ids=str,
 )
-def test_what_is_no_take_is_refused(running: Running, body: dict[str, object]) -> None:
-    assert running.http.post("/takes", json=body).status_code == 422
+def test_a_wrong_take_is_refused(shared: Running, body: dict[str, object]) -> None:
+    assert shared.http.post("/takes", json=body).status_code == 422
 
 
-def test_a_session_that_is_made_again_from_its_file_is_still_of_its_take(
-    running: Running, feet: dict[str, FakeNode]
+# --- all sessions in one file ---------------------------------------------------------------------
+
+
+@pytest.fixture
+def take(running: Running, node_of: NodeOf) -> Take:
+    return Take(running, [node_of(running, name) for name in ("right", "left")]).sealed()
+
+
+def test_a_file_of_a_take_has_all_sessions_until_a_marker_changes_it(take: Take) -> None:
+    http = take.running.http
+    http.post(f"{take.sessions[0].url}/markers", json={"label": "tap"})
+    formats = http.get("/formats").json()["items"]
+    assert {each["name"] for each in formats if each["can_hold_several_sessions"]} == set(
+        MULTI_SESSION_FORMATS
+    )
+    for to in MULTI_SESSION_FORMATS:
+        answer = take.get(to)
+        assert answer.status_code == 200, answer.text
+        assert [each["node"] for each in said_in(to, answer.content)] == ["left", "right"]
+        assert answer.headers["foottile-complete"] == "true"
+        # The marker is of now, and the frames are of long ago.
+        assert answer.headers["foottile-markers"] == "placed=0, left-out=1"
+        name = f"both_take-{take.id}.{FORMATS[to].ending}"
+        assert answer.headers["content-disposition"] == f'attachment; filename="{name}"'
+    first, query = take.get("xdf"), {"format": "xdf"}
+    tag = {"If-None-Match": first.headers["etag"]}
+    assert http.get(take.url, params=query, headers=tag).status_code == 304
+    http.post(f"{take.sessions[1].url}/markers", json={"label": "tap"})
+    assert http.get(take.url, params=query, headers=tag).status_code == 200
+    part = http.get(take.url, params=query | {"end_s": "0.1"}, headers=tag)
+    assert len(part.content) < len(first.content)
+
+
+def test_a_take_that_cannot_be_one_file_is_refused_with_its_session(
+    running: Running, node_of: NodeOf
 ) -> None:
-    made = take(running, nodes=["left"])
-    feet["left"].deliver(50)
-    running.http.post(f"/takes/{made['id']}/stop")
-    feet["left"].send(30, now=True)
-    recording = running.session(made["sessions"][0]["id"])
-    recording.sealed()
-    (recording.folder / "session.json").unlink()
-    again = rebuild_damaged_session_json(SessionsFolder(recording.folder.parent), recording.id)
-    assert again is not None
-    assert again.take == made["id"]
+    take = Take(running, [node_of(running, "left"), node_of(running, "raw", calibration=None)])
+    assert_refused(take.get("mcap"), 409, "session", "is recording", "Stop it")
+    take.sealed()
+    for to in set(FORMATS) - set(MULTI_SESSION_FORMATS):
+        assert_refused(take.get(to), 422, f"{to} holds one session only", *MULTI_SESSION_FORMATS)
+    for to in MULTI_SESSION_FORMATS:
+        answer = take.get(to)
+        if FORMATS[to].needs_forces:
+            assert_refused(answer, 422, "of raw", "this session has none")
+        else:
+            assert [each["node"] for each in said_in(to, answer.content)] == ["left", "raw"]
+    assert_refused(take.get("mcap", start_s=50), 422, "of left", "starts at 50 s")
+    assert_refused(take.get("opensim", body="foot"), 422, "this session has none")
+    assert running.http.get(take.url).status_code == 422  # without a format
+
+
+def test_clients_download_a_take_whole_or_not_at_all(take: Take, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with foottile.connect(take.running.url) as server:
+        pulled = pull_take_export(server, take.id, out, Slice(0.0, 0.1), get_format("mcap"))
+        path = Path(pulled["path"])
+        assert path.name == f"take-{take.id}_0s-0.1s.mcap"
+        assert len(said_in("mcap", path.read_bytes())) == 2
+        with pytest.raises(foottile.UsageError, match="csv holds one session only"):
+            pull_take_export(server, take.id, out, Slice(), get_format("csv"))
+        assert [*out.iterdir()] == [path]
+        assert server.session(take.sessions[0].id).take == take.id
+        mat = server.download_take(take.id, tmp_path / "take.mat", format="mat")
+        assert [each["node"] for each in said_in("mat", mat.read_bytes())] == ["left", "right"]
+        with pytest.raises(foottile.UsageError, match="holds one session only"):
+            server.download_take(take.id, tmp_path / "take.csv", format="csv")
+
+    async def download() -> bytes:
+        async with foottile.connect_async(take.running.url) as server:
+            path: Path = await server.download_take(take.id, tmp_path / "t.xdf", format="xdf")
+            return path.read_bytes()
+
+    assert len(said_in("xdf", asyncio.run(download()))) == 2
+    assert not [*tmp_path.glob(".*")]

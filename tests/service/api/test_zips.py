@@ -1,11 +1,10 @@
-"""Several sessions as one zip file: the files themselves, or nothing that opens."""
+"""Several sessions in one zip file: whole files, or no file that opens."""
 
 from __future__ import annotations
 
 import errno
 import io
 import os
-import threading
 import tracemalloc
 import zipfile
 from email.utils import parsedate_to_datetime
@@ -39,28 +38,28 @@ def two(tared: FakeNode) -> list[Recording]:
     return sessions
 
 
-def asked(running: Running, *ids: str) -> httpx.Response:
+def get(running: Running, *ids: str) -> httpx.Response:
     return running.http.get("/sessions/zip", params={"ids": ",".join(ids)})
 
 
 DATES_S = [0, -1, -(2**31) - 1, 315_532_799, 4_354_819_200, 2**32, 253_402_300_800, 2**56]
-"""1970, before it, 1901, just outside of what a zip can state, 2106, 10000, beyond all years."""
+"""1970, before it, 1901, just outside of the years of a zip file, 2106, 10000, beyond all years."""
 
 
 def date_files(monkeypatch: pytest.MonkeyPatch, dated_s: int) -> None:
-    """Have every file's last change at some instant, which not every file system can keep."""
-    real = Path.stat
+    """Set the last change of every file, also to dates that a file system cannot store."""
+    stat = Path.stat
 
-    def stat(self: Path, **how: Any) -> os.stat_result:
-        fields = list(real(self, **how))
+    def stat_dated(self: Path, **options: Any) -> os.stat_result:
+        fields = list(stat(self, **options))
         fields[8] = dated_s
         return os.stat_result(fields)
 
-    monkeypatch.setattr(Path, "stat", stat)
+    monkeypatch.setattr(Path, "stat", stat_dated)
 
 
 @pytest.mark.parametrize("dated_s", DATES_S)
-def test_a_zip_is_whole_whatever_the_date_of_a_file(
+def test_any_date_of_a_file_is_sent(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dated_s: int
 ) -> None:
     folder = tmp_path / "20200101T000000Z-00000a"
@@ -69,6 +68,10 @@ def test_a_zip_is_whole_whatever_the_date_of_a_file(
         (folder / name).write_bytes(name.encode())
     sealed = ZippedSession(folder, compute_sha256(folder / "frames.parquet"))
     date_files(monkeypatch, dated_s)
+    answer = file_response(folder / "frames.parquet")
+    assert answer.headers["content-length"] == str(len("frames.parquet"))
+    modified = parsedate_to_datetime(answer.headers["last-modified"])
+    assert (modified.year < 1970) == (dated_s < 0)
     content = b"".join(stream_zip([sealed]))
     with zipfile.ZipFile(io.BytesIO(content)) as file:
         assert file.testzip() is None
@@ -79,29 +82,16 @@ def test_a_zip_is_whole_whatever_the_date_of_a_file(
             assert (years < 2000) == (dated_s < 946_684_800)
 
 
-@pytest.mark.parametrize("dated_s", DATES_S)
-def test_a_stored_file_is_sent_whatever_its_date(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dated_s: int
-) -> None:
-    path = tmp_path / "frames.parquet"
-    path.write_bytes(b"PAR1")
-    date_files(monkeypatch, dated_s)
-    answer = file_response(path)
-    assert answer.headers["content-length"] == "4"
-    said = parsedate_to_datetime(answer.headers["last-modified"])
-    assert (said.year < 1970) == (dated_s < 0)
-
-
-def test_what_fails_before_the_first_byte_is_an_error_and_no_empty_file(
+def test_a_failure_before_the_first_byte_is_an_error(
     two: list[Recording], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(zipfile.ZipFile, "open", refusing(OSError, errno.EIO, "Input/output error"))
-    answer = asked(two[0].running, two[0].id)
+    answer = get(two[0].running, two[0].id)
     assert_refused(answer, 507, "Input/output error")
 
 
-def test_a_zip_has_the_very_files_and_they_are_proven(two: list[Recording], tmp_path: Path) -> None:
-    answer = asked(two[0].running, *(session.id for session in two), two[0].id)
+def test_a_zip_has_the_files_of_its_sessions(two: list[Recording], tmp_path: Path) -> None:
+    answer = get(two[0].running, *(session.id for session in two), two[0].id)
     assert answer.status_code == 200
     assert answer.headers["content-type"] == "application/zip"
     assert 'filename="foottile-2-sessions.zip"' in answer.headers["content-disposition"]
@@ -110,9 +100,9 @@ def test_a_zip_has_the_very_files_and_they_are_proven(two: list[Recording], tmp_
         names = file.namelist()
         assert len(names) == len(set(names))
         for session in two:
-            mine = {name.split("/")[1] for name in names if name.startswith(f"{session.id}/")}
-            assert mine >= FILES
-            for name in mine:
+            files = {name.split("/")[1] for name in names if name.startswith(f"{session.id}/")}
+            assert files >= FILES
+            for name in files:
                 entry = f"{session.id}/{name}"
                 assert file.read(entry) == (session.folder / name).read_bytes(), entry
                 assert file.getinfo(entry).compress_type == zipfile.ZIP_STORED
@@ -121,25 +111,23 @@ def test_a_zip_has_the_very_files_and_they_are_proven(two: list[Recording], tmp_
         assert verify_session(tmp_path / session.id).problems == []
 
 
-def test_what_has_no_whole_file_is_refused_before_anything_is_sent(
-    two: list[Recording], tared: FakeNode
-) -> None:
+def test_a_session_without_a_whole_file_is_refused(two: list[Recording], tared: FakeNode) -> None:
     running = two[0].running
-    runs = tared.record()
-    assert_refused(asked(running, two[0].id, runs.id), 409, runs.id, "recording")
-    assert_refused(asked(running, "20200101T000000Z-000000"), 404, "20200101T000000Z-000000")
-    assert_refused(asked(running, "../trash"), 404)
-    assert_refused(asked(running, " , "), 422, "0 sessions")
-    assert_refused(asked(running, *(f"a{i}" for i in range(1001))), 422, "1001 sessions")
+    recording = tared.record()
+    assert_refused(get(running, two[0].id, recording.id), 409, recording.id, "recording")
+    assert_refused(get(running, "20200101T000000Z-000000"), 404, "20200101T000000Z-000000")
+    assert_refused(get(running, "../trash"), 404)
+    assert_refused(get(running, " , "), 422, "0 sessions")
+    assert_refused(get(running, *(f"a{i}" for i in range(1001))), 422, "1001 sessions")
     assert running.http.get("/sessions/zip").status_code == 422
     running.http.delete(two[1].url)
-    assert_refused(asked(running, two[0].id, two[1].id), 404, two[1].id, "trash")
+    assert_refused(get(running, two[0].id, two[1].id), 404, two[1].id, "trash")
     (two[0].folder / "frames.parquet").unlink()
-    assert_refused(asked(running, two[0].id), 404, "is missing")
+    assert_refused(get(running, two[0].id), 404, "is missing")
 
 
-def taken(running: Running, *ids: str) -> bytes:
-    """What came of a download that breaks off."""
+def read_until_cut(running: Running, *ids: str) -> bytes:
+    """Return the bytes of a download that breaks off."""
     content = b""
     with running.http.stream("GET", "/sessions/zip", params={"ids": ",".join(ids)}) as answer:
         assert answer.status_code == 200
@@ -151,49 +139,35 @@ def taken(running: Running, *ids: str) -> bytes:
     pytest.fail("it did not break off")
 
 
-def test_of_a_damaged_session_there_is_no_zip_that_opens(two: list[Recording]) -> None:
+def test_a_zip_of_a_damaged_session_does_not_open(two: list[Recording]) -> None:
     path = two[1].folder / "frames.parquet"
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
     with pytest.raises(zipfile.BadZipFile):
-        zipfile.ZipFile(io.BytesIO(taken(two[0].running, two[0].id, two[1].id)))
+        zipfile.ZipFile(io.BytesIO(read_until_cut(two[0].running, two[0].id, two[1].id)))
 
 
-def test_of_a_session_that_is_deleted_on_the_way_there_is_no_zip_that_opens(
+def test_a_zip_of_a_session_deleted_meanwhile_does_not_open(
     two: list[Recording], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     running = two[0].running
-    real, begun, deleted = (
-        service.api.routes.downloads.zips._put,
-        threading.Event(),
-        threading.Event(),
-    )
+    put = service.api.routes.downloads.zips._put
 
-    def slow(*args: Any) -> Any:
-        if args[2].parent.name == two[1].id:
-            begun.set()
-            assert deleted.wait(30)
-        return real(*args)
+    def delete_and_put(*arguments: Any) -> Any:
+        if arguments[2].parent.name == two[1].id:
+            with running.client() as http:
+                assert http.delete(two[1].url).status_code == 204
+        return put(*arguments)
 
-    monkeypatch.setattr(service.api.routes.downloads.zips, "_put", slow)
-
-    def delete() -> None:
-        assert begun.wait(30)
-        with running.client() as http:
-            assert http.delete(two[1].url).status_code == 204
-        deleted.set()
-
-    deleting = threading.Thread(target=delete)
-    deleting.start()
-    content = taken(running, two[0].id, two[1].id)
-    deleting.join()
+    monkeypatch.setattr(service.api.routes.downloads.zips, "_put", delete_and_put)
+    content = read_until_cut(running, two[0].id, two[1].id)
     assert len(content) > 1000  # the first one had gone out
     with pytest.raises(zipfile.BadZipFile):
         zipfile.ZipFile(io.BytesIO(content))
 
 
-def test_its_memory_does_not_grow_with_the_files(tmp_path: Path) -> None:
+def test_memory_does_not_grow_with_the_files(tmp_path: Path) -> None:
     folder = tmp_path / "20200101T000000Z-000000"
     folder.mkdir()
     (folder / "frames.parquet").write_bytes(b"\0" * (40 << 20))

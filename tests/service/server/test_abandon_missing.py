@@ -1,4 +1,4 @@
-"""Sessions whose streams the server or the node knows little of, or nothing any more."""
+"""Sessions whose stream the server or the node has lost."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ pytestmark = pytest.mark.real_time
 
 @pytest.fixture
 def session(tared: FakeNode) -> Recording:
-    """A recording of which fifty frames are here, and thirty were taken and not sent."""
+    """A recording of fifty stored frames, and of thirty that the node has not sent."""
     recording = tared.record()
     tared.deliver(50)
     tared.frames(30)
     return recording
 
 
-def forgotten(running: Running, tared: FakeNode) -> None:
-    """The server has lost all that it knew of the node but its sessions."""
+def lose_node(running: Running, tared: FakeNode) -> None:
+    """Delete all files of the node on the server but its sessions."""
     running.stop()
-    for what in ("nodes", "journal"):
-        shutil.rmtree(running.data / what / tared.name)
+    for folder in ("nodes", "journal"):
+        shutil.rmtree(running.data / folder / tared.name)
     running.start()
 
 
-def test_what_is_given_up_of_a_stream_whose_end_is_known_is_counted_frame_by_frame(
+def test_abandoned_frames_of_a_stream_with_a_known_end_are_counted(
     tared: FakeNode, session: Recording
 ) -> None:
     tared.restart()
@@ -40,19 +40,16 @@ def test_what_is_given_up_of_a_stream_whose_end_is_known_is_counted_frame_by_fra
     answer = session.running.http.post(f"{session.url}/abandon-missing")
     assert answer.status_code == 200, answer.text
     sealed = session.sealed()
-    assert sealed["lost"] == {"abandoned": 30}
-    assert (sealed["frames"], sealed["max_lost_tail_frames"], sealed["complete"]) == (
-        50,
-        0,
-        "lossy",
-    )
+    assert sealed["lost"] == {"is_abandoned": 30}
+    counts = (sealed["frames"], sealed["max_lost_tail_frames"], sealed["complete"])
+    assert counts == (50, 0, "lossy")
 
 
-def test_a_stream_that_is_not_announced_yet_is_waited_for_and_comes_whole(
+def test_a_session_waits_for_a_stream_that_is_not_announced(
     running: Running, tared: FakeNode, session: Recording
 ) -> None:
     tared.leave()
-    forgotten(running, tared)
+    lose_node(running, tared)
     (listed,) = running.sessions()
     assert (listed["state"], listed["frames"], listed["complete"]) == ("recording", 0, False)
     assert session.stop()["pending_reason"] == "end"
@@ -62,14 +59,14 @@ def test_a_stream_that_is_not_announced_yet_is_waited_for_and_comes_whole(
     assert (sealed["frames"], sealed["complete"]) == (80, True)
 
 
-def test_a_stream_that_has_vanished_on_both_sides_leaves_no_session_open_for_ever(
+def test_a_stream_lost_on_both_sides_seals_its_session(
     running: Running, tared: FakeNode, session: Recording
 ) -> None:
     tared.leave()
-    forgotten(running, tared)
+    lose_node(running, tared)
     session.stop()
     tared.reboot()
     tared.connect()
     sealed = session.sealed()
     assert (sealed["frames"], sealed["complete"]) == (0, "lossy")
-    assert sealed["max_lost_tail_frames"] > 0, "nobody knows how many there were"
+    assert sealed["max_lost_tail_frames"] > 0

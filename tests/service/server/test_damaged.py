@@ -1,4 +1,4 @@
-"""A server that finds its files damaged starts, says what it found, and gives no wrong number."""
+"""Damaged files of a server: it starts, names them, and shows no wrong number."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def flip(path: Path, before: bytes, after: bytes) -> None:
     path.write_bytes(text[:at] + after + text[at + len(before) :])
 
 
-def problems(running: Running) -> str:
+def list_problems(running: Running) -> str:
     return " ".join(running.http.get("/health").json()["problems"])
 
 
-def shown(running: Running, node: FakeNode) -> dict[str, Any]:
-    """What a screen gets of the next frames."""
+def receive_frame(running: Running, node: FakeNode) -> dict[str, Any]:
+    """Return a live message of the next frames."""
     with running.socket("/api/v1/live?rate_hz=60") as live:
         assert json.loads(live.recv(timeout=PATIENCE_S))["type"] == "hello"
         node.deliver(60, 3.0)
@@ -46,7 +46,7 @@ def shown(running: Running, node: FakeNode) -> dict[str, Any]:
 
 @pytest.fixture
 def lost(running: Running, tared: FakeNode) -> FakeNode:
-    """The node, whose tare was damaged while the server was down."""
+    """A node whose tare was damaged while the server was down."""
     running.stop()
     path = running.data / "nodes" / "bench" / "tares.json"
     flip(path, b'"baseline_kpa": [100.', b'"baseline_kpa": [102.')
@@ -55,18 +55,18 @@ def lost(running: Running, tared: FakeNode) -> FakeNode:
     return tared
 
 
-def test_while_a_tare_is_lost_no_force_is_known_and_everybody_says_so(
-    running: Running, lost: FakeNode
-) -> None:
+def test_while_a_tare_is_lost_no_force_is_known(running: Running, lost: FakeNode) -> None:
     node = running.node()
     assert node["tare"] is None
     assert "damaged and lost" in node["tare_problem"]
-    assert "tares.json.damaged-1" in problems(running)
-    message = shown(running, lost)
+    assert "tares.json.damaged-1" in list_problems(running)
+    message = receive_frame(running, lost)
     assert message["gauge_kpa"] == message["force_n"] == [None, None]
     assert message["grf_n"] is None
     assert message["contact"] is None
     assert message["estimate_flags"] & LOST
+    # The lead, which the server has seen, is not tared again.
+    assert running.http.get("/nodes/bench/tares").json()["items"] == []
     recording = lost.record()
     lost.deliver(100, 3.0, now=True)
     sealed = lost.finish(recording)
@@ -78,16 +78,14 @@ def test_while_a_tare_is_lost_no_force_is_known_and_everybody_says_so(
         assert [tare["source"] for tare in reader.notes["tares"]] == ["lost"]
 
 
-def test_a_tare_by_hand_ends_that_in_the_middle_of_a_session(
-    running: Running, lost: FakeNode
-) -> None:
+def test_a_tare_by_hand_replaces_a_lost_one(running: Running, lost: FakeNode) -> None:
     lost.deliver(10)
     recording = lost.record()
     lost.deliver(300, alive=True, now=True)
     answer = running.http.post("/nodes/bench/tare", json={})
     assert answer.status_code == 201, answer.text
     assert running.node()["tare_problem"] is None
-    message = shown(running, lost)
+    message = receive_frame(running, lost)
     assert message["force_n"] == pytest.approx([3.0, 3.0], abs=0.05)
     assert not message["estimate_flags"] & LOST
     lost.finish(recording)
@@ -100,17 +98,8 @@ def test_a_tare_by_hand_ends_that_in_the_middle_of_a_session(
     assert running.http.get("/health").json()["problems"] == []
 
 
-def test_a_lead_that_was_seen_before_does_not_come_back_in_place_of_a_lost_tare(
-    running: Running, lost: FakeNode
-) -> None:
-    lost.deliver(100)
-    node = running.node()
-    assert node["tare"] is None
-    assert running.http.get("/nodes/bench/tares").json()["items"] == []
-
-
 @pytest.mark.parametrize("is_one_between", [False, True])
-def test_a_session_has_forces_if_a_proven_tare_was_taken_between_it_and_a_lost_one(
+def test_a_session_has_forces_if_a_later_tare_precedes_the_lost_one(
     running: Running, tared: FakeNode, *, is_one_between: bool
 ) -> None:
     pending = tared.record()
@@ -127,7 +116,7 @@ def test_a_session_has_forces_if_a_proven_tare_was_taken_between_it_and_a_lost_o
         TareHistory(path).store_and_apply_tare(replace(by_lead, t_ns=t_ns, source="unloaded"), info)
     flip(path, b'"undone": false', b'"undone": true ')
     running.start()
-    assert "1 tare is lost" in problems(running)
+    assert "1 tare is lost" in list_problems(running)
     tared.connect()
     tared.send(10, now=True)
     problem = pending.sealed()["problem"]
@@ -138,14 +127,14 @@ def test_a_session_has_forces_if_a_proven_tare_was_taken_between_it_and_a_lost_o
         assert problem is None
         assert not is_lost.any()
         assert grf_n == pytest.approx(10.0, abs=0.1)
-    else:  # it may have been taken right after the lead
+    else:  # the lost one may be of right after the lead
         assert "a tare is damaged and lost" in problem
         assert is_lost.all()
         assert np.isnan(grf_n).all()
 
 
 @pytest.mark.parametrize("damage", ["flip", "folder", "of another node", "another version"])
-def test_a_node_whose_hello_is_damaged_is_known_again_when_it_connects(
+def test_a_node_with_a_damaged_hello_is_unknown_until_it_connects(
     running: Running, tared: FakeNode, node_of: Any, damage: str
 ) -> None:
     other = node_of(running, "other")
@@ -169,7 +158,7 @@ def test_a_node_whose_hello_is_damaged_is_known_again_when_it_connects(
             write_checksummed_json(path, b'{"type":"hello","protocol":1,"first_seq":0}')
     running.start()
     assert [node["node"] for node in running.http.get("/nodes").json()["items"]] == ["other"]
-    assert "hello.json" in problems(running)
+    assert "hello.json" in list_problems(running)
     assert path.with_name("hello.json.damaged-1").exists() == (damage != "another version")
     assert pending.now()["state"] == "pending"
     with running.socket("/api/v1/live") as live:
@@ -183,7 +172,7 @@ def test_a_node_whose_hello_is_damaged_is_known_again_when_it_connects(
     read_checksummed_json(path)
 
 
-def test_a_lock_or_probe_that_is_no_file_keeps_nobody_from_starting(
+def test_a_server_starts_beside_a_lock_and_a_probe_that_are_no_files(
     running: Running, tared: FakeNode
 ) -> None:
     running.stop()
@@ -196,7 +185,7 @@ def test_a_lock_or_probe_that_is_no_file_keeps_nobody_from_starting(
 
 
 @pytest.mark.parametrize("odd", ["\x1b[31mred", "\udcff", "two\nlines", "\u202eoverridden"])
-def test_whatever_a_file_is_called_everybody_can_be_told_of_it(
+def test_a_problem_of_any_file_name_is_printable(
     running: Running, tared: FakeNode, odd: str
 ) -> None:
     running.stop()
@@ -205,15 +194,15 @@ def test_whatever_a_file_is_called_everybody_can_be_told_of_it(
     (running.data / "nodes" / odd).mkdir()
     write_checksummed_json(running.data / "nodes" / odd / "hello.json", b'{"a": 1}')
     running.start()
-    said = problems(running)
-    assert "it is not a file" in said
-    assert "not this node's last hello" in said
-    assert said.isprintable()
+    text = list_problems(running)
+    assert "it is not a file" in text
+    assert "not this node's last hello" in text
+    assert text.isprintable()
     with running.socket("/api/v1/live") as live:
         assert json.loads(live.recv(timeout=PATIENCE_S))["problems"]
 
 
-def test_a_hello_of_another_version_is_told_in_one_sentence(
+def test_a_hello_of_another_version_is_named_in_one_sentence(
     running: Running, tared: FakeNode
 ) -> None:
     running.stop()
@@ -222,6 +211,6 @@ def test_a_hello_of_another_version_is_told_in_one_sentence(
     hello = json.loads(content) | {"older": 1}
     write_checksummed_json(path, json.dumps(hello).encode())
     running.start()
-    said = problems(running)
-    assert "written by another version, or edited (older: Extra inputs are not permitted)" in said
-    assert "validation error" not in said
+    text = list_problems(running)
+    assert "written by another version, or edited (older: Extra inputs are not permitted)" in text
+    assert "validation error" not in text

@@ -1,4 +1,4 @@
-"""Whatever dies or is replaced, a name belongs to one machine, and that machine gets in again."""
+"""Identities of nodes: a name belongs to one machine until a person accepts another one."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ SERVER, NODE, NOW_T_NS = "5" * 32, "leg", 1_800_000_000 * 10**9
 ADDRESS = "192.168.4.7"
 
 
-class _Killed(Exception):  # noqa: N818  # no error: where a process ends
+class _Killed(Exception):  # noqa: N818  # no error: the end of a process
     pass
 
 
 class Machine:
-    """A node's end: its folder, and what it answers as `service.node.publisher` does."""
+    """A node's end: its folder, and its proofs, like those of `service.node.publisher`."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -80,66 +80,50 @@ def stranger(tmp_path: Path) -> Machine:
     return Machine(tmp_path / "stranger")
 
 
+EVENTS = ["share", "keep", "connects", "server restarts", "server loses it", "stranger"]
+
+
 @settings(deadline=None, max_examples=60)
-@given(
-    happened=st.lists(
-        st.sampled_from(
-            ["share", "keep", "connects", "server restarts", "server loses it", "stranger"]
-        ),
-        max_size=8,
-    )
-)
-def test_whatever_dies_when_the_machine_that_was_first_is_let_in_without_a_person(
-    happened: list[str],
-) -> None:
+@given(events=st.lists(st.sampled_from(EVENTS), max_size=8))
+def test_the_first_machine_is_accepted_whatever_dies(events: list[str]) -> None:
     with TemporaryDirectory() as folder:
         data = Path(folder) / "data"
         server, machine = NodeIdentities(data), Machine(Path(folder) / "machine")
-        assert machine.connect(server)
-        for what in happened:
-            is_kept = (data / "nodes" / NODE / SECRETS_NAME).exists()
-            if what in ("share", "keep"):
+        for event in events:
+            is_stored = (data / "nodes" / NODE / SECRETS_NAME).exists()
+            if event in ("share", "keep"):
                 with pytest.raises(_Killed):
-                    machine.connect(server, dies_after=what)
-            elif what == "connects":
+                    machine.connect(server, dies_after=event)
+            elif event == "connects":
                 assert machine.connect(server)
-            elif what == "server restarts":
+            elif event == "server restarts":
                 server = NodeIdentities(data)
-            elif what == "server loses it":  # an older copy of its folder, say
+            elif event == "server loses it":  # with an older copy of its folder
                 shutil.rmtree(data / "nodes", ignore_errors=True)
-            elif is_kept:
+            elif is_stored:
                 assert not Machine(Path(folder) / "stranger").connect(server)
         assert machine.connect(server)
 
 
-def test_a_first_contact_that_dies_anywhere_locks_nobody_out(
-    server: NodeIdentities, machine: Machine
-) -> None:
-    for step in ("share", "keep", "share"):
-        with pytest.raises(_Killed):
-            machine.connect(server, dies_after=step)
-    assert machine.connect(server)
-
-
-def test_a_person_decides_and_from_then_on_the_machine_before_is_refused(
+def test_an_accepted_machine_replaces_the_first_one(
     server: NodeIdentities, machine: Machine, stranger: Machine
 ) -> None:
     assert machine.connect(server)
     assert not stranger.connect(server)
-    # It proved that it has a secret, and now shows it: else nobody could accept it.
+    # At first it proved its secret; now it shows it, so that a person can accept it.
     assert not stranger.connect(server)
-    asking = server.refused_machines[NODE]
-    assert (asking.fingerprint, asking.address) == (stranger.fingerprint, ADDRESS)
+    refused = server.refused_machines[NODE]
+    assert (refused.fingerprint, refused.address) == (stranger.fingerprint, ADDRESS)
     server.accept_replacement(NODE, stranger.fingerprint)
     assert stranger.connect(server)
     assert not machine.connect(server)
-    assert NODE not in server.refused_machines, "it has shown a proof only"
+    assert NODE not in server.refused_machines, "it showed a proof only"
     assert not machine.connect(server)
     assert server.refused_machines[NODE].fingerprint == machine.fingerprint
     assert stranger.connect(NodeIdentities(server._nodes.parent))
 
 
-def test_only_the_machine_that_was_looked_at_is_accepted(
+def test_only_the_last_refused_machine_is_accepted(
     server: NodeIdentities, machine: Machine, stranger: Machine, tmp_path: Path
 ) -> None:
     with pytest.raises(StateError, match="no other machine"):
@@ -153,7 +137,7 @@ def test_only_the_machine_that_was_looked_at_is_accepted(
     assert machine.connect(server)
 
 
-def test_a_disk_that_takes_nothing_leaves_the_machine_before_in_force(
+def test_a_full_disk_leaves_the_first_machine_accepted(
     server: NodeIdentities,
     machine: Machine,
     stranger: Machine,
@@ -171,7 +155,7 @@ def test_a_disk_that_takes_nothing_leaves_the_machine_before_in_force(
     assert server.refused_machines[NODE].fingerprint == fingerprint
 
 
-def test_a_secret_that_was_damaged_is_named_and_the_node_is_let_in(
+def test_a_damaged_secret_is_named_and_stored_again(
     server: NodeIdentities, machine: Machine, stranger: Machine, tmp_path: Path
 ) -> None:
     assert machine.connect(server)
@@ -182,7 +166,7 @@ def test_a_secret_that_was_damaged_is_named_and_the_node_is_let_in(
     assert not stranger.connect(server)
 
 
-def test_a_secret_that_cannot_be_read_now_lets_nobody_in(
+def test_an_unreadable_secret_refuses_every_machine(
     server: NodeIdentities, machine: Machine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert machine.connect(server)
@@ -197,7 +181,7 @@ def test_a_secret_that_cannot_be_read_now_lets_nobody_in(
     "answer",
     [Proof, lambda: Proof(proof=generate_secret()), lambda: Proof(secret=generate_secret())],
 )
-def test_no_answer_but_the_right_one_is_that_of_the_node(
+def test_a_wrong_proof_is_refused(
     server: NodeIdentities, machine: Machine, answer: Callable[[], Proof]
 ) -> None:
     assert machine.connect(server)

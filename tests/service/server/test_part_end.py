@@ -1,4 +1,4 @@
-"""Sessions over several streams of a node: which frames belong to them, whatever came between."""
+"""Sessions over several streams of a node: which frames of each stream belong to them."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from tests.waiting import until
 
 @pytest.fixture
 def session(tared: FakeNode) -> Recording:
-    """A session of fifty frames, 70 to 119, whose node has left then."""
+    """A session of fifty frames, 70 to 119; its node has left."""
     session = tared.record()
     tared.deliver(50)
     tared.leave()
     return session
 
 
-def reboot_now(node: FakeNode) -> None:
+def restart_now(node: FakeNode) -> None:
     """Begin a new stream whose first frame is taken now."""
     node.reboot()
     node.next_t_mono_ns = time.monotonic_ns()
 
 
-def test_streams_that_were_taken_while_the_link_was_down_are_parts_and_nothing_is_lost(
+def test_streams_taken_without_a_link_are_parts_of_a_session(
     running: Running, tared: FakeNode, session: Recording
 ) -> None:
     tared.frames(30)
@@ -62,9 +62,7 @@ def test_streams_that_were_taken_while_the_link_was_down_are_parts_and_nothing_i
     assert running.node()["lost_frames"] == 0
 
 
-def test_it_goes_on_so_although_the_server_is_restarted_between_any_two_steps(
-    running: Running, tared: FakeNode
-) -> None:
+def test_restarts_of_the_server_change_no_part(running: Running, tared: FakeNode) -> None:
     session = tared.record()
     tared.deliver(50)
     running.restart()
@@ -85,14 +83,16 @@ def test_it_goes_on_so_although_the_server_is_restarted_between_any_two_steps(
     assert whole_parts_of(sealed) == [(first.stream_id, 70, 149), (tared.stream_id, 0, 9)]
 
 
-@pytest.mark.parametrize(("said", "open_tail"), [(250, 200), (30, 0), (50, 0)])
-def test_a_tail_that_a_power_cut_left_open_is_shorter_by_what_the_server_has_of_it(
-    tared: FakeNode, session: Recording, said: int, open_tail: int
+@pytest.mark.parametrize(("announced", "open_tail"), [(250, 200), (30, 0), (50, 0)])
+def test_the_servers_frames_shorten_the_tail_of_a_power_cut(
+    tared: FakeNode, session: Recording, announced: int, open_tail: int
 ) -> None:
     tared.reboot()
     [first] = tared.before
-    # The last fifty frames are here, and were lost there when the power failed.
-    tared.connect(earlier=(first.said(stored=((0, 69),), next_seq=70, max_lost_tail_frames=said),))
+    # The server has the last fifty frames, which the node lost when its power failed.
+    tared.connect(
+        earlier=(first.said(stored=((0, 69),), next_seq=70, max_lost_tail_frames=announced),)
+    )
     sealed = tared.finish(session)
     assert parts_of(sealed)[0] == (first.stream_id, 70, 119)
     part = session.ledger()["parts"][0]
@@ -101,7 +101,9 @@ def test_a_tail_that_a_power_cut_left_open_is_shorter_by_what_the_server_has_of_
     assert sealed["max_lost_tail_frames"] == open_tail
 
 
-def test_what_an_earlier_stream_lost_is_named(tared: FakeNode, session: Recording) -> None:
+def test_losses_of_an_earlier_stream_have_their_reasons(
+    tared: FakeNode, session: Recording
+) -> None:
     tared.frames(30)
     tared.reboot()
     [first] = tared.before
@@ -116,37 +118,31 @@ def test_what_an_earlier_stream_lost_is_named(tared: FakeNode, session: Recordin
     assert ledger["missed_slots"] == sealed["missed_slots"] == 7
 
 
-def test_a_stop_while_the_node_was_away_falls_into_the_stream_that_was_taken_then(
-    tared: FakeNode, session: Recording
-) -> None:
+def test_a_stop_falls_into_the_stream_of_its_time(tared: FakeNode, session: Recording) -> None:
     tared.frames(30)
     tared.reboot()
-    tared.frames(40)  # long ago, as all before
+    tared.frames(40)  # long ago, as the frames before
     session.stop()
     tared.frames(25, now=True)
-    reboot_now(tared)
+    restart_now(tared)
     tared.frames(10)
     first, second = tared.come_back()
     sealed = session.sealed()
     assert whole_parts_of(sealed) == [(first.stream_id, 70, 149), (second.stream_id, 0, 39)]
 
 
-def test_a_stop_between_two_streams_ends_with_the_first_one(
-    tared: FakeNode, session: Recording
-) -> None:
+def test_a_stop_between_two_streams_ends_the_first_one(tared: FakeNode, session: Recording) -> None:
     tared.frames(30)
     session.stop()
-    reboot_now(tared)
+    restart_now(tared)
     tared.frames(10)
-    reboot_now(tared)
+    restart_now(tared)
     first, _ = tared.come_back()
     sealed = session.sealed()
     assert whole_parts_of(sealed) == [(first.stream_id, 70, 149)]
 
 
-def test_a_stop_that_falls_into_the_present_stream_makes_it_a_part(
-    tared: FakeNode, session: Recording
-) -> None:
+def test_a_stop_in_the_present_stream_makes_it_a_part(tared: FakeNode, session: Recording) -> None:
     tared.reboot()
     tared.frames(40)
     session.stop()
@@ -160,14 +156,14 @@ def test_a_stop_that_falls_into_the_present_stream_makes_it_a_part(
     assert whole_parts_of(sealed) == [(first.stream_id, 70, 119), (tared.stream_id, 0, 39)]
 
 
-def test_frames_of_a_node_that_is_much_slower_than_its_rate_belong_to_it_too(
+def test_frames_slower_than_the_nominal_rate_belong_to_the_session(
     tared: FakeNode, session: Recording
 ) -> None:
     tared.reboot()
-    tared.nominal_rate_hz = 1e5  # its frames would be of the last millisecond
+    tared.nominal_rate_hz = 1e5  # by which its frames would be of the last millisecond
     tared.frames(40)
     session.stop()
-    time.sleep(1.1)  # a node may have taken frames in the last second that it does not know of
+    time.sleep(1.1)  # in its last second a node may have taken more frames
     tared.frames(10, now=True)
     [first] = tared.before
     tared.connect(earlier=(first.said(),))
@@ -177,7 +173,7 @@ def test_frames_of_a_node_that_is_much_slower_than_its_rate_belong_to_it_too(
     assert whole_parts_of(sealed) == [(first.stream_id, 70, 119), (tared.stream_id, 0, 39)]
 
 
-def test_a_stop_in_the_middle_of_what_has_not_come_yet_waits_for_it(
+def test_a_stop_among_frames_of_the_backlog_waits_for_them(
     tared: FakeNode, session: Recording
 ) -> None:
     tared.frames(30)
@@ -196,11 +192,11 @@ def test_a_stop_in_the_middle_of_what_has_not_come_yet_waits_for_it(
 
 
 @pytest.mark.real_time
-def test_a_stop_among_frames_that_are_lost_is_placed_by_the_rate(tared: FakeNode) -> None:
+def test_a_stop_among_lost_frames_is_placed_by_the_rate(tared: FakeNode) -> None:
     session = tared.record()
     tared.deliver(50)
     session.stop()
-    # From then on five hundred frames a second, the first ten thousand of which were lost.
+    # Five hundred frames a second from now on; the first ten thousand are lost.
     tared.next_t_mono_ns = time.monotonic_ns()
     lost = tared.frames(10_000)
     tared.next_t_mono_ns -= 10_000 * 2_000_000
@@ -215,7 +211,7 @@ def test_a_stop_among_frames_that_are_lost_is_placed_by_the_rate(tared: FakeNode
     assert 0.03 * 10_000 < end - 119 < 0.07 * 10_000
 
 
-def test_other_tiles_begin_a_session_of_their_own_also_in_an_earlier_stream(
+def test_other_tiles_in_an_earlier_stream_begin_another_session(
     running: Running, tared: FakeNode
 ) -> None:
     session = tared.record(name="mud")
@@ -236,29 +232,27 @@ def test_other_tiles_begin_a_session_of_their_own_also_in_an_earlier_stream(
     assert sealed["complete"] is True
 
 
-def test_a_node_that_does_not_remember_its_stream_leaves_a_tail_that_is_bounded_by_its_silence(
+def test_a_forgotten_stream_has_a_tail_bounded_by_its_silence(
     tared: FakeNode,
 ) -> None:
     session = tared.record()
     tared.deliver(50, now=True)
     tared.leave()
-    reboot_now(tared)
+    restart_now(tared)
     tared.connect()
     tail = session.ledger()["parts"][0]["max_lost_tail_frames"]
-    # Since its newest frame, at five hundred a second; a test that is slow takes some seconds.
+    # Five hundred a second since its newest frame; a slow test takes some seconds.
     assert 1 <= tail <= 500 * 20
     assert session.now()["complete"] == "lossy"
 
 
-def test_two_sessions_of_one_node_overlap_and_each_has_its_own_frames(
-    running: Running, tared: FakeNode
-) -> None:
+def test_overlapping_sessions_have_their_own_frames(running: Running, tared: FakeNode) -> None:
     first = tared.record(name="first")
     tared.deliver(50)
     second = tared.record(name="second")
     tared.deliver(50)
     assert set(running.node()["recording"]) == {first.id, second.id}
-    # The stop has to lie after them on the node's clock, too.
+    # The stop has to lie behind these frames on the node's clock, too.
     first.stop()
     tared.send(10, now=True)
     until(lambda: first.now()["state"] == "sealed")
@@ -274,27 +268,27 @@ def test_two_sessions_of_one_node_overlap_and_each_has_its_own_frames(
     assert_same_bits(second.frames(), tared.all_sent().slice_rows(120, 180))
 
 
-def test_the_node_is_told_what_sessions_need_whenever_that_changes(tared: FakeNode) -> None:
-    def told() -> tuple[list[tuple[str, list[Any]]], bool]:
+def test_the_node_gets_each_change_of_the_retention_request(tared: FakeNode) -> None:
+    def request() -> tuple[list[tuple[str, list[Any]]], bool]:
         wanted = tared.wanted
         return [(each.stream_id, [*each.numbers]) for each in wanted.streams], wanted.recording
 
-    assert told() == ([], False)
+    assert request() == ([], False)
     first = tared.record()
     tared.receive("retain")
-    assert told() == ([(tared.stream_id, [(70, None)])], True)
+    assert request() == ([(tared.stream_id, [(70, None)])], True)
     tared.deliver(50)
     second = tared.record(pre_roll_s=0.02)
     tared.finish(first)
     tared.finish(second)
-    until(lambda: told() == ([], False) or (tared.receive("retain") and False))
+    until(lambda: request() == ([], False) or (tared.receive("retain") and False))
     third = tared.record()
-    until(lambda: told()[1] or (tared.receive("retain") and False))
+    until(lambda: request()[1] or (tared.receive("retain") and False))
     tared.restart()
     [before] = tared.before
     tared.connect(earlier=(before.said(),))
     first_seq = third["parts"][0]["seq_first"]
-    assert told() == (
+    assert request() == (
         sorted([(before.stream_id, [(first_seq, 139)]), (tared.stream_id, [(0, None)])])
         if first_seq <= 139
         else [(tared.stream_id, [(0, None)])],
@@ -302,7 +296,7 @@ def test_the_node_is_told_what_sessions_need_whenever_that_changes(tared: FakeNo
     )
 
 
-def test_while_it_is_not_known_which_stream_a_stop_fell_into_none_of_them_may_be_forgotten(
+def test_the_node_keeps_every_stream_that_may_have_the_stop(
     tared: FakeNode, session: Recording
 ) -> None:
     tared.frames(30)
@@ -317,12 +311,12 @@ def test_while_it_is_not_known_which_stream_a_stop_fell_into_none_of_them_may_be
     assert tared.wanted.recording is False
 
 
-def test_a_pre_roll_reaches_into_what_the_node_has_yet_to_send(tared: FakeNode) -> None:
+def test_a_pre_roll_reaches_into_the_backlog(tared: FakeNode) -> None:
     tared.leave()
     backlog = tared.frames(400)
     tared.connect()
     tared.deliver(20)
-    session = tared.record(pre_roll_s=0.44)  # 220 frames, of which 20 are here
+    session = tared.record(pre_roll_s=0.44)  # 220 frames; the server has 20
     first = session["parts"][0]["seq_first"]
     assert 490 - 220 - 15 <= first <= 490 - 220 + 15
     tared.send_again(backlog)
@@ -331,7 +325,7 @@ def test_a_pre_roll_reaches_into_what_the_node_has_yet_to_send(tared: FakeNode) 
     assert whole_parts_of(sealed) == [(tared.stream_id, first, 519)]
 
 
-def test_events_are_kept_by_their_instant_also_while_the_node_is_away_and_after_the_stop(
+def test_a_marker_keeps_its_instant_without_the_node_and_after_the_stop(
     running: Running, tared: FakeNode
 ) -> None:
     session = tared.record()
@@ -345,21 +339,10 @@ def test_events_are_kept_by_their_instant_also_while_the_node_is_away_and_after_
     session.sealed()
     before = session.now()
     assert running.http.post(url, json={"label": "sealed", "t_ns": 6}).status_code == 201
-    events = running.http.get(url).json()["items"]
-    assert [(e["label"], e["t_ns"]) for e in events] == [
+    markers = running.http.get(url).json()["items"]
+    assert [(m["label"], m["t_ns"]) for m in markers] == [
         ("away", 5),
         ("sealed", 6),
         ("pending", 7),
     ]
     assert session.now()["sha256"] == before["sha256"]
-
-
-def test_a_mark_that_is_sent_twice_with_its_id_is_marked_once(
-    running: Running, tared: FakeNode
-) -> None:
-    url = f"/sessions/{tared.record()['id']}/markers"
-    for label in ("stone", "again"):
-        answer = running.http.post(url, json={"label": label, "t_ns": 5, "id": "0123456789ab"})
-        assert (answer.status_code, answer.json()["label"]) == (201, "stone")
-    assert len(running.http.get(url).json()["items"]) == 1
-    assert running.http.post(url, json={"label": "x", "id": "no"}).status_code == 422

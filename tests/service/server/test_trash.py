@@ -1,7 +1,8 @@
-"""Deleting, having back, giving up; and frames that are damaged before they were sealed."""
+"""Trash, abandoned frames, damage before the seal, and starts of the server."""
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import threading
@@ -23,15 +24,15 @@ from tests.storage.faulty_disk import refusing
 from tests.waiting import PATIENCE_S, until
 
 
-def sealed(node: FakeNode) -> Recording:
+def seal(node: FakeNode) -> Recording:
     session = node.record()
     node.deliver(20)
     node.finish(session)
     return session
 
 
-def pending(node: FakeNode) -> Recording:
-    """A session whose node has gone with its last thirty frames."""
+def leave_pending(node: FakeNode) -> Recording:
+    """Stop a session whose node has left with its last thirty frames."""
     session = node.record()
     node.deliver(50)
     node.leave()
@@ -40,72 +41,55 @@ def pending(node: FakeNode) -> Recording:
     return session
 
 
-def ids(running: Running, path: str) -> list[str]:
+def list_ids(running: Running, path: str) -> list[str]:
     return [each["id"] for each in running.http.get(path).json()["items"]]
 
 
 # --- the trash ------------------------------------------------------------------------------------
 
 
-def test_a_deleted_session_is_in_the_trash_and_can_be_had_back_as_it_was(
-    running: Running, tared: FakeNode
-) -> None:
-    session = sealed(tared)
-    kept = session.now()
+def test_a_deleted_session_is_restored_unchanged(running: Running, tared: FakeNode) -> None:
+    session = seal(tared)
+    before = session.now()
     answer = running.http.delete(session.url)
     assert (answer.status_code, answer.content) == (204, b"")
-    assert ids(running, "/sessions") == []
-    assert running.http.get("/trash").json()["items"] == [kept]
+    assert list_ids(running, "/sessions") == []
+    running.restart()
+    assert running.http.get("/trash").json()["items"] == [before]
     assert_refused(running.http.get(session.url), 404, "trash")
     assert running.http.get(f"{session.url}/data").status_code == 404
     answer = running.http.post(f"/trash/{session.id}/restore")
     assert answer.status_code == 200
-    assert answer.json() == kept
-    assert ids(running, "/trash") == []
+    assert answer.json() == before
+    assert list_ids(running, "/trash") == []
     assert running.http.get(f"{session.url}/data").status_code == 200
 
 
-def test_what_is_in_the_trash_is_so_after_a_restart(running: Running, tared: FakeNode) -> None:
-    kept, deleted = sealed(tared), sealed(tared)
-    running.http.delete(deleted.url)
-    running.restart()
-    assert ids(running, "/sessions") == [kept.id]
-    assert ids(running, "/trash") == [deleted.id]
-
-
-def test_emptying_the_trash_deletes_for_good_and_says_how_much(
-    running: Running, tared: FakeNode
-) -> None:
-    kept = sealed(tared)
+def test_emptying_the_trash_deletes_and_counts(running: Running, tared: FakeNode) -> None:
+    kept = seal(tared)
     size = 0
     for _ in range(2):
-        session = sealed(tared)
+        session = seal(tared)
         folder = session.folder
         size += sum(path.stat().st_size for path in folder.iterdir())
         running.http.delete(session.url)
     assert running.http.delete("/trash").json() == {"sessions": 2, "bytes": size}
     assert running.http.delete("/trash").json() == {"sessions": 0, "bytes": 0}
-    assert ids(running, "/trash") == []
+    assert list_ids(running, "/trash") == []
     assert list((running.data / "trash").iterdir()) == []
-    assert ids(running, "/sessions") == [kept.id]
+    assert list_ids(running, "/sessions") == [kept.id]
 
 
-def test_a_session_that_is_recorded_is_not_deleted(running: Running, tared: FakeNode) -> None:
-    session = tared.record()
-    assert_refused(running.http.delete(session.url), 409, "Stop it first")
-    assert session.now()["state"] == "recording"
-
-
-def test_a_session_that_is_being_sealed_is_not_deleted(
+def test_a_session_is_not_deleted_during_its_seal(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     may_seal = threading.Event()
 
-    def slow(*arguments: Any) -> Any:
+    def wait_and_seal(*arguments: Any) -> Any:
         assert may_seal.wait(20.0)
         return seal_session(*arguments)
 
-    monkeypatch.setattr(service.server.sealer, "seal_session", slow)
+    monkeypatch.setattr(service.server.sealer, "seal_session", wait_and_seal)
     try:
         session = tared.record()
         tared.deliver(20)
@@ -128,14 +112,14 @@ def test_a_session_that_is_being_sealed_is_not_deleted(
         ("POST", "/trash/x/restore"),
     ],
 )
-def test_what_is_not_there_is_not_found(running: Running, method: str, path: str) -> None:
+def test_an_unknown_session_is_not_found(running: Running, method: str, path: str) -> None:
     assert running.http.request(method, path).status_code == 404
 
 
-def test_a_pending_session_in_the_trash_keeps_its_frames_until_the_trash_is_emptied(
+def test_a_pending_session_needs_its_frames_until_the_trash_is_emptied(
     running: Running, tared: FakeNode
 ) -> None:
-    session = pending(tared)
+    session = leave_pending(tared)
     running.http.delete(session.url)
     running.restart()
     tared.connect()
@@ -147,7 +131,7 @@ def test_a_pending_session_in_the_trash_keeps_its_frames_until_the_trash_is_empt
     assert running.http.get("/trash").json()["items"][0]["state"] == "pending"
     running.http.post(f"/trash/{session.id}/restore")
     assert session.sealed()["complete"] is True
-    again = pending(tared)
+    again = leave_pending(tared)
     running.http.delete(again.url)
     tared.connect()
     assert tared.wanted.streams
@@ -156,34 +140,34 @@ def test_a_pending_session_in_the_trash_keeps_its_frames_until_the_trash_is_empt
     assert tared.wanted.streams == ()
 
 
-def test_a_session_is_in_one_place_however_a_delete_was_cut_off(
+def test_an_interrupted_delete_leaves_a_session_in_one_place(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    session = sealed(tared)
+    session = seal(tared)
     cut_off = refusing(StorageError, "No space left")
     move = SessionsFolder.move_to
     monkeypatch.setattr(SessionsFolder, "move_to", cut_off)
     assert running.http.delete(session.url).status_code == 507
-    assert ids(running, "/sessions") == [session.id]
-    assert ids(running, "/trash") == []
+    assert list_ids(running, "/sessions") == [session.id]
+    assert list_ids(running, "/trash") == []
     monkeypatch.setattr(SessionsFolder, "move_to", move)
 
-    def then_killed(folder: SessionsFolder, session_id: str, to: SessionsFolder) -> None:
+    def move_and_die(folder: SessionsFolder, session_id: str, to: SessionsFolder) -> None:
         move(folder, session_id, to)
-        cut_off()  # the folder was renamed, and the process ends before it knows
+        cut_off()  # after the folder was renamed
 
-    monkeypatch.setattr(SessionsFolder, "move_to", then_killed)
+    monkeypatch.setattr(SessionsFolder, "move_to", move_and_die)
     assert running.http.delete(session.url).status_code == 507
     monkeypatch.setattr(SessionsFolder, "move_to", move)
     running.restart()
-    assert ids(running, "/sessions") == []
-    assert ids(running, "/trash") == [session.id]
+    assert list_ids(running, "/sessions") == []
+    assert list_ids(running, "/trash") == [session.id]
 
 
-def test_what_was_half_deleted_is_no_session_and_gone_at_the_next_start(
+def test_a_half_deleted_session_is_removed_at_the_next_start(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    session = sealed(tared)
+    session = seal(tared)
     running.http.delete(session.url)
     monkeypatch.setattr(
         service.server.server, "delete_and_count_bytes", lambda folders: 0
@@ -193,14 +177,12 @@ def test_what_was_half_deleted_is_no_session_and_gone_at_the_next_start(
         DELETED_PREFIX + session.id
     ]
     running.restart()
-    assert ids(running, "/trash") == []
+    assert list_ids(running, "/trash") == []
     assert list((running.data / "trash").iterdir()) == []
 
 
-def test_screens_are_told_of_a_deletion(running: Running, tared: FakeNode) -> None:
-    import json
-
-    session = sealed(tared)
+def test_pages_get_a_notice_of_a_deletion(running: Running, tared: FakeNode) -> None:
+    session = seal(tared)
     with running.socket("/api/v1/live") as live:
         assert json.loads(live.recv(timeout=PATIENCE_S))["type"] == "hello"
         running.http.delete(session.url)
@@ -209,31 +191,27 @@ def test_screens_are_told_of_a_deletion(running: Running, tared: FakeNode) -> No
     assert message["session_id"] == session.id
 
 
-# --- giving up ------------------------------------------------------------------------------------
+# --- abandoned ------------------------------------------------------------------------------------
 
 
-def test_a_session_whose_node_never_comes_back_can_be_sealed_without_it(
-    running: Running, tared: FakeNode
-) -> None:
-    session = pending(tared)
+def test_a_session_is_sealed_without_its_node(running: Running, tared: FakeNode) -> None:
+    session = leave_pending(tared)
     answer = running.http.post(f"{session.url}/abandon-missing")
     assert answer.status_code == 200, answer.text
     done = session.sealed()
     assert (done["complete"], done["frames"]) == ("lossy", 50)
     assert done["parts"] == [{"stream_id": tared.stream_id, "seq_first": 70, "seq_last": 119}]
-    # Nobody knows how many there were: at most as many as fit between the last one and the stop.
+    # At most as many frames as fit between the last one and the stop.
     assert done["max_lost_tail_frames"] >= 30
     assert done["pending_frames"] == 0
 
 
-def test_what_is_given_up_within_a_session_is_lost_for_that_reason(
-    running: Running, tared: FakeNode
-) -> None:
+def test_abandoned_frames_are_lost_with_this_reason(running: Running, tared: FakeNode) -> None:
     session = tared.record()
     tared.send(50)
     tared.frames(30)
     tared.send(20)
-    until(lambda: running.node()["last_seq"] == 169)
+    tared.taken_in()
     session.stop()
     tared.send(10, now=True)
     until(lambda: session.now()["parts"][0]["seq_last"] == 169)
@@ -245,9 +223,13 @@ def test_what_is_given_up_within_a_session_is_lost_for_that_reason(
     assert ledger["parts"][0]["max_lost_tail_frames"] == 0
 
 
-def test_only_a_pending_session_can_be_given_up(running: Running, tared: FakeNode) -> None:
+def test_a_recording_session_is_neither_deleted_nor_abandoned(
+    running: Running, tared: FakeNode
+) -> None:
     recording = tared.record()
     assert_refused(running.http.post(f"{recording.url}/abandon-missing"), 409, "Stop it first")
+    assert_refused(running.http.delete(recording.url), 409, "Stop it first")
+    assert recording.now()["state"] == "recording"
     tared.finish(recording)
     assert running.http.post(f"{recording.url}/abandon-missing").status_code == 409
 
@@ -264,9 +246,7 @@ def damage(running: Running, node: FakeNode, at: float = 0.5) -> None:
         file.write(content)
 
 
-def test_frames_that_are_found_damaged_are_asked_for_again_and_the_session_is_complete(
-    running: Running, tared: FakeNode
-) -> None:
+def test_damaged_frames_are_requested_again(running: Running, tared: FakeNode) -> None:
     session = tared.record()
     tared.deliver(200)
     damage(running, tared)
@@ -274,8 +254,7 @@ def test_frames_that_are_found_damaged_are_asked_for_again_and_the_session_is_co
     tared.send(10, now=True)
     code, reason = closed(tared.socket)
     assert (code, "damaged" in reason) == (1012, True)
-    lacks = tared.connect()
-    first, last = lacks[0]
+    first, last = tared.connect()[0]
     assert last is not None
     assert 70 <= first <= last <= 269
     tared.send_again(tared.all_sent().slice_rows(first, last + 1))
@@ -283,7 +262,7 @@ def test_frames_that_are_found_damaged_are_asked_for_again_and_the_session_is_co
     assert (done["complete"], done["frames"], done["lost"]) == (True, 200, {})
 
 
-def test_frames_that_are_found_damaged_and_nobody_has_are_lost_and_said_to_be(
+def test_damaged_frames_that_the_node_has_deleted_are_lost(
     running: Running, tared: FakeNode
 ) -> None:
     session = tared.record()
@@ -292,7 +271,7 @@ def test_frames_that_are_found_damaged_and_nobody_has_are_lost_and_said_to_be(
     session.stop()
     tared.send(10, now=True)
     closed(tared.socket)
-    tared.connect(stored=((270, 279),))  # the rest it has forgotten, as it may
+    tared.connect(stored=((270, 279),))  # it has deleted the others
     done = session.sealed()
     assert (done["complete"], done["frames"], done["lost"]) == ("lossy", 190, {"corrupt": 10})
 
@@ -301,7 +280,7 @@ def test_frames_that_are_found_damaged_and_nobody_has_are_lost_and_said_to_be(
 
 
 @pytest.mark.parametrize("state", ["sealing", "pending"])
-def test_a_session_that_was_not_yet_sealed_when_the_server_ended_is_sealed_by_the_next(
+def test_a_restarted_server_seals_unsealed_sessions(
     running: Running, tared: FakeNode, state: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
@@ -322,32 +301,27 @@ def test_a_session_that_was_not_yet_sealed_when_the_server_ended_is_sealed_by_th
     assert session.sealed()["frames"] == 20
 
 
-def test_what_killed_processes_left_half_written_is_removed_at_the_start(
+def test_half_written_files_of_dead_processes_are_removed_at_the_start(
     running: Running, tared: FakeNode
 ) -> None:
-    session = sealed(tared)
+    session = seal(tared)
     folder = session.folder
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait(20)
-    stale = [
-        running.data / "nodes" / "bench" / f".hello.json.{ended.pid}.7.0a1b2c3d.tmp",
-    ]
-    kept = [
-        folder / ".mine.tmp",
-        folder / f"frames.{ended.pid}.tmp",
-    ]
-    for path in (*stale, *kept):
+    stale = running.data / "nodes" / "bench" / f".hello.json.{ended.pid}.7.0a1b2c3d.tmp"
+    foreign = [folder / ".mine.tmp", folder / f"frames.{ended.pid}.tmp"]
+    for path in (stale, *foreign):
         path.write_bytes(b"half")
     running.restart()
-    assert not any(path.exists() for path in stale)
-    assert all(path.exists() for path in kept)
+    assert not stale.exists()
+    assert all(path.exists() for path in foreign)
 
 
-def test_frames_of_an_unsealed_session_are_never_pruned(
+def test_frames_of_an_unsealed_session_are_not_deleted(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("service.server.node.RING_DURATION_NS", 0)
-    pending(tared)
+    leave_pending(tared)
     node = running.server.nodes.get("bench")
     running.call(
         lambda: node.delete_old_frames_or_one_ended_journal(
@@ -357,16 +331,16 @@ def test_frames_of_an_unsealed_session_are_never_pruned(
     assert not (Intervals([(70, 119)]) - node.present_stream.stored)
 
 
-def test_journals_that_nobody_needs_go_one_at_a_time(running: Running, tared: FakeNode) -> None:
-    # A node that was switched on a thousand times holds nobody up while all of them are deleted.
-    boots = [tared.stream_id]
+def test_unneeded_journals_are_deleted_one_at_a_time(running: Running, tared: FakeNode) -> None:
+    # A node with a thousand streams does not block the others meanwhile.
+    streams = [tared.stream_id]
     for _ in range(2):
         tared.close()
         tared.reboot()
         until(lambda: not running.node()["connected"])
         tared.connect()
         tared.deliver(10)
-        boots.append(tared.stream_id)
+        streams.append(tared.stream_id)
     node = running.server.nodes.get("bench")
     folder = running.data / "journal" / "bench"
     left = []
@@ -376,5 +350,5 @@ def test_journals_that_nobody_needs_go_one_at_a_time(running: Running, tared: Fa
         )
     ):
         left.append(sorted(path.name for path in folder.iterdir()))
-    assert left == [sorted(boots[1:]), boots[2:]]
+    assert left == [sorted(streams[1:]), streams[2:]]
     assert node.present_stream.stored

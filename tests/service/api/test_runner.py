@@ -1,4 +1,4 @@
-"""A first start: while another process compiles, pressures come and nothing is lost."""
+"""First start: while another process compiles, pressures are shown and no frame is lost."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from tests.waiting import PATIENCE_S, until
 
 @pytest.fixture
 def compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A file; another process "compiles" until it is there."""
-    there = tmp_path / "compiled"
-    waits = f"while not p.Path({str(there)!r}).exists(): t.sleep(0.02)"
+    """A file; another process "compiles" until it exists."""
+    path = tmp_path / "compiled"
+    wait = f"while not p.Path({str(path)!r}).exists(): t.sleep(0.02)"
     monkeypatch.setattr(service.api.runner, "load_cached_code", lambda: False)
     monkeypatch.setattr(
-        service.api.runner, "_COMPILE_CODE", f"import pathlib as p, time as t\n{waits}"
+        service.api.runner, "_COMPILE_CODE", f"import pathlib as p, time as t\n{wait}"
     )
-    return there
+    return path
 
 
-def shown(node: FakeNode) -> dict[str, object]:
-    """What a screen is shown of frames that come now."""
+def receive_frame(node: FakeNode) -> dict[str, object]:
+    """Return a live message of frames of now."""
     with node.running.socket("/api/v1/live?rate_hz=60") as live:
         while True:
             node.deliver(40, now=True)
@@ -43,7 +43,7 @@ def shown(node: FakeNode) -> dict[str, object]:
             return dict(message)
 
 
-def test_until_models_are_compiled_screens_have_pressures_and_then_forces(
+def test_pages_have_pressures_until_models_are_compiled(
     compiled: Path, serve_with: ServeWith, node_of: NodeOf
 ) -> None:
     running = serve_with()
@@ -53,10 +53,10 @@ def test_until_models_are_compiled_screens_have_pressures_and_then_forces(
     assert running.node()["compiling"]
     session = node.record()
     node.deliver(300, [20.0, 60.0])
-    so_far = running.http.get(f"/sessions/{session.id}/timeseries")
-    assert "has no frames yet" in so_far.json()["detail"]
+    answer = running.http.get(f"{session.url}/timeseries")
+    assert "has no frames yet" in answer.json()["detail"]
     session.stop()
-    before = shown(node)
+    before = receive_frame(node)
     assert before["grf_n"] is None
     assert before["force_n"] == [None, None]
     assert before["gauge_kpa"] == pytest.approx([0.0, 0.0], abs=1.0)
@@ -64,12 +64,12 @@ def test_until_models_are_compiled_screens_have_pressures_and_then_forces(
     compiled.touch()
     until(lambda: not is_compiling())
     until(lambda: not running.node()["compiling"])
-    until(lambda: shown(node)["grf_n"] is not None)
+    until(lambda: receive_frame(node)["grf_n"] is not None)
     until(lambda: session.now()["state"] == "sealed")
     assert "grf_n" in pq.read_schema(session.folder / "frames.parquet").names
 
 
-def test_a_server_that_ends_meanwhile_ends_the_other_process(
+def test_a_server_ends_its_compiling_process(
     compiled: Path, serve_with: ServeWith, tmp_path: Path
 ) -> None:
     serve_with()
@@ -79,15 +79,15 @@ def test_a_server_that_ends_meanwhile_ends_the_other_process(
 
 @pytest.mark.process
 @pytest.mark.soak
-def test_a_machine_on_which_nothing_was_compiled_has_pressures_at_once(tmp_path: Path) -> None:
-    nothing = {
+def test_a_machine_without_compiled_code_has_pressures_at_once(tmp_path: Path) -> None:
+    empty = {
         "NUMBA_CACHE_DIR": str(tmp_path / "numba"),
         "XDG_CACHE_HOME": str(tmp_path / "cache"),
     }
     command = [sys.executable, "-c", "from service.cli.main import main; main()", "demo"]
     demo = subprocess.Popen(
         [*command, "--port=0", f"--data={tmp_path / 'data'}"],
-        env={**os.environ, **nothing},
+        env={**os.environ, **empty},
         stdout=subprocess.PIPE,
         text=True,
     )
