@@ -40,7 +40,7 @@ def test_abandoned_frames_of_a_stream_with_a_known_end_are_counted(
     answer = session.running.http.post(f"{session.url}/abandon-missing")
     assert answer.status_code == 200, answer.text
     sealed = session.sealed()
-    assert sealed["lost"] == {"is_abandoned": 30}
+    assert sealed["lost"] == {"abandoned": 30}
     counts = (sealed["frames"], sealed["max_lost_tail_frames"], sealed["complete"])
     assert counts == (50, 0, "lossy")
 
