@@ -96,25 +96,36 @@ def test_missing_damaged_and_foreign_stances_are_rebuilt(tared: FakeNode) -> Non
         assert path.read_bytes() == whole
 
 
-def test_a_seal_succeeds_without_its_stances(
-    tared: FakeNode, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    full = refusing(StorageError, "cannot be written: No space left on device")
-    for owner, name, failing, reason in (
-        (
-            *(service.sessions.stances, "write_stances", full),
+@pytest.mark.parametrize(
+    ("owner", "name", "failing", "reason"),
+    [
+        pytest.param(
+            *(service.sessions.stances, "write_stances"),
+            refusing(StorageError, "cannot be written: No space left on device"),
             "stances.parquet was not written, and is rebuilt",
+            id="full disk",
         ),
-        (StanceDetector, "add_frames", refusing(ZeroDivisionError, "a bug"), "a bug"),
-    ):
-        with monkeypatch.context() as patch:
-            patch.setattr(owner, name, failing)
-            session = record_stances(tared)
-        sealed = session.now()
-        assert (sealed["state"], sealed["complete"]) == ("sealed", True)
-        assert reason in sealed["problem"]
-        assert not (session.folder / "stances.parquet").exists()
-        assert len(get(session).json()) == 2
+        pytest.param(
+            *(StanceDetector, "add_frames", refusing(ZeroDivisionError, "a bug"), "a bug"), id="bug"
+        ),
+    ],
+)
+def test_a_seal_succeeds_without_its_stances(
+    tared: FakeNode,
+    monkeypatch: pytest.MonkeyPatch,
+    owner: Any,
+    name: str,
+    failing: Any,
+    reason: str,
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, failing)
+        session = record_stances(tared)
+    sealed = session.now()
+    assert (sealed["state"], sealed["complete"]) == ("sealed", True)
+    assert reason in sealed["problem"]
+    assert not (session.folder / "stances.parquet").exists()
+    assert len(get(session).json()) == 2
 
 
 def test_a_session_without_stances_has_a_reason(

@@ -233,7 +233,7 @@ def test_a_file_of_a_take_has_all_sessions_until_a_marker_changes_it(take: Take)
         assert answer.headers["foottile-complete"] == "true"
         # The marker is of now, and the frames are of long ago.
         assert answer.headers["foottile-markers"] == "placed=0, left-out=1"
-        name = f"both_take-{take.id}.{FORMATS[to].ending}"
+        name = f"both_take-{take.id}{FORMATS[to].ending}"
         assert answer.headers["content-disposition"] == f'attachment; filename="{name}"'
     first, query = take.get("xdf"), {"format": "xdf"}
     tag = {"If-None-Match": first.headers["etag"]}
