@@ -43,8 +43,7 @@ from service.api.settings import Settings
 from service.cli.main import SUMMARIES, load_command
 from service.estimation.calibration import TileCalibration
 from service.protocol import LinkCloseCode
-from service.server.broadcast.history import summarize_force
-from service.server.broadcast.summary import PendingUpdate, summarize_frames
+from service.server.broadcast.summary import PendingUpdate, summarize_force, summarize_frames
 from service.server.server import Server
 from storage.schema import COLUMNS_BY_NAME
 from tests.builders.frames import make_frames

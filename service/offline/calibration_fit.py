@@ -16,18 +16,20 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from devices.chips.compensation import Compensation
-from devices.chips.mpl115a2 import PRESSURE_MIN_KPA
+from devices.chips.mpl115a2 import PRESSURE_MIN_KPA, Compensation
 from devices.errors import CalibrationError
 from devices.frames import NOT_READ, FrameBatch
 from devices.temperature_hold import hold_temperature
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.dead_weights import parse_weight
 from service.estimation.effects import Parameter
-from service.estimation.fitting.effects_fit import fit_determined_effects
+from service.estimation.fitting.effects_fit import (
+    DEFAULT_REFERENCE_DELAY,
+    fit_determined_effects,
+    separate_delays,
+)
 from service.estimation.fitting.rig.indentation import Indentation, select_loaded
 from service.estimation.fitting.rig.loading import has_weights
-from service.estimation.fitting.sample_delay import DEFAULT_REFERENCE_DELAY, separate_delays
 from service.estimation.fitting.static_fit import fit_static_curve
 from service.estimation.fitting.weights_fit import fit_dead_weights
 from storage.schema import UNKNOWN_T_NS

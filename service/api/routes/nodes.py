@@ -11,8 +11,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from devices.types import check_user_name
 from service.api.routes.common import ServerState, parse_if_match, problem_responses
-from service.server.broadcast.history import SECONDS_MAX, ForceSpan
-from service.server.broadcast.summary import round_values
+from service.server.broadcast.summary import SECONDS_MAX, ForceSpan, round_values
 from service.server.broadcast.views import DriftView, NodeView, Page, TaresPage, TareView, View
 from service.server.node import ServerNode
 from service.server.server import Server

@@ -20,14 +20,16 @@ import numpy.typing as npt
 from websockets.frames import Frame, Opcode
 
 from service.protocol import CloseConnection, LinkCloseCode
-from service.server.broadcast.history import (
+from service.server.broadcast.summary import (
     SECONDS_MAX,
     ForceHistory,
     ForceSpan,
+    PendingUpdate,
+    encode_json,
     select_newest_spans,
     summarize_force,
+    summarize_frames,
 )
-from service.server.broadcast.summary import PendingUpdate, encode_json, summarize_frames
 from service.server.estimates.node_estimator import EstimatedBatch
 from service.server.node import ServerNode
 from service.server_clock import server_utc_ns

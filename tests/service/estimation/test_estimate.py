@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.chips.compensation import Compensation
 from devices.chips.mpl115a2 import (
     PRESSURE_MIN_KPA,
     Coefficients,
+    Compensation,
     compensate_kpa,
     compute_padc,
 )

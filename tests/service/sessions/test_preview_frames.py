@@ -13,17 +13,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import service.sessions.checkpoints
 import service.sessions.preview
 import service.sessions.preview_frames
 import storage.journal.time_index
 from devices.errors import StorageError, UsageError
 from devices.frames import FrameBatch
 from service.estimation.tare.tare import Tare
-from service.sessions.checkpoints import make_preview_stream
 from service.sessions.frames import iterate_raw_frames_with_part
 from service.sessions.inputs import SessionInputs
-from service.sessions.preview import SessionPreview, SessionPreviews
+from service.sessions.preview import SessionPreview, SessionPreviews, make_preview_stream
 from service.sessions.preview_frames import PreviewFrames
 from storage.durable_files import ScratchFile
 from storage.formats.export import Export, make_one_pass_frame_source
@@ -44,8 +42,8 @@ EVERY = 24
 def _small() -> Iterator[None]:
     """Places are near one another, and few of them are kept."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(service.sessions.checkpoints, "CHECKPOINT_FRAMES", EVERY)
-        patch.setattr(service.sessions.checkpoints, "CHECKPOINTS_MAX", 6)
+        patch.setattr(service.sessions.preview, "CHECKPOINT_FRAMES", EVERY)
+        patch.setattr(service.sessions.preview, "CHECKPOINTS_MAX", 6)
         patch.setattr(service.sessions.preview, "_REST_FACTOR", 0)
         patch.setattr(service.sessions.preview, "UPDATE_BUDGET_S", 1e9)
         patch.setattr(storage.journal.time_index, "PIECE_FRAMES", 8)
@@ -255,7 +253,7 @@ def test_what_a_slice_costs_does_not_depend_on_where_it_is(
 def test_after_frames_that_came_late_only_what_is_behind_them_is_estimated_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(service.sessions.checkpoints, "CHECKPOINTS_MAX", 1000)
+    monkeypatch.setattr(service.sessions.preview, "CHECKPOINTS_MAX", 1000)
     recorded = Recorded(tmp_path)
     recorded.tares.append(taken_at(0, 0.0))
     so_fars = SessionPreviews(tmp_path)

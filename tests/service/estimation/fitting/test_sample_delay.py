@@ -6,7 +6,7 @@ import pytest
 
 from service.estimation.effects import Effects, Parameter
 from service.estimation.fitting.dome_model import SAMPLE_DELAY_SIGMA_S
-from service.estimation.fitting.sample_delay import DEFAULT_REFERENCE_DELAY, separate_delays
+from service.estimation.fitting.effects_fit import DEFAULT_REFERENCE_DELAY, separate_delays
 
 SEEN_S = (1.4e-3, 1.6e-3, 1.5e-3)
 

@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 
 from devices.frames import FrameBatch
 from service.estimation.foot import CONTACT_UNKNOWN
-from service.server.broadcast.history import nan_min, summarize_force
 from service.server.broadcast.summary import (
     SUMMARY_NS,
     FrameSummary,
     PendingUpdate,
+    nan_min,
+    summarize_force,
     summarize_frames,
 )
 from tests.builders.arrays import PERIOD_NS

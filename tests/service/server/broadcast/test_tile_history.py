@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.server.broadcast.broadcaster import TILE_QUANTITIES, TILE_SPAN_PERIOD_NS, TileHistory
-from service.server.broadcast.history import summarize_force
+from service.server.broadcast.summary import summarize_force
 from tests.builders.arrays import PERIOD_NS
 from tests.builders.frames import make_frames
 
