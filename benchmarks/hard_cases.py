@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from devices.arrays import Bools, Floats
-from devices.chips.mpl115a2 import Compensation
+from devices.chips.compensation import Compensation
 from devices.clock import VirtualClock
 from devices.emulation.ground.load_trace import CopTransform, LoadTrace
 from devices.errors import FootTileError

@@ -13,7 +13,8 @@ import numpy as np
 
 from devices.array.tile import Scan
 from devices.array.tile_array import TileArray
-from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA, Compensation
+from devices.chips.compensation import Compensation
+from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 from devices.clock import Clock, UtcAnchor
 from devices.flags import FrameFlag, TileFlag
 from devices.frames import (

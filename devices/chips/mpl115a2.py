@@ -1,4 +1,4 @@
-"""MPL115A2 pressure chip: registers, coefficients, and compensation of raw counts.
+"""Driver of the NXP MPL115A2: registers, coefficients, compensation and its inverse, transfers.
 
 Source: MPL115A2 data sheet Rev. 10, "DS" below. The arithmetic is pure and works on arrays; the
 driver class only transfers bytes.
@@ -17,8 +17,6 @@ import numpy.typing as npt
 from devices.arrays import Floats
 from devices.buses.i2c import I2cBus, i2c_msg
 from devices.errors import TileSetupError
-from devices.flags import TileFlag
-from devices.frames import NOT_READ, FrameBatch, TileInfo
 
 ADDRESS = 0x60
 """I2C address, fixed for every part (DS 2): more than one on a bus needs a multiplexer."""
@@ -220,39 +218,3 @@ def estimate_degc(tadc: float) -> float:
     25 degC at 472 counts and -5.35 counts/K (hardware.md 1.3); the data sheet states no scale.
     """
     return 25.0 + (tadc - _TADC_AT_25_DEGC) / TADC_PER_KELVIN
-
-
-_QUANTIZATION_SIGMA = 1.0 / np.sqrt(12.0)  # standard deviation of the quantization error, in counts
-
-
-class Compensation:
-    """Coefficients a0, b1, b2 and c12 of an array's chips, as arrays over tiles."""
-
-    def __init__(self, tiles: Sequence[TileInfo]) -> None:
-        chips = [Coefficients.from_words(tile.coefficient_words) for tile in tiles]
-        self.a0, self.b1, self.b2, self.c12 = (
-            np.array([getattr(chip, name) for chip in chips]) for name in ("a0", "b1", "b2", "c12")
-        )
-
-    def compute_kpa(self, pressure_raw: npt.ArrayLike, temperature_raw: npt.ArrayLike) -> Floats:
-        """Compute absolute pressure, (n, tiles), from raw counts of that shape."""
-        return compensate_kpa(pressure_raw, temperature_raw, self.a0, self.b1, self.b2, self.c12)
-
-    def compute_usable_kpa(self, frames: FrameBatch) -> Floats:
-        """Compute absolute pressure of frames, NaN where a tile has no usable reading."""
-        unreadable = (
-            ((frames.tile_flags & TileFlag.UNUSABLE) != 0)
-            | (frames.pressure_raw == NOT_READ)
-            | (frames.temperature_raw == NOT_READ)
-        )
-        return np.where(
-            unreadable, np.nan, self.compute_kpa(frames.pressure_raw, frames.temperature_raw)
-        )
-
-    def compute_kpa_per_count(self, temperature_raw: npt.ArrayLike) -> Floats:
-        """Compute the pressure step of one count of `pressure_raw`; negative."""
-        return compute_kpa_per_padc(temperature_raw, self.b1, self.c12)
-
-    def compute_quantization_sigma_kpa(self, temperature_raw: npt.ArrayLike) -> Floats:
-        """Compute the standard uncertainty due to quantization to a count."""
-        return np.asarray(np.abs(self.compute_kpa_per_count(temperature_raw)) * _QUANTIZATION_SIGMA)

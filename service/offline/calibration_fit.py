@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from devices.chips.mpl115a2 import PRESSURE_MIN_KPA, Compensation
+from devices.chips.compensation import Compensation
+from devices.chips.mpl115a2 import PRESSURE_MIN_KPA
 from devices.errors import CalibrationError
 from devices.frames import NOT_READ, FrameBatch
 from devices.temperature_hold import hold_temperature

@@ -13,7 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Bools, Floats
-from devices.chips.mpl115a2 import SAMPLE_DELAY_DIVISOR, Coefficients, Compensation, compensate_kpa
+from devices.chips.compensation import Compensation
+from devices.chips.mpl115a2 import SAMPLE_DELAY_DIVISOR, Coefficients, compensate_kpa
 from devices.emulation.world import World
 from devices.flags import TileFlag
 from devices.frames import NOT_READ, FrameBatch, TileInfo

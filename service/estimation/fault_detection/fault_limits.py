@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from devices.arrays import Bools, Floats
-from devices.chips.mpl115a2 import TADC_PER_KELVIN, Compensation
+from devices.chips.compensation import Compensation
+from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration
 from service.estimation.fault_detection import baseline_loss

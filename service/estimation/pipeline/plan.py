@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Floats, Ints
-from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, Compensation
+from devices.chips.compensation import Compensation
+from devices.chips.mpl115a2 import PRESSURE_MAX_KPA
 from devices.errors import CalibrationError, UsageError
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration, TileCalibration

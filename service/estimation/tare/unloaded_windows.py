@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Bools, Floats, Times
-from devices.chips.mpl115a2 import Compensation
+from devices.chips.compensation import Compensation
 from devices.errors import TareError
 from devices.flags import FrameFlag
 from devices.frames import FrameBatch

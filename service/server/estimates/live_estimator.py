@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 
 from devices.arrays import Floats
-from devices.chips.mpl115a2 import Compensation
+from devices.chips.compensation import Compensation
 from devices.errors import FootTileError, TareError
 from devices.flags import TileFlag
 from devices.frames import NOT_READ, ArrayInfo, FrameBatch

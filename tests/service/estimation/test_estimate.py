@@ -14,13 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.chips.mpl115a2 import (
-    PRESSURE_MIN_KPA,
-    Coefficients,
-    Compensation,
-    compensate_kpa,
-    compute_padc,
-)
+from devices.chips.compensation import Compensation
+from devices.chips.mpl115a2 import PRESSURE_MIN_KPA, Coefficients, compensate_kpa, compute_padc
 from devices.flags import EstimateFlag
 from devices.frames import NOT_READ, FrameBatch
 from devices.temperature_hold import hold_temperature

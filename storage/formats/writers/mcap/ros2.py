@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
-from devices.chips.mpl115a2 import Compensation
+from devices.chips.compensation import Compensation
 from devices.flags import TileFlag
 from devices.frames import NOT_READ
 from storage.formats.export import Export

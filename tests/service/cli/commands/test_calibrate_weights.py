@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from devices.arrays import Floats
-from devices.chips.mpl115a2 import Compensation
+from devices.chips.compensation import Compensation
 from service.estimation.calibration import Calibration
 from service.estimation.dead_weights import (
     STANDARD_GRAVITY_M_S2,

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.chips.mpl115a2 import Compensation
+from devices.chips.compensation import Compensation
 from devices.errors import TareError
 from devices.frames import FrameBatch
 from service.estimation.calibration import Calibration, make_paper_shape_preset

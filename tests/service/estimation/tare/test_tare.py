@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from devices.chips.mpl115a2 import TADC_PER_KELVIN, Compensation
+from devices.chips.compensation import Compensation
+from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from devices.errors import TareError
 from service.estimation.pipeline.plan import make_plan
 from service.estimation.tare.tare import (

@@ -17,7 +17,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from devices.chips.mpl115a2 import Compensation
+from devices.chips.compensation import Compensation
 from devices.errors import UsageError
 from devices.flags import TileFlag
 from devices.frames import NOT_READ
