@@ -27,7 +27,7 @@ from service.node.publisher import Publisher
 from service.node.server_connection import make_hello
 from service.protocol import NodeStatus, RetentionMessage
 from storage.journal.node.journal import NodeJournal
-from storage.journal.node.retention import RetentionRequest
+from storage.journal.node.retention_requests import RetentionRequest
 from storage.journal.node.stream import NodeStream
 
 _POLL_S = 0.02

@@ -27,13 +27,14 @@ from devices.buses.spi import open_spi
 from devices.chips.dynamixel.driver import open_servo
 from devices.chips.dynamixel.firmwares import COUNTS_PER_TURN
 from devices.chips.dynamixel.position_sources import ThreadedServoSource
-from devices.chips.mcp3208 import Mcp3208, ReferenceForceSensor
+from devices.chips.mcp3208 import Mcp3208
 from devices.clock import Clock, SpinningClock, SystemClock, UtcAnchor
 from devices.errors import FootTileError, I2cError, TileSetupError, UsageError
 from devices.flags import FrameFlag, TileFlag
 from devices.frames import ArrayInfo, FrameBatch, ServoInfo, TileInfo
 from devices.realtime import is_clock_set, set_timer_slack, use_realtime_priority
 from devices.recovery import BusRecovery, GpioRecovery, open_gpio_recovery
+from devices.reference_force import ReferenceForceSensor
 from devices.scene.hardware_sections import EMULATED, ScheduleName, ServoSection
 from devices.scene.scene_file import Scene
 from service.rig.emulated_foot import RigOptions

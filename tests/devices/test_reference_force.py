@@ -8,9 +8,10 @@ from collections.abc import Callable
 import pytest
 
 from devices.buses.spi import SpiDevice
-from devices.chips.mcp3208 import Mcp3208, ReferenceForceSensor
+from devices.chips.mcp3208 import Mcp3208
 from devices.clock import VirtualClock
 from devices.emulation.chips.mcp3208 import EmulatedMcp3208, InputVoltages, make_amplifier
+from devices.reference_force import ReferenceForceSensor
 from devices.scene.hardware_sections import ReferenceSection
 
 SCENE = ReferenceSection(channel=3, zero_v=1.65, n_per_v=100 / 3.3)

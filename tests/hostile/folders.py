@@ -18,7 +18,7 @@ from service.sessions.recovery import recover_locked_folder
 from service.sessions.tares import TareHistory
 from storage.checksummed_json import write_checksummed_json
 from storage.clock.log import ClockLog, ClockOffset
-from storage.journal.node.retention import RetentionRequest, RetentionRequests
+from storage.journal.node.retention_requests import RetentionRequest, RetentionRequests
 from storage.permissions import SECRETS_NAME, write_secrets
 from storage.server_id import SERVER_ID_NAME, write_server_id
 from storage.sessions.folder import FRAMES_NAME, Marker, Part, SessionsFolder

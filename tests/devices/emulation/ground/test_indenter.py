@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from devices.buses.spi import open_spi
-from devices.chips.mcp3208 import Mcp3208, ReferenceForceSensor
+from devices.chips.mcp3208 import Mcp3208
 from devices.clock import VirtualClock
 from devices.emulation.world import World
+from devices.reference_force import ReferenceForceSensor
 from devices.scene.hardware_sections import ReferenceSection
 from tests.builders.scenes import make_scene
 

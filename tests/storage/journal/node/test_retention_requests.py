@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from storage.intervals import NO_END, Intervals
-from storage.journal.node.retention import RetentionRequest, RetentionRequests
+from storage.journal.node.retention_requests import RetentionRequest, RetentionRequests
 
 
 def test_a_request_outlives_the_process(tmp_path: Path) -> None:
