@@ -86,7 +86,7 @@ def in_pieces(source: Path, folder: Path, asked: EstimateRequest, piece_frames: 
     "changes",
     [
         {},
-        {"models": ("static",), "exact": True},
+        {"models": ("static",), "unquantized": True},
         {"lag_ms": 60_000.0},  # as long as a piece: the first gives nothing, or next to it
         {"tare_s": (70.0, 71.0), "models": ("static", "denoise")},  # not in the first one
     ],

@@ -60,7 +60,7 @@ def estimated(source: Path, out: Path, part: Slice, **changes: Any) -> EstimateR
         "lag_ms": 100.0,
         "scene": None,
         "tare_s": None,
-        "exact": True,
+        "unquantized": True,
     }
     request = EstimateRequest(part=part, **asked | changes)
     return estimate_session(source, out, request, on_remark=lambda _: None)

@@ -98,7 +98,7 @@ def test_what_is_in_the_file_is_what_was_computed_rounded_to_the_steps_it_states
             np.testing.assert_array_equal(other, expected.astype(other.dtype), err_msg=flat)
 
 
-@pytest.mark.parametrize("exact", [False, True])
+@pytest.mark.parametrize("unquantized", [False, True])
 def test_a_session_estimated_in_its_folder_has_its_stances_beside_it(
     raw: Path, tmp_path: Path, unquantized: bool
 ) -> None:
