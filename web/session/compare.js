@@ -100,7 +100,7 @@ export class Compare {
   }
 
   /** Show another session, aligned as selected. */
-  async with(id, align) {
+  async showSession(id, align) {
     const wanted = this.wanted;
     const [other, stances, events, clock, array] = await Promise.all([
       api.getSession(id), ...[api.listStances(id), api.listMarkers(id), api.clockOf(id), api.arrayOf(id)].map((asked) => unlessRefused(asked)),
