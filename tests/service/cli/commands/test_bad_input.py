@@ -148,7 +148,7 @@ def test_estimate_refuses(
     assert left(tmp_path, "s.parquet", "other.json", "broken.json") == []
 
 
-def test_estimate_refuses_what_is_no_session(run: Run, tmp_path: Path) -> None:
+def test_estimate_refuses_a_file_that_is_no_session(run: Run, tmp_path: Path) -> None:
     (tmp_path / "x.parquet").write_bytes(b"PAR1 not really PAR1")
     for name in ("x.parquet", "gone.parquet"):
         run("estimate", name, "--out", "e.parquet").fails(1, name)
