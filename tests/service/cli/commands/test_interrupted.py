@@ -34,7 +34,7 @@ def is_fitting(process: subprocess.Popen[bytes], folder: Path) -> bool:
 @pytest.mark.parametrize(
     ("arguments", "has_begun"),
     [
-        (["simulate", "--scene=standing", "--seconds=3000", "--no-estimates"], has_file),
+        (["simulate", "--scene=standing", "--seconds=400", "--no-estimates"], has_file),
         (
             ["benchmark", "--scene=standing", "--draws=500", "--jobs=2", "--out=a/bench"],
             has_children,
