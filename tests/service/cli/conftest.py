@@ -1,7 +1,8 @@
-"""The command line as a user meets it: arguments in, exit code and two streams out."""
+"""The command line as a user meets it, and the recordings that several commands are tried on."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 import sys
@@ -11,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from service.cli.main import main
-from service.version import SOFTWARE_VERSION
-from tests.service.cli.outcome import Outcome, Run
+from service.version import compute_exact_version
+from tests.service.cli.outcome import Outcome, Run, Simulate, short_rig
 
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
 
@@ -43,20 +44,37 @@ def run(
 
 
 @pytest.fixture
-def bench(run: Run, bench_cache: Path) -> bytes:
-    """A recording of tiles T01 and T02 under the mill, which takes seconds: made once."""
-    kept = bench_cache / f"{SOFTWARE_VERSION}-T01,T02.parquet"
-    if not kept.exists():
-        made = f"{os.getpid()}.parquet"
-        pressed = ("--tiles", "T01,T02", "--out", made)
-        assert run("simulate", "--scene", "indentation", *pressed).code == 0
-        shutil.move(made, kept)
-    return kept.read_bytes()
+def simulate(run: Run, tmp_path: Path, bench_cache: Path) -> Simulate:
+    """Put a recording of a scene into the test's folder; tests that ask for the same share it.
+
+    The scene is a built-in one's name or the text of a scene file.
+    """
+
+    def put(name: str, scene: str, *options: object) -> Path:
+        asked = repr((compute_exact_version(), scene, options)).encode()
+        kept = bench_cache / f"simulated-{hashlib.sha256(asked).hexdigest()[:16]}.parquet"
+        if not kept.exists():
+            made = bench_cache / f"{os.getpid()}.parquet"
+            file = made.with_suffix(".toml")
+            file.write_text(scene)
+            source = file if "\n" in scene else scene
+            outcome = run("simulate", "--scene", source, *options, "--out", made)
+            assert outcome.code == 0, outcome.err
+            made.rename(kept)
+        return Path(shutil.copy(kept, tmp_path / name))
+
+    return put
+
+
+@pytest.fixture
+def bench(simulate: Simulate) -> Path:
+    """Tiles T01 and T02 under the indenter: `bench.parquet` in the test's folder."""
+    return simulate("bench.parquet", short_rig(), "--tiles", "T01,T02")
 
 
 @pytest.fixture
 def recording() -> Callable[[str], Path]:
-    """A real recording beside the project, or a skip that says which one is missing."""
+    """Find a real recording beside the project, or skip the test and name it."""
 
     def find(name: str) -> Path:
         path = SHARED / name

@@ -1,4 +1,4 @@
-"""What a run of `foottile` gives, and what several tests of commands feed it."""
+"""Outcome of a run of `foottile`, and texts of scenes for it."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 
@@ -19,22 +20,23 @@ class Outcome:
     err: str
 
     def printed(self, code: int = 0) -> Any:
-        """What it has printed as JSON; it has ended with this code."""
+        """Check the exit code and return the printed JSON."""
         assert self.code == code, self.err
         return json.loads(self.out)
 
     def fails(self, code: int, *words: str) -> None:
-        """It has ended with this code, and its second stream has all of these words."""
+        """Check the exit code, and that the second stream has all of these words."""
         assert self.code == code, self.err
         for word in words:
             assert word in self.err
 
 
 Run = Callable[..., Outcome]
+Simulate = Callable[..., Path]
 
 
 def scene_text(name: str, tiles: int | None = None) -> str:
-    """The file of a built-in scene, if asked for with its first tiles only."""
+    """Return the file of a built-in scene, with all tiles or the first ones."""
     text = (resources.files("devices.scene") / "builtin" / f"{name}.toml").read_text("utf-8")
     if tiles is None:
         return text
@@ -43,13 +45,19 @@ def scene_text(name: str, tiles: int | None = None) -> str:
     return "[[tile]]".join([head, *each[:tiles]]) + begin + rest
 
 
+def short_rig() -> str:
+    """Return the scene of the indenter with its fewest and with fast strokes."""
+    kind = 'kind = "indentation"'
+    return scene_text("indentation").replace(kind, f"{kind}\nrepeats = 2\nstroke_s = 1.5")
+
+
 def static_only(text: str) -> str:
-    """A scene's text with the models that need no bench with holds, releases and taps."""
+    """Return a scene's text with the models that need only the curve of a rig recording."""
     return re.sub(r"(?m)^models = .*$", 'models = ["unwrap", "static"]', text)
 
 
 def faulty(kind: str, *, t_s: float = 0.0, duration_s: float = 1000.0, **keys: object) -> str:
-    """The section of a scene's fault; without other times it is there from the beginning."""
+    """Return the section of a scene's fault, which lasts for the whole recording by default."""
     keys |= {"t_s": t_s, "duration_s": duration_s}
     lines = "".join(f"{key} = {json.dumps(value)}\n" for key, value in keys.items())
     return f'\n[[fault]]\nkind = "{kind}"\n{lines}'

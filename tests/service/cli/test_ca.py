@@ -39,7 +39,7 @@ def test_a_ca_is_named_with_an_option(
     assert (trusted.code == 0) is not bool(unknown), trusted.err
 
 
-def test_a_node_refuses_what_is_no_ca_before_anything_else(run: Run) -> None:
+def test_a_node_refuses_a_wrong_ca_before_anything_else(run: Run) -> None:
     words = ("node", "--scene", "standing", "--server", "https://127.0.0.1:1")
     done = run(*words, "--ca", "no-such-file.pem")
     assert done.code == 2

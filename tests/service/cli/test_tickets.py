@@ -156,7 +156,7 @@ def test_ticket_as_json_by_the_token_of_the_environment(
     assert TOKEN not in done.out
 
 
-def test_ticket_without_the_token_says_what_is_lacking(
+def test_a_ticket_without_the_token_names_the_missing_token(
     serve_with: ServeWith, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     running = serve_with(token=TOKEN)

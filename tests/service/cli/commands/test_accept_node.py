@@ -49,14 +49,14 @@ def test_a_machine_with_another_fingerprint_is_not(accept: Accept, stranger: Fak
     assert closed(stranger.socket)[0] == 4013
 
 
-def test_where_nobody_asks_it_says_so(accept: Accept, node: FakeNode) -> None:
+def test_a_node_without_a_request_is_named(accept: Accept, node: FakeNode) -> None:
     node.connect()
     outcome = accept("bench")
     assert outcome.code == 1
     assert "no other machine asks to connect as 'bench'" in outcome.err
 
 
-def test_an_unknown_name_is_said(accept: Accept) -> None:
+def test_an_unknown_name_is_refused(accept: Accept) -> None:
     outcome = accept("nobody")
     assert outcome.code == 1
     assert "no node 'nobody'" in outcome.err

@@ -118,9 +118,7 @@ def check(outcome: Outcome, *codes: int) -> None:
 
 
 @pytest.mark.parametrize(("command", "name"), options(int, float))
-def test_a_number_that_nobody_means_is_refused_in_a_sentence(
-    run_short: Run, command: str, name: str
-) -> None:
+def test_an_absurd_number_is_refused_in_a_sentence(run_short: Run, command: str, name: str) -> None:
     option = f"--{name.replace('_', '-')}"
     for value in NUMBERS:
         outcome = run_short(command, *COMMANDS[command], f"{option}={value}")
@@ -128,9 +126,7 @@ def test_a_number_that_nobody_means_is_refused_in_a_sentence(
 
 
 @pytest.mark.parametrize("pair", ["nan,nan", "inf,0", "0,-inf", "1e308,1e308", "-1e308,1e308", "1"])
-def test_a_pair_of_numbers_that_nobody_means_is_refused_in_a_sentence(
-    run_short: Run, pair: str
-) -> None:
+def test_an_absurd_pair_of_numbers_is_refused_in_a_sentence(run_short: Run, pair: str) -> None:
     check(run_short("estimate", *COMMANDS["estimate"], f"--tare-s={pair}"), 1, 2)
     (Path.cwd() / "load.csv").write_text("time_s,fz_n,cop_x_m,cop_y_m\n0,9,0,0\n1,9,0,0\n")
     check(run_short(*SHORT, "--load", "load.csv", f"--cop-offset-m={pair}"), 0, 1, 2)
@@ -249,7 +245,7 @@ def given(arguments: tuple[object, ...], name: str) -> list[object]:
 
 
 @pytest.mark.parametrize(("command", "option"), READ)
-def test_what_is_no_file_of_the_kind_is_refused_in_a_sentence(
+def test_a_wrong_kind_of_file_is_refused_in_a_sentence(
     run_short: Run, tmp_path: Path, command: str, option: str
 ) -> None:
     for name, make in PLACES.items():
@@ -259,7 +255,7 @@ def test_what_is_no_file_of_the_kind_is_refused_in_a_sentence(
 
 
 @pytest.mark.parametrize(("command", "option"), WRITTEN)
-def test_what_cannot_be_written_over_is_refused_before_anything_takes_time(
+def test_an_output_in_the_place_of_a_special_file_is_refused_at_once(
     run_short: Run, tmp_path: Path, command: str, option: str
 ) -> None:
     for name in PLACES.keys() - FILES:
@@ -268,7 +264,7 @@ def test_what_cannot_be_written_over_is_refused_before_anything_takes_time(
 
 
 @pytest.mark.parametrize(("command", "option"), IN_FOLDERS)
-def test_what_is_no_folder_is_refused_in_a_sentence(
+def test_a_file_in_the_place_of_a_folder_is_refused_in_a_sentence(
     run_short: Run, tmp_path: Path, command: str, option: str
 ) -> None:
     for name in PLACES.keys() - FOLDERS:

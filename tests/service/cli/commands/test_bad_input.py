@@ -1,13 +1,14 @@
-"""Everything wrong that a user can say: a clear line, the right exit code, nothing half-written."""
+"""Wrong scenes, loads and options: a clear line, the right exit code, no file."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 
 from tests.builders.calibrations import make_calibration
-from tests.service.cli.outcome import Run, scene_text, static_only
+from tests.service.cli.outcome import Run, Simulate, scene_text, static_only
 
 STANDING = static_only(scene_text("standing"))
 GOOD_TRACE = "time_s,fz_n,cop_x_m,cop_y_m\n" + "".join(
@@ -16,7 +17,7 @@ GOOD_TRACE = "time_s,fz_n,cop_x_m,cop_y_m\n" + "".join(
 
 
 def left(folder: Path, *given: str) -> list[str]:
-    """What lies in the folder beside what the test put there."""
+    """Return the names in a folder without those that the test put there."""
     return sorted(path.name for path in folder.iterdir() if path.name not in given)
 
 
@@ -108,31 +109,9 @@ def test_an_axis_name_that_is_none_is_refused(run: Run, tmp_path: Path) -> None:
     outcome.fails(2, "--cop-axes")
 
 
-def made_once(run: Run, folder: Path, name: str, *arguments: object) -> bytes:
-    """What `foottile simulate` writes; the same command always gives the same bytes."""
-    kept = folder / name
-    if not kept.exists():
-        assert run("simulate", *arguments, "--out", kept).code == 0
-    return kept.read_bytes()
-
-
-@pytest.fixture(scope="module")
-def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("kept")
-
-
 @pytest.fixture
-def session(run: Run, tmp_path: Path, kept: Path) -> Path:
-    arguments = ("--scene", "standing", "--seconds", 2, "--no-estimates")
-    path = tmp_path / "s.parquet"
-    path.write_bytes(made_once(run, kept, "s.parquet", *arguments))
-    return path
-
-
-@pytest.fixture
-def bench(run: Run, kept: Path) -> bytes:
-    """A recording of tile T01 under the mill."""
-    return made_once(run, kept, "bench.parquet", "--scene", "indentation", "--tiles", "T01")
+def session(simulate: Simulate) -> Path:
+    return simulate("s.parquet", "standing", "--seconds", 2, "--no-estimates")
 
 
 @pytest.mark.parametrize(
@@ -169,7 +148,7 @@ def test_estimate_refuses(
     assert left(tmp_path, "s.parquet", "other.json", "broken.json") == []
 
 
-def test_estimate_refuses_what_is_no_session(run: Run, tmp_path: Path) -> None:
+def test_estimate_refuses_a_file_that_is_no_session(run: Run, tmp_path: Path) -> None:
     (tmp_path / "x.parquet").write_bytes(b"PAR1 not really PAR1")
     for name in ("x.parquet", "gone.parquet"):
         run("estimate", name, "--out", "e.parquet").fails(1, name)
@@ -183,48 +162,21 @@ def test_calibrate_refuses_a_session_that_is_no_indentation(
     assert left(tmp_path, "s.parquet") == []
 
 
-@pytest.mark.slow
-def test_calibrate_refuses_an_indentation_that_never_loads_the_tile(
-    run: Run, tmp_path: Path
-) -> None:
-    text = scene_text("indentation")
-    text = text.replace('kind = "indentation"', 'kind = "indentation"\nload_n = 0.2')
-    (tmp_path / "scene.toml").write_text(text)
-    run("simulate", "--scene", "scene.toml", "--tiles", "T01", "--out", "bench.parquet")
-    outcome = run("calibrate", "bench.parquet", "--out", "cal.json", "--plot", "cal.png")
-    outcome.fails(1, "never loads the tile", "T01")
-    assert left(tmp_path, "scene.toml", "bench.parquet") == []
-
-
-@pytest.mark.slow
-def test_calibrate_refuses_one_tile_from_two_files(run: Run, tmp_path: Path, bench: bytes) -> None:
-    for name in ("a.parquet", "b.parquet"):
-        (tmp_path / name).write_bytes(bench)
-    outcome = run("calibrate", "a.parquet", "b.parquet", "--out", "cal.json")
-    outcome.fails(1, "T01", "a.parquet", "b.parquet")
-
-
 def test_a_full_disk_is_an_error_and_leaves_nothing(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import os
-
     def full(descriptor: int) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    outcome = run(
-        *("simulate", "--scene", "standing", "--seconds", 2, "--no-estimates", "--out", "s.parquet")
-    )
-    outcome.fails(1, "No space left")
+    simulate = ("simulate", "--scene", "standing", "--seconds", 0.2, "--no-estimates")
+    run(*simulate, "--out", "s.parquet").fails(1, "No space left")
     assert left(tmp_path) == []
 
 
-@pytest.mark.slow
-def test_a_tare_under_load_is_refused(run: Run, tmp_path: Path) -> None:
-    run("simulate", "--scene", "standing", "--seconds", 4, "--out", "s.parquet")
-    outcome = run("estimate", "s.parquet", "--tare-s", "2,3", "--out", "e.parquet")
-    outcome.fails(1, "seems to be loaded")
+def test_a_tare_under_load_is_refused(run: Run, simulate: Simulate, tmp_path: Path) -> None:
+    loaded = simulate("s.parquet", "standing", "--seconds", 4)
+    run("estimate", loaded, "--tare-s", "2,3", "--out", "e.parquet").fails(1, "seems to be loaded")
     assert left(tmp_path, "s.parquet") == []
 
 
@@ -236,8 +188,6 @@ def test_no_output_takes_the_place_of_an_input_or_a_device(run: Run, tmp_path: P
     for target in ("foot.toml", "load.csv", "folder"):
         outcome = run(*simulate, target)
         assert outcome.code == 2, target
-    import os
-
     os.mkfifo(tmp_path / "pipe")
     assert run(*simulate, "pipe").code == 2
     assert (tmp_path / "foot.toml").read_text() == STANDING
@@ -259,28 +209,3 @@ def test_a_wrong_list_of_tiles_is_refused(run: Run, tmp_path: Path, tiles: str) 
     assert outcome.code == 2
     assert outcome.err.startswith("foottile: ")
     assert left(tmp_path) == []
-
-
-@pytest.mark.slow
-def test_a_reference_with_brackets_is_printed_as_it_is(
-    run: Run, tmp_path: Path, bench: bytes
-) -> None:
-    (tmp_path / "bench.parquet").write_bytes(bench)
-    reference = "load cell [/dev/ttyUSB0]"
-    outcome = run("calibrate", "bench.parquet", "--out", "cal.json", "--sensor", reference)
-    assert outcome.code == 0, outcome.err
-    assert reference in outcome.out
-
-
-@pytest.mark.slow
-def test_a_calibration_of_another_part_with_the_same_serial_is_refused(
-    run: Run, tmp_path: Path, bench: bytes
-) -> None:
-    (tmp_path / "bench.parquet").write_bytes(bench)
-    assert run("calibrate", "bench.parquet", "--out", "cal.json").code == 0
-    other = ("--tiles", "T01", "--parts-seed", 3, "--seconds", 2, "--out", "other.parquet")
-    assert run("simulate", "--scene", "indentation", *other).code == 0
-    arguments = ("--calibration", "cal.json", "--out", "e.parquet")
-    outcome = run("estimate", "other.parquet", *arguments)
-    outcome.fails(1, "T01 is not the part that was calibrated")
-    assert run("estimate", "bench.parquet", *arguments).code == 0

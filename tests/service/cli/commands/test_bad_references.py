@@ -102,7 +102,7 @@ def test_every_case_stands_in_the_table() -> None:
 
 
 @pytest.mark.parametrize("wrong", CASES)
-def test_a_wrong_reference_is_refused_or_said_and_never_a_number_that_looks_fine(
+def test_a_wrong_reference_is_refused_or_named_and_never_gives_a_plausible_number(
     run: Run, session: Path, tmp_path: Path, wrong: str
 ) -> None:
     make, options = CASES[wrong]

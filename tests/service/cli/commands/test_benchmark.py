@@ -98,7 +98,7 @@ def test_a_scene_of_which_no_draw_can_be_used_leaves_nothing_behind(
         (("--scene", "rolling", "--draws", "0"), "draws"),
     ],
 )
-def test_what_cannot_be_meant_is_refused_before_anything_takes_time(
+def test_absurd_arguments_are_refused_at_once(
     run: Run, arguments: tuple[object, ...], says: str
 ) -> None:
     run("benchmark", *arguments, "--out", "o").fails(2, says)

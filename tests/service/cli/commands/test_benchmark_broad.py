@@ -65,7 +65,7 @@ def test_what_gave_no_result_is_named_and_code_3(
         (("--family", "broad", "--full-only"), "--full-only and --family broad"),
     ],
 )
-def test_what_cannot_be_meant_is_refused(
+def test_absurd_arguments_are_refused(
     run: Run, tmp_path: Path, arguments: tuple[object, ...], says: str
 ) -> None:
     run("benchmark", *arguments, "--out", "o").fails(2, says)

@@ -1,4 +1,4 @@
-"""`foottile calibrate`: several files, refusals, and the marker of an assumed scale."""
+"""`foottile calibrate`: the printed figures, several files, and refusals."""
 
 from __future__ import annotations
 
@@ -10,40 +10,64 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from tests.service.cli.outcome import Run, scene_text, static_only
+from service.offline.calibration_lookup import find_calibration
+from service.sessions.calibration_file import write_calibration
+from tests.service.cli.outcome import Run, Simulate, short_rig
 from tests.storage.sessions.session_files import rewritten
 
 pytestmark = pytest.mark.slow
 
 
-def test_calibrate_merges_files_and_its_tables_fit_a_narrow_terminal(
-    run: Run, monkeypatch: pytest.MonkeyPatch
+def test_several_files_of_a_tile_are_merged_in_a_table_for_a_narrow_terminal(
+    run: Run, simulate: Simulate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    short = scene_text("indentation").replace(
-        'kind = "indentation"', 'kind = "indentation"\nrepeats = 2\nstroke_s = 1.5'
-    )
-    Path("short.toml").write_text(short)
     for seed in (1, 2):
-        out = f"{seed}.parquet"
-        run("simulate", "--scene", "short.toml", "--tiles", "T01", "--seed", seed, "--out", out)
+        simulate(f"{seed}.parquet", short_rig(), "--tiles", "T01", "--seed", seed)
     monkeypatch.setenv("COLUMNS", "80")
-    outcome = run("calibrate", "1.parquet", "2.parquet", "--out", "cal.json")
+    reference = "load cell [/dev/ttyUSB0]"
+    options = ("--out", "cal.json", "--sensor", reference)
+    outcome = run("calibrate", "1.parquet", "2.parquet", *options)
     assert outcome.code == 0, outcome.err
     assert "4 in 2" in outcome.out
+    assert reference in outcome.out, "brackets are no markup"
     assert "…" not in outcome.out
     assert max(len(line) for line in outcome.out.splitlines()) <= 80
-    twice = run("calibrate", "1.parquet", "1.parquet", "--out", "twice.json")
-    twice.fails(1, "the same frames occur twice")
-    parts = ("--parts-seed", 9, "--seconds", 3, "--out", "parts.parquet")
-    run("simulate", "--scene", "short.toml", "--tiles", "T01", *parts)
-    other = run("calibrate", "1.parquet", "parts.parquet", "--out", "other.json")
-    other.fails(1, "tile T01 has another chip")
-    assert not Path("other.json").exists()
 
 
-def test_a_tile_without_a_curve_is_named_and_the_others_are_written(run: Run, bench: bytes) -> None:
-    Path("bench.parquet").write_bytes(bench)
-    table = pq.read_table("bench.parquet")
+def test_files_that_do_not_go_together_are_refused(run: Run, simulate: Simulate) -> None:
+    first = simulate("1.parquet", short_rig(), "--tiles", "T01", "--seed", 1)
+    simulate("again.parquet", short_rig(), "--tiles", "T01", "--seed", 1)
+    parts = ("--tiles", "T01", "--parts-seed", 9, "--seconds", 3)
+    simulate("parts.parquet", short_rig(), *parts)
+    for other, words in (
+        ("again.parquet", ("the same frames occur twice", "T01", "1.parquet", "again.parquet")),
+        ("parts.parquet", ("tile T01 has another chip",)),
+    ):
+        run("calibrate", first, other, "--out", "cal.json").fails(1, *words)
+        assert not Path("cal.json").exists()
+    simulate(
+        "light.parquet", short_rig().replace("repeats", "load_n = 0.2\nrepeats"), "--tiles", "T01"
+    )
+    light = run("calibrate", "light.parquet", "--out", "cal.json", "--plot", "cal.png")
+    light.fails(1, "never loads the tile", "T01")
+    assert not [*Path().glob("cal.*")]
+
+
+def test_a_calibration_of_another_part_with_the_same_serial_is_refused(
+    run: Run, simulate: Simulate
+) -> None:
+    write_calibration(Path("cal.json"), find_calibration("emulated-rig", ["T01"]))
+    arguments = ("--calibration", "cal.json", "--out", "e.parquet")
+    for name, parts_seed in (("same.parquet", 0), ("other.parquet", 9)):
+        parts = ("--tiles", "T01", "--parts-seed", parts_seed, "--seconds", 3)
+        simulate(name, short_rig(), *parts)
+    assert run("estimate", "same.parquet", *arguments).code == 0
+    refused = run("estimate", "other.parquet", *arguments)
+    refused.fails(1, "T01 is not the part that was calibrated")
+
+
+def test_a_tile_without_a_curve_is_named_and_the_others_are_written(run: Run, bench: Path) -> None:
+    table = pq.read_table(bench)
     force = table["reference_force_n"].to_numpy().copy()
     second = np.array([name == "T02" for name in table["pressed_tile"].to_pylist()])
     force[second] = np.minimum(force[second], 10.0)
@@ -56,16 +80,23 @@ def test_a_tile_without_a_curve_is_named_and_the_others_are_written(run: Run, be
     assert [tile["serial"] for tile in printed["tiles"]] == ["T01"]
     assert "saturated" in printed["refused"]["T02"]
     assert "tile T02 refused" in outcome.err
-    estimate = run("estimate", "bench.parquet", "--out", "e.parquet", "--calibration", "cal.json")
+    estimate = run("estimate", bench, "--out", "e.parquet", "--calibration", "cal.json")
     estimate.fails(1, "it covers T01, but not T02; T02 was refused: ")
 
 
-def test_an_assumed_scale_is_said_in_text_json_and_file(run: Run) -> None:
-    scene = 'calibration = "paper-eq2-shape"\n' + static_only(scene_text("standing"))
-    Path("paper.toml").write_text(scene)
-    arguments = ("simulate", "--scene", "paper.toml", "--seconds", 1, "--out", "paper.parquet")
-    assert "scale of this calibration is assumed" in run(*arguments).out
-    assert json.loads(run(*arguments, "--json").out)["absolute_scale"] == "assumed"
-    table = pq.read_table("paper.parquet")
-    assert json.loads(table.schema.metadata[b"foottile.notes"])["absolute_scale"] == "assumed"
-    assert (table["estimate_flags"].to_numpy() & 64 == 64).all()
+def test_calibrate_prints_each_tiles_fit_and_draws_it(run: Run, bench: Path) -> None:
+    outcome = run("calibrate", bench, "--out", "cal.json", "--plot", "cal.png", "--json")
+    printed = outcome.printed()
+    assert [tile["serial"] for tile in printed["tiles"]] == ["T01", "T02"]
+    tile = printed["tiles"][0]
+    assert set(tile) >= {
+        *("serial", "r2", "rmse_n", "cv_rmse_n", "hysteresis_n", "range_kpa"),
+        *("monotonic", "coefficients"),
+    }
+    assert tile["rig"]["ended_by"] == "load"
+    assert tile["absolute_scale"] == "measured"
+    low_ms, high_ms = tile["effects"]["gas_tau_ms"]["interval_95"]
+    assert low_ms < tile["effects"]["gas_tau_ms"]["value"] < high_ms
+    assert printed["refused"] == {}
+    assert json.loads(Path("cal.json").read_text())["id"] == printed["id"]
+    assert Path("cal.png").read_bytes().startswith(b"\x89PNG")

@@ -86,7 +86,7 @@ def test_a_shear_that_three_hops_do_not_determine_is_refused_and_nothing_is_writ
         (("--reference-gain-sigma", 0.1), "no"),
     ],
 )
-def test_what_is_said_of_a_plate_needs_one(
+def test_options_of_a_plate_need_a_plate(
     run: Run, session: Path, arguments: tuple[object, ...], says: str
 ) -> None:
     run("calibrate", session, "--out", "cal.json", *arguments).fails(2, "--reference")

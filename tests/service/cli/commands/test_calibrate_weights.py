@@ -1,4 +1,4 @@
-"""Dead weights on a tile: the interval holds another load, and the command guides to it."""
+"""`foottile calibrate --live`: dead weights on a tile, guided step by step."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ FIVE = "200g,500g,1kg,1.5kg,2kg"
 
 
 def put_on(path: Path, grams: tuple[float, ...]) -> None:
-    """A load that puts masses on the first tile: 8 s without, 9 s with each."""
+    """Write a load that puts masses on the first tile: 8 s without, 9 s with each."""
     rows = ["time_s,cell1_n"]
     for number, each in enumerate(grams):
         begin_s, force_n = 17.0 * number, 1e-3 * each * STANDARD_GRAVITY_M_S2
@@ -44,7 +44,7 @@ def put_on(path: Path, grams: tuple[float, ...]) -> None:
 
 
 def follow(path: Path, weights: tuple[str, ...]) -> Indentation:
-    """Tile T01 of a recording, with the steps that the guide has marked in it."""
+    """Return tile T01 of a recording, with the steps that the guide marks in it."""
     with SealedFileReader(path) as session:
         frames = [frames for frames, _ in session.read_batches()]
         compensation = Compensation(session.info.tiles)
@@ -96,26 +96,23 @@ def test_another_load_lies_within_the_interval_that_five_weights_state(run: Run)
         np.concatenate([piece[name] for piece in pieces])[:, 0] for name in names
     )
     for mass_g in OTHERS_G:
-        settled = _settled(true_n, 1e-3 * mass_g * STANDARD_GRAVITY_M_S2)
+        other_n = 1e-3 * mass_g * STANDARD_GRAVITY_M_S2
+        rows = np.flatnonzero(np.abs(true_n - other_n) < 1e-3 * other_n)
+        settled = rows[len(rows) // 2 :]
         error_n, half_n = (force_n - true_n)[settled], 1.96 * sigma_n[settled]
         assert (np.abs(error_n) <= half_n).mean() > 0.9, mass_g
         assert half_n.mean() < 0.25 * true_n[settled].mean(), mass_g
 
 
-def _settled(true_n: Floats, force_n: float) -> npt.NDArray[np.intp]:
-    """Rows of a load, from half of its time on."""
-    rows = np.flatnonzero(np.abs(true_n - force_n) < 1e-3 * force_n)
-    return rows[len(rows) // 2 :]
-
-
 @pytest.mark.in_turn(each=True)
-def test_the_command_guides_through_the_weights_and_writes_what_is_accepted(
+def test_the_command_guides_through_the_weights_and_writes_the_calibration(
     run: Run, running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(weighing, "HOLD_S", weighing.REST_S)
+    for name in ("REST_S", "HOLD_S"):
+        monkeypatch.setattr(weighing, name, 2.5)  # a fit needs steps of 2 s or more
 
     class Followed(weighing.Weighing):
-        """A guide whose prompts somebody follows."""
+        """A guide with an operator who follows its prompts."""
 
         def feed_tile_pressures(
             self, t_ns: npt.NDArray[np.int64], tile_absolute_kpa: Floats
@@ -156,7 +153,7 @@ def test_the_command_guides_through_the_weights_and_writes_what_is_accepted(
         (("--live", "--tile", "T01", "--weights", "200g,much"), "'much' is no weight"),
     ],
 )
-def test_what_does_not_go_together_is_refused(
+def test_options_that_exclude_each_other_are_refused(
     run: Run, arguments: tuple[str, ...], says: str
 ) -> None:
     run("calibrate", *arguments, "--out", "cal.json").fails(2, says)

@@ -43,7 +43,7 @@ def plate(session: Path, tmp_path: Path) -> Path:
     return path
 
 
-def test_a_plate_is_aligned_and_compared_and_all_three_files_say_so(
+def test_a_plate_is_aligned_and_compared_in_three_files(
     run: Run, session: Path, plate: Path, tmp_path: Path
 ) -> None:
     asked = (*LAB, "--sign", "-", "--remove-offset", "--reference-sigma-n", "0.5")
@@ -147,7 +147,7 @@ def test_what_cannot_be_compared_is_named_and_leaves_nothing_behind(
     assert not (tmp_path / "o").exists()
 
 
-def test_a_session_without_estimates_is_refused_with_what_to_do(
+def test_a_session_without_estimates_is_refused_with_a_remedy(
     run: Run, session: Path, plate: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "scene.toml").write_text(scene_text("standing"))
@@ -165,14 +165,14 @@ def test_a_missing_matplotlib_is_named_with_the_extra_that_brings_it(
     run("compare", session, "--reference", plate, *asked).fails(2, "pip install 'foottile[plot]'")
 
 
-def test_a_session_in_the_place_of_its_reference_is_said_to_be_swapped(
+def test_a_session_in_the_place_of_its_reference_is_called_swapped(
     run: Run, session: Path, plate: Path
 ) -> None:
     done = run("compare", plate, "--reference", session, "--out", "o")
     done.fails(1, "plate.csv: it is not a session, and session.parquet is one", "swapped?")
 
 
-def test_a_range_of_lags_that_leaves_the_true_one_out_is_named_with_what_fits(
+def test_a_range_without_the_true_lag_is_refused_with_the_lag_that_fits(
     run: Run, session: Path, plate: Path
 ) -> None:
     asked = (*LAB, "--sign", "-", "--lag-range-s", "-0.2,0.1", "--out", "o")

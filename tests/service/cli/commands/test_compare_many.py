@@ -26,7 +26,7 @@ def plate_of(session: Path, path: Path, *, unit: float = 1.0) -> None:
     path.write_text("t,F\n" + "".join(f"{t:.6f},{f:.9f}\n" for t, f in rows))
 
 
-def test_each_row_is_compared_as_it_says_and_a_bad_one_fails_alone(
+def test_each_row_is_compared_and_a_bad_one_fails_alone(
     run: Run, session: Path, tmp_path: Path
 ) -> None:
     plate_of(session, tmp_path / "newtons.csv")
@@ -84,7 +84,7 @@ def test_each_row_is_compared_as_it_says_and_a_bad_one_fails_alone(
         ("--manifest", "list.csv", "--out", "o", "--decimal", ";"),
     ],
 )
-def test_what_is_said_twice_or_not_at_all_is_wrong_usage(
+def test_a_repeated_or_missing_argument_is_wrong_usage(
     run: Run, tmp_path: Path, words: tuple[str, ...]
 ) -> None:
     (tmp_path / "list.csv").write_text("session,reference\na.parquet,b.csv\n")

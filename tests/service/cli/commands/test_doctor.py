@@ -26,7 +26,7 @@ def doctor(run: Run, tmp_path: Path) -> Doctor:
     return examine
 
 
-def test_a_healthy_bus_is_said_to_be_well_and_how_fast_it_is(run: Run) -> None:
+def test_a_healthy_bus_is_reported_with_its_rates(run: Run) -> None:
     found = run("doctor", "--bus", "emulated", "--json").printed()
     assert [tile["serial"] for tile in found["tiles"]] == ["T01", "T02", "T03", "T04"]
     assert all(tile["problem"] == "" for tile in found["tiles"])
@@ -41,20 +41,20 @@ def test_a_healthy_bus_is_said_to_be_well_and_how_fast_it_is(run: Run) -> None:
     assert "repeated" not in found["verdict"], "channels without a tile are no disturbance"
 
 
-def test_what_people_read_says_the_same(run: Run) -> None:
+def test_the_text_has_the_same_figures(run: Run) -> None:
     outcome = run("doctor", "--bus", "emulated")
     assert outcome.code == 0
     for word in ("T03", "0x70", "1.609 ms", "400.0 kHz", "541.5", "best", "pipelined gives"):
         assert word in outcome.out
 
 
-def test_a_rate_that_will_not_hold_is_said_with_what_would(run: Run) -> None:
+def test_a_rate_beyond_the_bus_gets_a_lower_one(run: Run) -> None:
     found = run("doctor", "--scene", "standing", "--rate-hz", 700, "--json").printed(3)
     assert found["holds"] is False
     assert "700 frames/s requested will not hold: ask for 531 or less" in found["verdict"]
 
 
-def test_a_rate_that_another_schedule_would_hold_is_said_with_its_name(doctor: Doctor) -> None:
+def test_a_rate_for_another_schedule_gets_the_name_of_this_schedule(doctor: Doctor) -> None:
     text = scene_text("standing").replace("[array]", '[array]\nschedule = "sequential"')
     found = doctor(text, "--rate-hz", 300).printed(3)
     assert "will not hold: use schedule simultaneous" in found["verdict"]
@@ -67,7 +67,7 @@ def test_the_raspberry_pi_that_runs_at_five_eighths_is_recognised(doctor: Doctor
     assert "core_freq" in found["verdict"]
 
 
-def test_a_slow_part_is_named_with_what_it_costs(run: Run) -> None:
+def test_a_slow_part_is_named_with_its_cost(run: Run) -> None:
     outcome = run("doctor", "--scene", "rolling", "--servo", "none", "--json")
     slowest = max(outcome.printed()["tiles"], key=lambda tile: tile["conversion_ms"])
     assert f"{slowest['serial']} converts slowest" in json.loads(outcome.out)["verdict"]
@@ -89,12 +89,12 @@ def test_a_part_that_does_not_convert_needs_attention(doctor: Doctor) -> None:
     assert "never change" in tile["problem"]
 
 
-def test_a_part_that_does_not_convert_is_not_said_to_set_the_pace(doctor: Doctor) -> None:
+def test_a_part_that_does_not_convert_does_not_set_the_rate(doctor: Doctor) -> None:
     found = json.loads(doctor(scene_text("standing") + faulty("stale", tile="T03")).out)
     assert "converts slowest" not in found["verdict"]
 
 
-def test_a_bus_on_which_nobody_answers_is_a_failure_with_advice(doctor: Doctor) -> None:
+def test_a_silent_bus_is_a_failure_with_advice(doctor: Doctor) -> None:
     found = doctor(scene_text("standing") + faulty("sda_high")).printed(1)
     assert found["scl_hz"] is None
     assert "Nothing answers at 0x70 to 0x77" in found["verdict"]
@@ -117,7 +117,7 @@ def test_more_channels_than_allowed_at_once_is_no_schedule(run: Run) -> None:
     assert len(found["tiles"]) == len(load_scene("grid").tile) == 64
 
 
-def test_which_bus_has_to_be_said(run: Run) -> None:
+def test_a_doctor_without_a_bus_is_refused(run: Run) -> None:
     run("doctor").fails(2, "--bus")
 
 
@@ -135,7 +135,7 @@ def test_the_servo_of_the_scene_is_found_and_named(run: Run) -> None:
 
 
 @pytest.mark.real_time
-def test_a_servo_that_is_not_what_the_scene_says_is_said(
+def test_a_servo_that_differs_from_the_scene_is_named(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from devices.clock import SystemClock
@@ -148,7 +148,7 @@ def test_a_servo_that_is_not_what_the_scene_says_is_said(
     assert "The scene says MX-28, protocol 2" in found["verdict"]
 
 
-def test_a_servo_whose_port_is_not_there_does_not_hide_the_tiles(run: Run) -> None:
+def test_a_servo_without_its_port_does_not_hide_the_tiles(run: Run) -> None:
     found = run("doctor", "--scene", "rolling", "--servo", "/dev/ttyUSB99", "--json").printed(3)
     assert found["scl_hz"] is not None
     assert found["servo"]["is_well"] is False

@@ -7,7 +7,7 @@ import json
 from tests.service.cli.outcome import Run
 
 
-def test_domes_names_one_for_a_load_and_says_what_is_an_estimate(run: Run) -> None:
+def test_domes_names_one_for_a_load_and_marks_estimates(run: Run) -> None:
     outcome = run("domes", "--load-n", 24)
     assert outcome.code == 0
     assert "For 24 N: v60-11 (paper)." in outcome.out

@@ -31,7 +31,7 @@ def test_another_look_ahead_is_stated_with_what_it_changes(run: Run) -> None:
     assert pq.read_metadata("other.parquet").num_rows == same["frames"]
 
 
-def test_a_part_whose_stored_estimates_are_damaged_is_estimated_again(run: Run) -> None:
+def test_a_part_with_damaged_estimates_is_estimated_again(run: Run) -> None:
     preset = 'calibration = "paper-eq2-shape"\n'
     Path("small.toml").write_text(preset + static_only(scene_text("standing", 1)))
     assert run("simulate", "--scene", "small.toml", "--seconds", 3, "--out", "s.parquet").code == 0

@@ -1,4 +1,4 @@
-"""Commands over many sessions: what they say, and what they leave when they are killed."""
+"""Commands over many sessions: messages, exit codes, and files after an interruption."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from tests.service.process import Process
 from tests.waiting import until
 
 COPIES = 24
+"""Enough that a client is stopped before it has finished."""
 
 
 @pytest.fixture(scope="module")
@@ -30,17 +32,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def data(made: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(made, tmp_path / "data"))
-
-
-@pytest.fixture
-def copies(made: Path, tmp_path: Path) -> list[str]:
-    """Lone files, to be estimated."""
-    names = [f"trial{number}" for number in range(COPIES)]
-    (tmp_path / "trials").mkdir()
-    for name in names:
-        source = made / "sessions" / IDS[0] / "frames.parquet"
-        shutil.copy(source, tmp_path / "trials" / f"{name}.parquet")
-    return names
 
 
 def report(out: Path, command: str) -> list[dict[str, object]]:
@@ -57,8 +48,8 @@ def test_many_sessions_are_estimated_each_into_its_folder(
     assert {line["name"] for line in report(tmp_path / "out", "estimate")} == set(IDS[:2])
     again = run("estimate", data, "--out", "out", "--jobs", 1, "--json")
     assert again.code == 0, again.err
-    said = [json.loads(line) for line in again.out.splitlines()]
-    assert [line["state"] for line in said] == ["there", "there"]
+    lines = [json.loads(line) for line in again.out.splitlines()]
+    assert [line["state"] for line in lines] == ["there", "there"]
     proof = run("verify", "out", "data", "--jobs", 1)
     assert proof.code == 0, proof.err
     assert "verify: 4 verified; 4 complete" in proof.out
@@ -67,7 +58,7 @@ def test_many_sessions_are_estimated_each_into_its_folder(
     assert "2 complete" in alone.out
 
 
-def test_what_failed_is_listed_with_its_reason_and_the_exit_code_is_3(
+def test_a_failed_session_is_listed_with_its_reason_and_exit_code_3(
     run: Run, data: Path, tmp_path: Path
 ) -> None:
     recording(data, 2)
@@ -79,7 +70,7 @@ def test_what_failed_is_listed_with_its_reason_and_the_exit_code_is_3(
     assert states == {IDS[0]: "made", IDS[1]: "made", IDS[2]: "failed"}
 
 
-def test_sessions_of_a_manifest_are_worked_through_and_one_that_is_not_there_fails(
+def test_a_manifest_is_exported_and_its_missing_session_fails(
     run: Run, data: Path, tmp_path: Path
 ) -> None:
     text = f"session\ndata/sessions/{IDS[1]}\ndata/sessions/gone\n"
@@ -89,7 +80,7 @@ def test_sessions_of_a_manifest_are_worked_through_and_one_that_is_not_there_fai
     assert (tmp_path / "out" / IDS[1] / "frames.csv").is_file()
 
 
-def test_a_damaged_session_among_many_is_told_by_the_exit_code(run: Run, data: Path) -> None:
+def test_a_damaged_session_among_many_gives_exit_code_1(run: Run, data: Path) -> None:
     (data / "sessions" / IDS[1] / "clock.parquet").unlink()
     done = run("verify", f"{data}/sessions/*", "--jobs", 1, "--out", "proofs")
     assert done.code == 1
@@ -113,46 +104,59 @@ def test_a_damaged_session_among_many_is_told_by_the_exit_code(run: Run, data: P
         ("export", "nosuch://a/b", "--out", "o", "--format", "csv"),
     ],
 )
-def test_what_cannot_be_meant_is_wrong_usage(run: Run, data: Path, words: tuple[str, ...]) -> None:
+def test_contradictory_arguments_are_wrong_usage(
+    run: Run, data: Path, words: tuple[str, ...]
+) -> None:
     done = run(*words)
     done.fails(2)
     assert len(done.err.splitlines()) == 1
 
 
-def contents(out: Path) -> dict[str, bytes]:
-    """All that a run leaves, without its report."""
-    return {
-        str(path.relative_to(out)): path.read_bytes()
-        for path in out.rglob("*")
-        if path.is_file() and path.suffix != ".jsonl"
-    }
-
-
 @pytest.mark.process
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-def test_a_client_that_was_killed_goes_on_where_it_was_and_the_end_is_the_same(
-    run: Run, tmp_path: Path, copies: list[str], number: signal.Signals
+def test_an_interrupted_and_then_killed_client_goes_on_and_leaves_the_same_files(
+    run: Run, made: Path, tmp_path: Path
 ) -> None:
+    names = {f"trial{number}" for number in range(COPIES)}
+    (tmp_path / "trials").mkdir()
+    for name in names:
+        source = made / "sessions" / IDS[0] / "frames.parquet"
+        shutil.copy(source, tmp_path / "trials" / f"{name}.parquet")
     words = ("estimate", f"{tmp_path}/trials/*.parquet", "--models", "static", "--jobs")
     out = tmp_path / "out"
-    with closing(Process(*words, 2, "--out", out, folder=tmp_path / "run")) as client:
-        until(lambda: any(out.glob("*/estimate.made.json")))
-        client.process.send_signal(number)
-        code = client.ended(60.0)
-    assert code == (-number if number == signal.SIGKILL else 130)
-    kept = {path: path.stat().st_mtime_ns for path in out.glob("*/estimate.made.json")}
+    kept: dict[Path, int] = {}
+
+    def has_more_than(known: int) -> bool:
+        return len([*out.glob("*/estimate.made.json")]) > known
+
+    for number, code in ((signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)):
+        with closing(Process(*words, 2, "--out", out, folder=tmp_path / "run")) as client:
+            until(partial(has_more_than, len(kept)))
+            client.process.send_signal(number)
+            assert client.ended(60.0) == code
+        before = kept
+        kept = {path: path.stat().st_mtime_ns for path in out.glob("*/estimate.made.json")}
+        assert before.items() <= kept.items()
     done = run(*words, 1, "--out", out)
     assert done.code == 0, done.err
-    there = {str(line["name"]) for line in report(out, "estimate") if line["state"] == "there"}
+    lines = report(out, "estimate")
+    assert {line["name"] for line in lines} == names
+    there = {line["name"] for line in lines if line["state"] == "there"}
     assert {path.parent.name for path in kept} <= there
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
-    assert {str(line["name"]) for line in report(out, "estimate")} == set(copies)
     assert run(*words, 1, "--out", "whole").code == 0
-    assert contents(out) == contents(tmp_path / "whole")
-    assert set(os.listdir(out)) == {*copies, "estimate.report.jsonl"}
+    resumed, whole = (
+        {
+            path.relative_to(folder): path.read_bytes()
+            for path in folder.rglob("*")
+            if path.is_file() and path.suffix != ".jsonl"
+        }
+        for folder in (out, tmp_path / "whole")
+    )
+    assert resumed == whole
+    assert set(os.listdir(out)) == {*names, "estimate.report.jsonl"}
 
 
-def test_the_path_of_a_file_that_failed_is_said_once(run: Run, tmp_path: Path) -> None:
+def test_the_path_of_a_failed_file_is_printed_once(run: Run, tmp_path: Path) -> None:
     (tmp_path / "bad").mkdir()
     for name in ("a", "b"):
         (tmp_path / "bad" / f"{name}.parquet").write_bytes(b"PAR1, and no more")

@@ -108,7 +108,7 @@ def session(demo: Demo) -> str:
 
 
 @pytest.mark.real_time
-def test_sessions_lists_what_the_server_has_and_what_the_folder_has(
+def test_sessions_are_listed_from_a_server_and_from_a_folder(
     run: Run, demo: Demo, session: str
 ) -> None:
     asked = run("sessions", "--server", demo.url, "--json").printed()["items"]
@@ -147,7 +147,7 @@ def test_pull_brings_the_file_verified_and_at_once_the_second_time(
 
 
 @pytest.mark.real_time
-def test_pull_of_what_is_not_there_says_so(run: Run, demo: Demo, tmp_path: Path) -> None:
+def test_pull_of_a_missing_session_is_refused(run: Run, demo: Demo, tmp_path: Path) -> None:
     done = run("pull", "../../etc", "--server", demo.url, "--out", str(tmp_path))
     done.fails(2, "foottile sessions")
     done = run("pull", "20200101T000000Z-000000", "--server", demo.url, "--out", str(tmp_path))
@@ -155,7 +155,7 @@ def test_pull_of_what_is_not_there_says_so(run: Run, demo: Demo, tmp_path: Path)
 
 
 @pytest.mark.real_time
-def test_exports_say_the_same_in_every_format(
+def test_exports_have_the_same_rows_in_every_format(
     run: Run, demo: Demo, session: str, tmp_path: Path
 ) -> None:
     tables = {}
@@ -191,18 +191,18 @@ def test_exports_say_the_same_in_every_format(
 
 @pytest.mark.real_time
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (("--format", "xlsx"), "one of parquet, arrow, csv"),
         (("--format", "csv", "--columns", "nonsense"), "no column 'nonsense'"),
     ],
 )
-def test_an_export_that_cannot_be_leaves_nothing(
-    run: Run, demo: Demo, session: str, tmp_path: Path, options: tuple[str, ...], said: str
+def test_a_refused_export_leaves_no_file(
+    run: Run, demo: Demo, session: str, tmp_path: Path, options: tuple[str, ...], message: str
 ) -> None:
     out = tmp_path / "out.csv"
     done = run("export", session, "--data", str(demo.data), "--out", str(out), *options)
-    done.fails(2, said)
+    done.fails(2, message)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -218,7 +218,7 @@ def test_a_second_server_on_the_same_port_or_folder_is_refused(
 
 
 @pytest.mark.real_time
-def test_a_second_node_of_the_same_name_is_told_why_it_is_not_let_in(
+def test_a_second_node_of_the_same_name_is_refused_with_the_reason(
     demo: Demo, tmp_path: Path
 ) -> None:
     node = subprocess.Popen(
@@ -233,15 +233,15 @@ def test_a_second_node_of_the_same_name_is_told_why_it_is_not_let_in(
         text=True,
     )
     assert node.stderr is not None
-    said = ""
+    message = ""
     with node.stderr:
-        while "not connected" not in said:
+        while "not connected" not in message:
             line = node.stderr.readline()
-            assert line, said
-            said += line
+            assert line, message
+            message += line
         node.terminate()
         node.wait(20)
-    assert "foottile accept-node demo" in said
+    assert "foottile accept-node demo" in message
     assert demo.get("/nodes/demo").json()["connected"]
 
 
@@ -259,12 +259,12 @@ def test_a_demo_prints_one_link_that_logs_a_browser_in_and_commands_need_no_toke
         assert server.create_invite()["role"] == "operator"
     demo.process.send_signal(signal.SIGINT)
     assert ended(demo.process) == 0
-    said = (tmp_path / "stderr.txt").read_text()
-    assert (demo.data / "token").read_text().strip() not in said + demo.link
+    message = (tmp_path / "stderr.txt").read_text()
+    assert (demo.data / "token").read_text().strip() not in message + demo.link
 
 
 @pytest.mark.real_time
-def test_ctrl_c_seals_what_is_being_recorded(run: Run, tmp_path: Path) -> None:
+def test_ctrl_c_seals_the_session_that_is_being_recorded(run: Run, tmp_path: Path) -> None:
     demo = start_demo(tmp_path)
     started = demo.post("/sessions", {"node": "demo", "name": "cut short"}).json()
     demo.process.send_signal(signal.SIGINT)
@@ -277,13 +277,13 @@ def test_ctrl_c_seals_what_is_being_recorded(run: Run, tmp_path: Path) -> None:
 
 @pytest.mark.real_time
 def test_a_demo_ends_by_itself_after_its_seconds(tmp_path: Path) -> None:
-    demo = start_demo(tmp_path, "--seconds", "3", tared=False)
+    demo = start_demo(tmp_path, "--seconds", "1", tared=False)
     assert ended(demo.process) == 0
-    assert "ended after 3 s" in (tmp_path / "stderr.txt").read_text()
+    assert "ended after 1 s" in (tmp_path / "stderr.txt").read_text()
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "message"),
     [
         (("node", "--scene", "leg.toml"), 2, "no file 'leg.toml' and no built-in scene"),
         (("node", "--scene", "."), 2, "scene '.' cannot be read"),
@@ -307,13 +307,13 @@ def test_wrong_options_are_refused_with_the_reason(
     run: Run,
     arguments: tuple[str, ...],
     code: int,
-    said: str,
+    message: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     done = run(*arguments)
-    done.fails(code, said)
+    done.fails(code, message)
     assert "Traceback" not in done.err
 
 
@@ -375,12 +375,12 @@ def test_a_token_is_made_kept_and_asked_for_and_commands_of_its_user_find_it(
     assert "/#ticket=" in found.out, found.err
     serve.terminate()
     assert ended(serve) == 0
-    said = log.read_text()
-    assert str(tmp_path / "token") in said
-    assert token not in said + line  # they may be a log
+    message = log.read_text()
+    assert str(tmp_path / "token") in message
+    assert token not in message + line  # they may be a log
 
 
-def test_a_port_that_is_taken_by_somebody_else_is_named(run: Run, tmp_path: Path) -> None:
+def test_a_taken_port_is_named(run: Run, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         done = run("demo", "--scene", str(tiny_scene(tmp_path)), "--port", str(port))

@@ -56,9 +56,9 @@ def test_what_is_left_out_is_named_and_the_exit_code_is_3(run: Run, tmp_path: Pa
     done = run("query", "SELECT count(*) AS n FROM sessions", tmp_path)
     done.fails(3, IDS[1], "left out: it is recording")
     assert done.out.split() == ["n", "1"]
-    said = run("query", "SELECT count(*) AS n FROM sessions", tmp_path, "--json").printed(3)
-    assert said["rows"] == [{"n": 1}]
-    assert list(said["left_out"]) == [str(tmp_path / "sessions" / IDS[1])]
+    answer = run("query", "SELECT count(*) AS n FROM sessions", tmp_path, "--json").printed(3)
+    assert answer["rows"] == [{"n": 1}]
+    assert list(answer["left_out"]) == [str(tmp_path / "sessions" / IDS[1])]
 
 
 @pytest.mark.parametrize(
@@ -85,15 +85,15 @@ def test_a_place_without_a_session_is_wrong_usage_and_names_lone_files(
     run("query", "SELECT 1 AS a", "some").fails(2, "there is no session in these places")
     for name in ("a", "b"):
         (tmp_path / "some" / f"{name}.parquet").write_bytes(b"PAR1")
-    said = "there is no session in these places, but files by themselves: a.parquet and 1 more"
-    run("query", "SELECT 1 AS a", "some").fails(2, said)
-    run("estimate", "some", "--out", "o").fails(2, said)
+    answer = "there is no session in these places, but files by themselves: a.parquet and 1 more"
+    run("query", "SELECT 1 AS a", "some").fails(2, answer)
+    run("estimate", "some", "--out", "o").fails(2, answer)
 
 
 def test_a_data_folder_without_a_session_yet_answers_with_nothing(run: Run, tmp_path: Path) -> None:
     (tmp_path / "data" / "sessions").mkdir(parents=True)
-    said = run("query", "SELECT count(*) AS n FROM sessions", "data", "--json").printed()
-    assert said["rows"] == [{"n": 0}]
+    answer = run("query", "SELECT count(*) AS n FROM sessions", "data", "--json").printed()
+    assert answer["rows"] == [{"n": 0}]
 
 
 ODD_VALUES = [

@@ -65,7 +65,7 @@ def test_a_renamed_folder_is_named_with_its_id_by_everybody(
 
 
 @pytest.mark.parametrize("name", NAMES[:2])
-def test_a_copy_is_told_of_and_neither_is_merged_nor_deleted(
+def test_a_copy_is_named_and_neither_is_merged_nor_deleted(
     run: Run, tmp_path: Path, name: str
 ) -> None:
     data = tmp_path / "data"
@@ -83,7 +83,7 @@ def test_a_copy_is_told_of_and_neither_is_merged_nor_deleted(
 
 
 @pytest.mark.parametrize(("state", "is_held"), [("sealed", False), ("recording", True)])
-def test_a_server_says_so_and_keeps_the_frames_that_a_renamed_session_may_need(
+def test_a_server_names_a_renamed_session_and_keeps_its_frames(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, state: SessionState, is_held: bool
 ) -> None:
     renamed(tmp_path, "walk 3", state=state)

@@ -63,7 +63,7 @@ class Lab:
 
 
 @pytest.mark.in_turn(each=True)
-def test_a_trial_that_fails_twice_fails_alone_and_the_exit_code_says_so(
+def test_a_trial_that_fails_twice_fails_alone_with_exit_code_3(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lab = Lab()
@@ -85,7 +85,7 @@ def test_when_most_trials_fail_none_is_repeated(run: Run, monkeypatch: pytest.Mo
     assert len(lab.tried) == reproduction.REPEATED_MAX + 1
 
 
-def test_a_node_that_does_not_start_is_said_with_its_log(tmp_path: Path) -> None:
+def test_a_node_that_does_not_start_is_named_with_its_log(tmp_path: Path) -> None:
     with Laboratory(tmp_path) as laboratory:
         trial = RecordingJob("wrong", ["--scene=no-such-scene"], 1.0, ())
         with pytest.raises(FootTileError, match="does not come") as raised:

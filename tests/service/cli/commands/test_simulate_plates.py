@@ -8,7 +8,7 @@ from pathlib import Path
 from tests.service.cli.outcome import Run
 
 
-def test_files_of_a_plate_are_named_with_what_was_injected(run: Run, tmp_path: Path) -> None:
+def test_files_of_a_plate_are_named_with_the_injected_truth(run: Run, tmp_path: Path) -> None:
     asked = ("--scene", "standing", "--seconds", "1.5", "--no-estimates", "--force-plate", "fp.csv")
     done = run("simulate", *asked)
     assert done.code == 0, done.err

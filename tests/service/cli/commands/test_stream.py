@@ -11,32 +11,30 @@ from pathlib import Path
 
 import pytest
 
+from tests.service.cli.outcome import Run
 from tests.service.fake_node import FakeNode, Play
 from tests.service.process import Start
 from tests.service.running import Running
 from tests.waiting import PATIENCE_S, until
 
-COLUMNS = ["seq", "t_ns", "grf_n", "recomputed"]
+
+def test_each_frame_in_order_is_a_line_of_csv_or_json(
+    running: Running, tared: FakeNode, run: Run
+) -> None:
+    asked = ("stream", "bench", "--columns", "grf_n", "--frames", 40, "--server", running.url)
+    with Play(tared, 20.0):
+        as_csv, as_json = run(*asked), run(*asked, "--format", "jsonl")
+    assert (as_csv.code, as_json.code, as_csv.err, as_json.err) == (0, 0, "", "")
+    head, *table = csv.reader(as_csv.out.splitlines())
+    rows = [json.loads(line) for line in as_json.out.splitlines()]
+    assert all([*row] == head == ["seq", "t_ns", "grf_n", "recomputed"] for row in rows)
+    for seqs in ([int(row[0]) for row in table], [row["seq"] for row in rows]):
+        assert seqs == list(range(seqs[0], seqs[0] + 40))
 
 
-def test_lines_are_csv_or_json_one_for_each_frame_in_order(
+def test_ctrl_c_ends_a_stream_without_a_message(
     running: Running, tared: FakeNode, foottile: Start
 ) -> None:
-    with Play(tared, 20.0):
-        asked = ("stream", "bench", "--columns", "grf_n", "--frames", 40, "--server", running.url)
-        as_csv, as_json = foottile(*asked), foottile(*asked, "--format", "jsonl")
-        assert as_csv.ended(PATIENCE_S) == as_json.ended(PATIENCE_S) == 0
-    table = [*csv.reader(as_csv.out)]
-    assert table[0] == COLUMNS
-    rows = [json.loads(line) for line in as_json.out]
-    assert all([*row] == COLUMNS for row in rows)
-    for seqs in ([int(row[0]) for row in table[1:]], [row["seq"] for row in rows]):
-        assert seqs == list(range(seqs[0], seqs[0] + 40))
-    assert not as_csv.err
-    assert not as_json.err
-
-
-def test_ctrl_c_ends_it_without_a_word(running: Running, tared: FakeNode, foottile: Start) -> None:
     with Play(tared):
         process = foottile("stream", "--server", running.url)
         until(lambda: len(process.out) > 2)
@@ -45,7 +43,7 @@ def test_ctrl_c_ends_it_without_a_word(running: Running, tared: FakeNode, footti
     assert not process.err
 
 
-def test_it_ends_without_a_word_when_its_reader_goes_away(
+def test_a_stream_without_a_reader_ends_without_a_message(
     running: Running, tared: FakeNode, tmp_path: Path
 ) -> None:
     command = str(Path(sys.executable).parent / "foottile")
@@ -67,33 +65,27 @@ def test_it_ends_without_a_word_when_its_reader_goes_away(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "line"),
     [
-        (("nobody",), 2, "no node 'nobody'"),
+        (("ankle",), 2, "no node 'ankle'"),
         (("bench", "--columns", "grf_n_sigma"), 2, "did you mean 'grf_sigma_n'?"),
         (("bench", "--format", "xml"), 2, "expected csv or jsonl"),
         (("--server", "http://127.0.0.1:1"), 1, "no answer"),
     ],
 )
-def test_what_cannot_be_is_one_line_and_a_code(
-    running: Running,
-    tared: FakeNode,
-    foottile: Start,
-    arguments: tuple[str, ...],
-    code: int,
-    said: str,
+def test_a_wrong_request_ends_with_one_line_and_a_code(
+    running: Running, tared: FakeNode, run: Run, arguments: tuple[str, ...], code: int, line: str
 ) -> None:
-    process = foottile("stream", "--server", running.url, *arguments)
-    assert process.ended(PATIENCE_S) == code
-    assert len(process.err) == 1
-    assert said in process.err[0]
+    outcome = run("stream", "--server", running.url, *arguments)
+    outcome.fails(code, line)
+    assert len(outcome.err.splitlines()) == 1
 
 
 @pytest.mark.parametrize(
-    ("sink", "code", "said"), [("> /dev/full", 1, "No space left on device"), (">&-", 0, "")]
+    ("sink", "code", "reason"), [("> /dev/full", 1, "No space left on device"), (">&-", 0, "")]
 )
-def test_where_nothing_can_be_written_it_ends_and_says_why_if_it_was_to_be_written(
-    running: Running, tared: FakeNode, tmp_path: Path, sink: str, code: int, said: str
+def test_a_full_disk_is_an_error_and_a_closed_output_is_none(
+    running: Running, tared: FakeNode, tmp_path: Path, sink: str, code: int, reason: str
 ) -> None:
     command = [str(Path(sys.executable).parent / "foottile"), "stream", "--server", running.url]
     with Play(tared):
@@ -106,4 +98,4 @@ def test_where_nothing_can_be_written_it_ends_and_says_why_if_it_was_to_be_writt
         )
     assert ended.returncode == code
     assert len(ended.stderr.splitlines()) == code
-    assert said in ended.stderr
+    assert reason in ended.stderr

@@ -25,7 +25,7 @@ from storage.sessions.reader import SealedFileReader
 from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import UTC_NS, make_array
 from tests.builders.frames import make_frames
-from tests.service.cli.outcome import Run
+from tests.service.cli.outcome import Run, Simulate
 
 ID = "20200101T000000Z-00000a"
 OTHER_ID = "20200101T000000Z-00000b"
@@ -95,7 +95,7 @@ def test_json_of_one_session_is_its_ledger(run: Run, data: Path) -> None:
     assert folder["journals"][0]["held"] == [[0, 99]]
 
 
-def test_damage_is_said_and_is_exit_code_1(run: Run, data: Path) -> None:
+def test_damage_is_named_with_exit_code_1(run: Run, data: Path) -> None:
     run("recover", data)
     path = data / "sessions" / ID / "frames.parquet"
     content = bytearray(path.read_bytes())
@@ -129,7 +129,7 @@ def test_a_journal_and_its_segment_are_proven_alone(run: Run, data: Path) -> Non
     assert json.loads(run("verify", segment, "--json").out)["held"] == [[0, 99]]
 
 
-def test_what_is_lone_says_what_it_does_not_prove(run: Run, data: Path) -> None:
+def test_a_lone_file_is_not_proven_to_be_the_sealed_one(run: Run, data: Path) -> None:
     run("recover", data)
     found = run("verify", data / "sessions" / ID / "frames.parquet")
     assert found.code == 4
@@ -138,11 +138,11 @@ def test_what_is_lone_says_what_it_does_not_prove(run: Run, data: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["verify", "recover"])
-def test_a_name_of_nothing_is_wrong_usage(run: Run, command: str) -> None:
+def test_a_missing_path_is_wrong_usage(run: Run, command: str) -> None:
     assert run(command, "nowhere").code == 2
 
 
-def test_what_foottile_did_not_write_is_exit_code_1(run: Run, tmp_path: Path) -> None:
+def test_a_foreign_file_is_exit_code_1(run: Run, tmp_path: Path) -> None:
     (tmp_path / "some").mkdir()
     (tmp_path / "some" / "notes.txt").write_text("a walk")
     assert run("verify", "some").code == 1
@@ -159,7 +159,9 @@ def test_a_folder_that_is_used_is_not_recovered_but_verified(run: Run, data: Pat
     assert "a foottile server or node uses this folder" in refused.err
 
 
-def test_on_a_server_what_may_come_is_waited_for_unless_given_up(run: Run, data: Path) -> None:
+def test_recover_waits_for_the_frames_of_a_node_unless_they_are_given_up(
+    run: Run, data: Path
+) -> None:
     (data / "nodes").mkdir()
     waiting = run("recover", data)
     assert waiting.code == 3
@@ -193,7 +195,7 @@ def test_estimates_of_frames_out_of_order_are_refused(run: Run, data: Path, tmp_
 
 
 @pytest.mark.parametrize("to", ["parquet", "arrow", "csv"])
-def test_an_export_says_what_it_is_of_and_proves_nothing(
+def test_an_export_names_its_source_and_proves_nothing(
     run: Run, data: Path, tmp_path: Path, to: str
 ) -> None:
     run("recover", data)
@@ -203,13 +205,13 @@ def test_an_export_says_what_it_is_of_and_proves_nothing(
     assert found.code == 4
     assert found.out.splitlines()[-1].startswith("An export: it proves nothing")
     assert "damaged" not in found.out
-    said = json.loads(run("verify", out, "--json").out)
-    assert (said["export"], said["proves"], said["problems"]) == (to, [], [])
+    export = json.loads(run("verify", out, "--json").out)
+    assert (export["export"], export["proves"], export["problems"]) == (to, [], [])
     assert f"session {ID}" in found.out
     sealed = data / "sessions" / ID / "frames.parquet"
     with SealedFileReader(sealed) as reader:
-        assert said["source"]["content_sha256"] == reader.content_sha256
-    assert (said["source"]["start_s"], said["source"]["clock"]) == (0.1, "node")
+        assert export["source"]["content_sha256"] == reader.content_sha256
+    assert (export["source"]["start_s"], export["source"]["clock"]) == (0.1, "node")
     if to != "csv":  # of which any line may be the last
         out.write_bytes(out.read_bytes()[:-200])
         assert run("verify", out).code == 1
@@ -224,11 +226,11 @@ def test_an_export_in_the_place_of_a_sealed_file_is_damage(run: Run, data: Path)
     assert run("verify", sealed.parent).code == 1
 
 
-def test_what_simulate_and_estimate_write_is_whole_but_of_no_recorded_session(
-    run: Run, tmp_path: Path
+def test_a_simulated_and_an_estimated_file_are_whole_but_of_no_recorded_session(
+    run: Run, simulate: Simulate, tmp_path: Path
 ) -> None:
-    raw, estimated = tmp_path / "raw.parquet", tmp_path / "estimated.parquet"
-    run("simulate", "--scene", "standing", "--seconds", "2", "--out", raw)
+    raw = simulate("raw.parquet", "standing", "--seconds", 2, "--no-estimates")
+    estimated = tmp_path / "estimated.parquet"
     calibrated = ("--calibration", "paper-eq2-shape", "--models", "unwrap,static")
     run("estimate", raw, "--out", estimated, *calibrated)
     for path in (raw, estimated):
@@ -256,7 +258,7 @@ def test_every_other_file_of_a_data_folder_is_looked_at(run: Run, data: Path) ->
     assert (found.code, "damaged: nodes/bench/tares.json" in found.out) == (1, True)
 
 
-def test_a_server_id_is_held_against_its_checksum(run: Run, data: Path) -> None:
+def test_a_damaged_server_id_is_named(run: Run, data: Path) -> None:
     run("recover", data)
     path = data / SERVER_ID_NAME
     for at in range(41):
@@ -291,7 +293,7 @@ def _nothing_in_it(path: Path) -> None:
 @pytest.mark.parametrize(
     "replaced_by", [_a_folder, _a_link_to_nothing, _a_link_to_itself, _a_pipe, _nothing_in_it]
 )
-def test_verify_names_whatever_stands_in_the_place_of_a_file(
+def test_verify_names_a_file_that_was_replaced(
     run: Run, data: Path, replaced_by: Callable[[Path], None]
 ) -> None:
     run("recover", data)
@@ -351,7 +353,7 @@ def test_a_list_of_sessions_goes_on_behind_a_damaged_one(run: Run, data: Path) -
     assert "0000ff" not in found.err
 
 
-def test_a_list_of_sessions_says_how_much_was_not_sampled(run: Run, data: Path) -> None:
+def test_a_list_of_sessions_shows_the_part_that_was_not_sampled(run: Run, data: Path) -> None:
     run("recover", data)
     folder = SessionsFolder(data / "sessions")
     session = folder.load(ID)
@@ -363,7 +365,7 @@ def test_a_list_of_sessions_says_how_much_was_not_sampled(run: Run, data: Path) 
     assert (listed["missed_slots"], listed["lost"]) == (25, {})
 
 
-def test_verify_says_what_it_may_not_read(
+def test_verify_names_unreadable_files(
     run: Run, data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run("recover", data)
