@@ -47,6 +47,11 @@ def test_fields_have_the_types_and_the_order_of_the_annotations() -> None:
     assert dtype["limits"] == np.dtype((np.int64, (2,)))
 
 
+def test_a_layout_is_one_object_which_numba_recognises_without_a_comparison() -> None:
+    assert Outer.dtype() is Outer.dtype()
+    assert Outer.array(1)["inner"].dtype is Inner.dtype()
+
+
 def test_compiled_code_reads_and_writes_the_fields() -> None:
     records = Outer.array(2, force_n=[2.0, 3.0], weights=[[0, 0, 1], [0, 0, 5]], limits=[[7, 0]])
     records["inner"]["count"] = [10, 100]
