@@ -65,7 +65,7 @@ class Looking:
 
     is_writable = True
 
-    def write_framed(self, framed: bytes) -> None:
+    def write_framed_unless_closed(self, framed: bytes) -> None:
         """Forget it."""
 
 

@@ -103,7 +103,7 @@ class AsyncSession:
         return await asyncio.to_thread(self.snapshot.markers)
 
     async def add_marker(self, label: str, *, t_ns: int | None = None) -> Marker:
-        """Call `Session.add_marker_while_recording` in a thread."""
+        """Call `Session.add_marker` in a thread."""
         return await asyncio.to_thread(self.snapshot.add_marker, label, t_ns=t_ns)
 
     async def update(self, **changes: Any) -> Self:

@@ -316,7 +316,7 @@ class LimitedWebSocket(WebSocketsSansIOProtocol):
         """True if all earlier writes are sent, up to the transport buffer (64 KiB)."""
         return self.writable.is_set()
 
-    def write_framed(self, framed: bytes) -> None:
+    def write_framed_unless_closed(self, framed: bytes) -> None:
         """Write whole frames beside uvicorn's own `send`, which frames each message again."""
         if not (self.close_sent or self.disconnected or self.transport.is_closing()):
             self.transport.write(framed)

@@ -52,13 +52,13 @@ class OmittedModelEffect:
         self._frames = 0
         self._last_t_mono_ns = 0
 
-    def add_frames(self, tare: Tare, frames: FrameBatch, is_loaded: Bools) -> None:
+    def add_frames(self, tare: Tare, frames: FrameBatch, is_foot_loaded: Bools) -> None:
         """Estimate the next frames with and without the omitted models.
 
         Args:
             tare: in force.
             frames: n frames, in order, one at least.
-            is_loaded: (n,), whether the foot bears load.
+            is_foot_loaded: (n,), whether the foot bears load.
         """
         if tare is not self._tare:
             self._start_tare(tare)
@@ -69,7 +69,7 @@ class OmittedModelEffect:
         if not grf_n:
             return
         whole_n = grf_n.pop(_ALL_MODELS)
-        judged = is_loaded & np.isfinite(whole_n)
+        judged = is_foot_loaded & np.isfinite(whole_n)
         for without_n in grf_n.values():
             judged &= np.isfinite(without_n)
         self._frames += int(judged.sum())

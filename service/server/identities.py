@@ -141,7 +141,7 @@ class NodeIdentities:
             "no secret of node %s is stored; any machine may use its name: %s", claim.node, why
         )
 
-    def accept_replacement(self, node: str, fingerprint: str) -> None:
+    def accept_last_refused_machine(self, node: str, fingerprint: str) -> None:
         """Accept the machine that was refused last as the node from now on.
 
         Raises:

@@ -352,7 +352,7 @@ class ServerNode:
             self.clock_offset.server_minus_node_ns if self.clock_offset is not None else 0
         )
 
-    def delete_old_frames_or_one_ended_journal(self, keep: Mapping[str, Intervals]) -> bool:
+    def delete_old_frames_and_up_to_one_ended_journal(self, keep: Mapping[str, Intervals]) -> bool:
         """Delete frames older than the ring and not in `keep`, at most one whole journal per call.
 
         Args:
@@ -363,7 +363,7 @@ class ServerNode:
             times has as many.
 
         Raises:
-            StorageError: a file cannot be deleted.
+            StorageError: an old segment of the present stream cannot be deleted.
         """
         for name, stream in list(self.streams.items()):
             needed = keep.get(name, Intervals())
@@ -414,7 +414,9 @@ class ServerNode:
         if self.storage_problem is not None:  # a tare could not be stored
             return
         try:
-            self.estimator.tare_if_due(self.journal, lambda: self.present_stream.obtainable)
+            self.estimator.store_lead_or_flight_tare_if_due(
+                self.journal, lambda: self.present_stream.obtainable
+            )
         except StorageError as error:
             self.storage_problem = str(error)
 

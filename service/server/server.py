@@ -152,7 +152,7 @@ class Server:
                 continue
             with self._isolate_errors("guided calibrations"):
                 for node in self.nodes:
-                    self.weighings.end_if_stalled(node, now_s)
+                    self.weighings.fail_if_stalled_or_interrupted(node, now_s)
             with self._isolate_errors("sessions"):
                 self.sealer.advance_unsealed_sessions()
             for link in list(self.links.values()):
@@ -174,7 +174,7 @@ class Server:
         until_s = time.monotonic() + _DELETE_BUDGET_S
         for node in list(self.nodes):
             with self._isolate_errors(f"node {node.name}, deleting unneeded journals"):
-                while node.delete_old_frames_or_one_ended_journal(
+                while node.delete_old_frames_and_up_to_one_ended_journal(
                     self.recorder.needed_frames(node.name)
                 ):
                     await asyncio.sleep(0)
@@ -248,12 +248,12 @@ class Server:
 
         Raises:
             UnknownError: no node has this name.
-            StateError, ChangedError, StorageError: as `NodeIdentities.accept_replacement`.
+            StateError, ChangedError, StorageError: as `NodeIdentities.accept_last_refused_machine`.
         """
         the_node = self.nodes.find(node)
         if the_node is None and node not in self.identities.refused_machines:
             self.nodes.get(node)
-        self.identities.accept_replacement(node, fingerprint)
+        self.identities.accept_last_refused_machine(node, fingerprint)
         link = self.links.get(node)
         if link is not None:
             link.request_close(

@@ -146,7 +146,7 @@ class TakeRecorder:
                 take.errors_by_node[session.node] = str(error)
         return self._require_success(take, take.sessions)
 
-    def add_marker_while_recording(
+    def add_marker_to_recording_sessions(
         self, take_id: str, label: str, t_ns: int | None, marker_id: str | None = None
     ) -> Take:
         """Add a marker at one time to all of its sessions that are being recorded.

@@ -236,7 +236,7 @@ class Weighings:
         del self._of[node]
         await self._cancel(weighing)
 
-    def end_if_stalled(self, node: ServerNode, now_s: float) -> None:
+    def fail_if_stalled_or_interrupted(self, node: ServerNode, now_s: float) -> None:
         """End, as failed, the weighing of a node without progress, frames or recording.
 
         Args:

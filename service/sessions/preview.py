@@ -133,26 +133,26 @@ class Checkpoints:
         newest.begin_ns, newest.end_ns = _EVER_NS, -_EVER_NS
         self.checkpoints = tuple(self.checkpoints[:count])
 
-    def resume_stream_at_or_before(
-        self, checkpoints: Sequence[Checkpoint], index: int, inputs: SessionInputs
+    def resume_stream_at_checkpoint_or_earlier(
+        self, checkpoints: Sequence[Checkpoint], checkpoint_index: int, inputs: SessionInputs
     ) -> ResumedStream:
         """Resume estimates from a checkpoint, or from one before it if that cannot be read.
 
         Args:
             checkpoints: valid checkpoints.
-            index: index of the checkpoint.
+            checkpoint_index: of the checkpoint to resume from, among `checkpoints`.
             inputs: inputs for which the checkpoints are valid.
         """
         stream = make_preview_stream(inputs)
-        while stream is not None and (state := checkpoints[index].state) is not None:
+        while stream is not None and (state := checkpoints[checkpoint_index].state) is not None:
             try:
                 with np.load(io.BytesIO(self._scratch.read(state)), allow_pickle=False) as memory:
                     stream.load_state(dict(memory))
             except Exception:  # damaged bytes cause any error; the first checkpoint has no bytes
-                index, stream = index - 1, make_preview_stream(inputs)
+                checkpoint_index, stream = checkpoint_index - 1, make_preview_stream(inputs)
             else:
                 break
-        return ResumedStream(index, stream)
+        return ResumedStream(checkpoint_index, stream)
 
 
 def make_preview_stream(inputs: SessionInputs) -> EstimateStream | None:
@@ -268,7 +268,9 @@ class SessionPreview:
         index = max(
             0, bisect_left(true, max(kept_frames, 1), key=lambda place: place.estimated_frames) - 1
         )
-        index, self._stream = self.checkpoints.resume_stream_at_or_before(all_, index, inputs)
+        index, self._stream = self.checkpoints.resume_stream_at_checkpoint_or_earlier(
+            all_, index, inputs
+        )
         self.checkpoints.truncate(index + 1)
         place = all_[index]
         self.measure_repeated_work_up_to(self)

@@ -86,7 +86,9 @@ class PreviewFrames:
         """Yield the frames between two checkpoints, with estimates, up to an end time."""
         places = self._valid_checkpoints
         end_count = places[end].estimated_frames if end < len(places) else NO_END
-        start, stream = self._checkpoints.resume_stream_at_or_before(places, begin, self._inputs)
+        start, stream = self._checkpoints.resume_stream_at_checkpoint_or_earlier(
+            places, begin, self._inputs
+        )
         ahead, count = (
             places[begin].estimated_frames - places[start].estimated_frames,
             end_count - places[start].estimated_frames,

@@ -298,7 +298,7 @@ class Journal:
         return Intervals()
 
     def close_and_delete(self) -> None:
-        """Close the journal and delete its folder."""
+        """Close the journal and delete its folder; files that cannot be deleted stay."""
         self._open.close_without_sync()
         self._segments = []
         self.stored = Intervals()

@@ -89,7 +89,7 @@ _SUCTION_SPEED_M_S = 0.05
 
 @dataclass(frozen=True)
 class SoftGround:
-    """Properties of the ground at one place. `SoftGround.of` derives them from a scene.
+    """Properties of the ground at one place. Derived from a scene.
 
     Attributes:
         strength_pa_m: strength per metre of depth.

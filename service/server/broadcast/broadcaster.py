@@ -128,7 +128,7 @@ class SubscriberSocket(Protocol):
     def is_writable(self) -> bool:
         """True if all earlier writes are sent, up to the transport buffer (64 KiB)."""
 
-    def write_framed(self, framed: bytes) -> None:
+    def write_framed_unless_closed(self, framed: bytes) -> None:
         """Write whole frames of the websocket protocol; nothing if it is closed."""
 
 
@@ -147,12 +147,12 @@ class Subscriber:
         is_ready = self._socket.is_writable
         if self._backlog is None:
             if is_ready:
-                self._socket.write_framed(tick.framed)
+                self._socket.write_framed_unless_closed(tick.framed)
                 return
             self._backlog, self._backlog_since_s = PendingUpdate(), now_s
         self._backlog.add_update(tick.update)
         if is_ready:
-            self._socket.write_framed(
+            self._socket.write_framed_unless_closed(
                 encode_websocket_messages(self._backlog.pop_update().encode_messages(tick.ages_ms))
             )
             self._backlog = None

@@ -229,14 +229,16 @@ class NodeEstimator:
             self._disable(error)
             return [(frames, {})]
 
-    def tare_if_due(self, journal: Journal | None, get_obtainable: Callable[[], Intervals]) -> None:
-        """Tare if there is reason to, as `TareController.update`.
+    def store_lead_or_flight_tare_if_due(
+        self, journal: Journal | None, get_obtainable: Callable[[], Intervals]
+    ) -> None:
+        """Tare if there is reason to, as `TareController.store_lead_or_flight_tare_if_due`.
 
         Raises:
             StorageError: the tare cannot be stored; it is not in force then, and retried.
         """
         try:
-            self.tare_controller.tare_if_due(journal, get_obtainable)
+            self.tare_controller.store_lead_or_flight_tare_if_due(journal, get_obtainable)
         except StorageError:
             raise
         except Exception as error:

@@ -143,7 +143,9 @@ class TareController:
         self._flight_warning = None
         self._live.set_tare(self._history.tare_in_force_or_lost(self._info))
 
-    def tare_if_due(self, journal: Journal | None, get_obtainable: Callable[[], Intervals]) -> None:
+    def store_lead_or_flight_tare_if_due(
+        self, journal: Journal | None, get_obtainable: Callable[[], Intervals]
+    ) -> None:
         """Tare from a lead that has ended, or in flight, if that is due.
 
         Args:

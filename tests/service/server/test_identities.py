@@ -114,7 +114,7 @@ def test_an_accepted_machine_replaces_the_first_one(
     assert not stranger.connect(server)
     refused = server.refused_machines[NODE]
     assert (refused.fingerprint, refused.address) == (stranger.fingerprint, ADDRESS)
-    server.accept_replacement(NODE, stranger.fingerprint)
+    server.accept_last_refused_machine(NODE, stranger.fingerprint)
     assert stranger.connect(server)
     assert not machine.connect(server)
     assert NODE not in server.refused_machines, "it showed a proof only"
@@ -127,13 +127,13 @@ def test_only_the_last_refused_machine_is_accepted(
     server: NodeIdentities, machine: Machine, stranger: Machine, tmp_path: Path
 ) -> None:
     with pytest.raises(StateError, match="no other machine"):
-        server.accept_replacement(NODE, "0000-0000-0000-0000")
+        server.accept_last_refused_machine(NODE, "0000-0000-0000-0000")
     assert machine.connect(server)
     third = Machine(tmp_path / "third")
     for other in (stranger, stranger, third, third):
         assert not other.connect(server)
     with pytest.raises(ChangedError, match=third.fingerprint):
-        server.accept_replacement(NODE, stranger.fingerprint)
+        server.accept_last_refused_machine(NODE, stranger.fingerprint)
     assert machine.connect(server)
 
 
@@ -150,7 +150,7 @@ def test_a_full_disk_leaves_the_first_machine_accepted(
     with monkeypatch.context() as full:
         full.setattr(os, "fsync", refusing(*NO_SPACE))
         with pytest.raises(StorageError):
-            server.accept_replacement(NODE, fingerprint)
+            server.accept_last_refused_machine(NODE, fingerprint)
     assert machine.connect(server)
     assert server.refused_machines[NODE].fingerprint == fingerprint
 

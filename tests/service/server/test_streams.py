@@ -216,7 +216,7 @@ def test_what_was_deleted_because_nobody_needs_it_is_not_lost_even_after_a_resta
     for n in range(0, 100, 5):
         told.take(n, n + 4)
     told.synced()
-    told.node.delete_old_frames_or_one_ended_journal({NEW: Intervals([(10, 12)])})
+    told.node.delete_old_frames_and_up_to_one_ended_journal({NEW: Intervals([(10, 12)])})
     held = told.node.present_stream.stored
     assert held.missing_in(10, 12).number_count == 0
     assert held.missing_in(0, 99).number_count > 50
@@ -234,12 +234,12 @@ def test_what_was_deleted_because_nobody_needs_it_is_not_lost_even_after_a_resta
 def test_frames_that_no_session_needs_are_acknowledged_before_they_are_deleted(told: Told) -> None:
     told.connect(earlier=(told.earlier(stored=((0, 4),), next_seq=5),))
     told.take(0, 4, OLD)
-    assert not told.node.delete_old_frames_or_one_ended_journal({})
+    assert not told.node.delete_old_frames_and_up_to_one_ended_journal({})
     assert told.synced()[OLD] == Intervals([(0, 4)])
-    assert told.node.delete_old_frames_or_one_ended_journal({})
+    assert told.node.delete_old_frames_and_up_to_one_ended_journal({})
     told.take(0, 4, OLD)
     told.node.storage_problem = "the disk is full"
-    assert told.node.delete_old_frames_or_one_ended_journal({})  # it makes room
+    assert told.node.delete_old_frames_and_up_to_one_ended_journal({})  # it makes room
 
 
 def test_of_the_present_stream_all_is_asked_for_and_what_sessions_need_first(told: Told) -> None:

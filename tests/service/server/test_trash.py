@@ -324,7 +324,7 @@ def test_frames_of_an_unsealed_session_are_not_deleted(
     leave_pending(tared)
     node = running.server.nodes.get("bench")
     running.call(
-        lambda: node.delete_old_frames_or_one_ended_journal(
+        lambda: node.delete_old_frames_and_up_to_one_ended_journal(
             running.server.recorder.needed_frames("bench")
         )
     )
@@ -345,7 +345,7 @@ def test_unneeded_journals_are_deleted_one_at_a_time(running: Running, tared: Fa
     folder = running.data / "journal" / "bench"
     left = []
     while running.call(
-        lambda: node.delete_old_frames_or_one_ended_journal(
+        lambda: node.delete_old_frames_and_up_to_one_ended_journal(
             running.server.recorder.needed_frames("bench")
         )
     ):

@@ -145,7 +145,8 @@ async def stop_take(take_id: str, server: ServerState) -> TakeView:
 async def mark_take(take_id: str, body: one.AddMarker, server: ServerState) -> TakeView:
     """Add a marker at one time and with one id to all sessions that are being recorded."""
     return TakeView.from_take(
-        server.takes.add_marker_while_recording(take_id, body.label, body.t_ns, body.id), server
+        server.takes.add_marker_to_recording_sessions(take_id, body.label, body.t_ns, body.id),
+        server,
     )
 
 

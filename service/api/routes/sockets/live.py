@@ -214,7 +214,9 @@ async def serve_live(socket: WebSocket, server: Server) -> None:
 
 async def _serve_page(socket: WebSocket, server: Server, outlet: Connection) -> None:
     node, rate_hz = _parse_query(socket, server)
-    outlet.write_framed(encode_websocket_messages([encode_json(_make_hello(server, node))]))
+    outlet.write_framed_unless_closed(
+        encode_websocket_messages([encode_json(_make_hello(server, node))])
+    )
     viewer = server.broadcaster.subscribe(outlet, rate_hz, node)
     try:
         await _run_until_first(viewer.disconnected, _answer_pings(socket))

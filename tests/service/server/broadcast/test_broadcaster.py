@@ -31,7 +31,7 @@ class Screen:
         self.is_writable = True
         self.written: list[bytes] = []
 
-    def write_framed(self, framed: bytes) -> None:
+    def write_framed_unless_closed(self, framed: bytes) -> None:
         assert self.is_writable
         self.written.append(framed)
 

@@ -201,7 +201,7 @@ class World:
 
     def prune(self) -> None:
         """It deletes what nobody needs."""
-        while self.node.delete_old_frames_or_one_ended_journal(self.needed()):
+        while self.node.delete_old_frames_and_up_to_one_ended_journal(self.needed()):
             pass
 
     def needed(self) -> Mapping[str, Intervals]:
