@@ -313,11 +313,11 @@ class CalibrationJobs:
         """
         fit = self.get_job(job_id)
         if fit is self._running:
-            await self.close()
+            await self.cancel_running_job_and_wait()
         return fit
 
-    async def close(self) -> None:
-        """Cancel the running job."""
+    async def cancel_running_job_and_wait(self) -> None:
+        """Cancel the running job, if any, and wait for its end."""
         if self._task is None or self._running is None:
             return
         fit, task = self._running, self._task

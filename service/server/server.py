@@ -76,7 +76,7 @@ class NodeLink:
         self.close_requested.set()
 
 
-class DeletedSessions(NamedTuple):
+class DeletedTotals(NamedTuple):
     """Sessions that were deleted from the trash."""
 
     session_count: int
@@ -208,7 +208,7 @@ class Server:
         for link in list(self.links.values()):
             link.request_close(LinkCloseCode.RESTART, "the server is stopping; reconnect")
         await self.weighings.close()
-        await self.calibration_jobs.close()
+        await self.calibration_jobs.cancel_running_job_and_wait()
         await self.sealer.wait_for_running_sealing()
         for node in self.nodes:
             keep = [node.save_hello] if node.is_dirty else []
@@ -263,7 +263,7 @@ class Server:
         if the_node is not None:
             self.notify_node_changed(the_node)
 
-    async def empty_trash(self) -> DeletedSessions:
+    async def empty_trash(self) -> DeletedTotals:
         """Delete all sessions in the trash.
 
         Raises:
@@ -271,7 +271,7 @@ class Server:
         """
         doomed = self.sessions.trash.rename_all_for_deletion()
         size_bytes = await asyncio.to_thread(delete_and_count_bytes, doomed)
-        return DeletedSessions(len(doomed), size_bytes)
+        return DeletedTotals(len(doomed), size_bytes)
 
     def make_node_view(self, node: ServerNode) -> NodeView:
         """Return a node's present state, for answers and subscribers."""

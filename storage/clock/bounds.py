@@ -47,7 +47,7 @@ _MIN_STEADY_ROWS = 4
 
 @dataclass(frozen=True)
 class OffsetRows:
-    """Measurements in order of time: int64[n] each; their ranges are checked at reading.
+    """Measurements, int64[n] each; `ClockTable` sorts them. Ranges are checked at reading.
 
     Attributes:
         t_mono_ns: instant by the node's clock that never steps.

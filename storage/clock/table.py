@@ -147,7 +147,7 @@ class ClockTable:
         )
 
 
-def group_unsorted_rows_by_stream(
+def group_rows_by_stream_without_sorting(
     rows: Iterable[ClockOffset], *, where: str = ""
 ) -> dict[str, OffsetRows]:
     """Group the measurements of a session by stream_id, as columns.

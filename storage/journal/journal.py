@@ -326,7 +326,7 @@ class Journal:
             self.stored = self.stored | segment.stored
 
     def _recompute_stored(self) -> None:
-        self._instants.clear()
+        self._instants.forget_cached_times()
         self.stored = union(segment.stored for segment in self._segments)
 
     def _append_to_segment(self, message: EncodedBatch) -> None:

@@ -60,7 +60,7 @@ class TimeIndex:
             t_ns_by_end.pop((last + 1, False), None)
             t_ns_by_end.pop((last, True), None)
 
-    def clear(self) -> None:
+    def forget_cached_times(self) -> None:
         """Clear the cache: numbers are no longer stored."""
         self._t_ns_by_end.clear()
 

@@ -124,7 +124,7 @@ def test_a_pending_session_says_what_it_waits_for_and_can_be_sealed_without_it(
     expect(page.locator("#ask-dialog")).to_contain_text("100 frames will be lost for good")
     page.get_by_role("button", name="Seal as lossy").click()
     expect(row.locator(".state")).to_have_text("lossy")
-    expect(row).to_contain_text("100 frames: abandoned")
+    expect(row).to_contain_text("100 frames: session sealed without them")
     expect(open_menu(page, row).get_by_role("menuitem", name="Abandon")).to_have_count(0)
 
 

@@ -8,7 +8,7 @@ const REASONS = {
   evicted: "link down longer than the node's buffer",
   corrupt: "damaged on disk",
   node_restarted: "node restarted without them",
-  abandoned: "abandoned",
+  abandoned: "session sealed without them",
   refused: "invalid, refused by the server",
 };
 

@@ -147,7 +147,7 @@ class ForceHistory:
         """Return the newest seconds, with the fields of `ForceSpan`, oldest first.
 
         Args:
-            seconds: counted back from the newest frame.
+            seconds: counted back from the newest selected span.
             before_seq: only spans that begin before this number.
         """
         first = max(0, self._count - _MERGED_MAX)

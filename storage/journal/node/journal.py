@@ -320,7 +320,7 @@ class NodeJournal:
         stream.ensure_journal_and_notes()
         while stream.unwritten_bytes and stream.journal is not None:
             try:
-                self._retention.enforce_budget_or_raise_full(
+                self._retention.delete_unneeded_to_budget_or_raise_full(
                     self.streams, ignore_check_interval=self._disk_problem is not None
                 )
                 stream.write_oldest_waiting()

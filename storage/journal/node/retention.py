@@ -47,7 +47,7 @@ class RetentionPolicy:
         self._began_s = time.monotonic()
         self._weighed_s = -math.inf
 
-    def enforce_budget_or_raise_full(
+    def delete_unneeded_to_budget_or_raise_full(
         self, streams: Sequence[NodeStream], *, ignore_check_interval: bool
     ) -> None:
         """Delete the oldest unneeded segments beyond the budget; check once a second.

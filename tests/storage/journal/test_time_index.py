@@ -47,7 +47,7 @@ def test_when_something_is_not_held_any_more_the_disk_is_asked_once() -> None:
 
     instants, stored = TimeIndex(look_up), Intervals([(0, 9)])
     instants.register_message(EncodedBatch.from_frames_and_payload(make_frames(10), b""), stored)
-    instants.clear()
+    instants.forget_cached_times()
     for _ in range(3):
         assert (
             instants.describe_reversal_against_stored(make_frames(np.arange(10, 12)), stored) == ""
