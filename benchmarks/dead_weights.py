@@ -22,7 +22,7 @@ from devices.errors import CalibrationError
 from devices.scene.emulation_sections import PartFamily
 from service.estimation.dead_weights import STANDARD_GRAVITY_M_S2
 from service.estimation.fitting.rig.indentation import Indentation
-from service.estimation.fitting.weights_fit import fit_dead_weights
+from service.estimation.fitting.weights_fit import fit_curve_to_dead_weights
 from service.estimation.models.static import StaticCurves
 from service.offline.calibration_lookup import make_rig_scene
 
@@ -103,7 +103,7 @@ def measure(
             temperature_raw=np.full(calibrating.sum(), np.nan),
         )
         try:
-            tile = fit_dead_weights([recording])
+            tile = fit_curve_to_dead_weights([recording])
         except CalibrationError:
             refused += 1
             continue

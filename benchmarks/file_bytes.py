@@ -62,7 +62,7 @@ def measured(recording: data.Recording, folder: Path, *, with_ladder: bool) -> l
             find_calibration("emulated-rig", recording.info.serials),
             sealing.LADDER,
         )
-    journal = Journal.open_and_recover(folder / "journal")
+    journal = Journal.open_existing_and_recover(folder / "journal")
     columns: dict[str, Counter[str]] = {}
     for name, (calibration, models) in ways.items():
         sources = sealing.sources_of(journal, calibration, models)

@@ -43,7 +43,7 @@ def sealed(recording: Recording, folder: SessionsFolder, session_id: str, work: 
     """A recording as a server seals it."""
     journal_folder = work / session_id
     write_journal(journal_folder, recording)
-    journal = Journal.open_and_recover(journal_folder)
+    journal = Journal.open_existing_and_recover(journal_folder)
     sources = sources_of(journal, make_paper_shape_preset(), STATIC)
     named = {"id": session_id, "name": recording.title}
     sources = type(sources)(

@@ -94,13 +94,14 @@ def step(name: str, folder: Path, hours: float) -> Step:
         case "build":
             frames, append_us = _build(folder, hours)
         case "open":
-            frames = Journal.open_and_recover(journal).stored.number_count
+            frames = Journal.open_existing_and_recover(journal).stored.number_count
         case "read":
-            opened = Journal.open_and_recover(journal)
+            opened = Journal.open_existing_and_recover(journal)
             frames = sum(len(batch) for batch in opened.read_frames(0, opened.stored.last or 0))
         case _:
             frames = seal(
-                sources_of(Journal.open_and_recover(journal), None), folder / "sealed.parquet"
+                sources_of(Journal.open_existing_and_recover(journal), None),
+                folder / "sealed.parquet",
             )
     return Step(
         frames=frames,

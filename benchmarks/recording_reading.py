@@ -19,7 +19,7 @@ LEARNT_S = 60.0
 
 def jobs(folder: Path, frames: int) -> dict[str, Callable[[], object]]:
     """Ways to read the journal in `folder`."""
-    opened = Journal.open_and_recover(folder)
+    opened = Journal.open_existing_and_recover(folder)
 
     def arrow_alone() -> None:
         count = 0
@@ -37,7 +37,7 @@ def jobs(folder: Path, frames: int) -> dict[str, Callable[[], object]]:
 
     return {
         "Arrow alone, its stream": arrow_alone,
-        "`Journal.open`": lambda: Journal.open_and_recover(folder),
+        "`Journal.open`": lambda: Journal.open_existing_and_recover(folder),
         "`Journal.read`": read,
         "`foottile verify` of it": verify,
     }

@@ -72,7 +72,7 @@ def jobs(
     recording: Recording, folder: Path, *, with_ladder: bool
 ) -> dict[str, Callable[[], object]]:
     """Ways to seal the journal in `folder / "journal"`, and pyarrow's part of it alone."""
-    journal = Journal.open_and_recover(folder / "journal")
+    journal = Journal.open_existing_and_recover(folder / "journal")
     table = flat_table(recording.frames)
     rows = minute(recording.frames)
 

@@ -281,7 +281,7 @@ class ReplayedNode:
         acked = self.stream.acked
         while self._kept and not self._kept[0] - acked:
             self._kept.popleft()
-            self.stream.drop_oldest_waiting(EVICTED, self._wanted)
+            self.stream.drop_oldest_waiting_and_record_unacked_loss(EVICTED, self._wanted)
 
 
 def run_load(played: Played, count: int, server: str, control: Connection) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 def to_json_value(value: Any) -> Any:
     """Convert a result to JSON values: non-finite numbers to null, dataclasses to objects.
 
-    An object with a method `to_json_dict` is converted by that.
+    An object with a method `as_dict` is converted by that.
     """
     if hasattr(value, "as_dict"):
         return to_json_value(value.as_dict())

@@ -31,7 +31,7 @@ from storage.parquet_hash import compute_sha256, parse_hashed_table
 from storage.sessions.folder import FRAMES_NAME
 from storage.sessions.metadata import SESSION_NAME
 from storage.verify.export import RECOGNISED_FORMATS as PROVEN
-from storage.verify.export import recognise_export_and_check_readable
+from storage.verify.export import recognise_export_and_check_not_cut_off
 
 if TYPE_CHECKING:
     import httpx
@@ -205,7 +205,9 @@ def _download_export(
             _write_response(answer, file)
         # For other formats, only the connection detects truncation.
         report = (
-            recognise_export_and_check_readable(partial) if export_format.name in PROVEN else None
+            recognise_export_and_check_not_cut_off(partial)
+            if export_format.name in PROVEN
+            else None
         )
         if export_format.name in PROVEN and (report is None or report.problems):
             why = "it cannot be read" if report is None else report.problems[0]

@@ -193,7 +193,7 @@ def union(sets: Iterable[Intervals]) -> Intervals:
     return Intervals(sorted(chain.from_iterable(sets)))  # sorted, each is added at the end
 
 
-def intervals_from_open_pairs(pairs: Iterable[tuple[int, int | None]]) -> Intervals:
+def intervals_from_inclusive_pairs(pairs: Iterable[tuple[int, int | None]]) -> Intervals:
     """Return pairs as a set, with `NO_END` for a missing last number."""
     return Intervals((first, NO_END if last is None else last) for first, last in pairs)
 

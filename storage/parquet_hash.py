@@ -96,7 +96,7 @@ def _compute_stated_and_actual_hash(content: bytes) -> HashPair | None:
     return _hashes(io.BytesIO(content))
 
 
-def check_file_hash(hashes: HashPair | None, *, where: str) -> None:
+def refuse_wrong_or_missing_file_hash(hashes: HashPair | None, *, where: str) -> None:
     """Refuse a Parquet file whose bytes have changed since it was written.
 
     Checksums of pages alone are not enough: a flip in the footer may give a column the name or the
@@ -145,7 +145,7 @@ def footer_stated_and_actual_hash(footer: bytes) -> HashPair | None:
     return HashPair(stated, _footer_hash(footer, own, at))
 
 
-def check_footer_hash(hashes: HashPair | None, *, where: str) -> None:
+def refuse_wrong_or_missing_footer_hash(hashes: HashPair | None, *, where: str) -> None:
     """Refuse a footer whose bytes have changed since it was written.
 
     Args:
@@ -284,7 +284,7 @@ def parse_hashed_table(content: bytes, *, where: str) -> pa.Table:
     Raises:
         DamagedFileError: its hash is wrong or missing, or it is no table.
     """
-    check_file_hash(_compute_stated_and_actual_hash(content), where=where)
+    refuse_wrong_or_missing_file_hash(_compute_stated_and_actual_hash(content), where=where)
     try:
         with pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True) as file:
             # On this thread: if one of Arrow's released `content` last while the interpreter ends,

@@ -338,7 +338,7 @@ def _compute_cop_positions(
     """Compute the grid indices of the COP, and its position on the ground."""
     foot_params = params.foot[0]
     if foot_params.has_grid == 1:
-        grf_cop.compute_cop_index(params, samples, out)
+        grf_cop.compute_gauge_weighted_cop_index(params, samples, out)
     if foot_params.has_servo == 1 and not math.isnan(foot_params.travel_m_per_rad):
         out[grf_cop.COP_GROUND_X] = transform_to_ground_x_m(
             out[grf_cop.COP_X],

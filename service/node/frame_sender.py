@@ -30,7 +30,7 @@ from service.protocol import (
     append_crc,
     encode_message,
 )
-from storage.intervals import NO_END, Intervals, intervals_from_open_pairs, union
+from storage.intervals import NO_END, Intervals, intervals_from_inclusive_pairs, union
 from storage.journal.node.stream import NodeStream
 from storage.wire import EncodedBatch
 
@@ -286,7 +286,7 @@ class FrameSender:
 def _missing_before_hello(pair: tuple[int, int | None], hello: Hello, stream_id: str) -> Intervals:
     """Return the missing frames from before hello; newer ones are sent anyway."""
     newest = hello.next_seq - 1 if stream_id == hello.array_info.stream_id else NO_END
-    return intervals_from_open_pairs([pair]).restricted_to(0, newest)
+    return intervals_from_inclusive_pairs([pair]).restricted_to(0, newest)
 
 
 class Backlog:

@@ -18,9 +18,9 @@ from service.sessions.parts import (
     SessionStream,
     close_at_stream_end_or_newest_frame,
     close_unfinished,
-    continue_session,
     create_session,
     split_number_in_parentheses,
+    stop_session_and_make_continuation,
 )
 from storage.durable_files import remove_dead_process_temporaries
 from storage.intervals import NO_END, Intervals
@@ -105,7 +105,7 @@ class LocalRecording:
             if before is None or before.has_same_tiles_as(stream.info):
                 session = session.model_copy(update={"parts": (*session.parts, part)})
             else:
-                ended, session = continue_session(
+                ended, session = stop_session_and_make_continuation(
                     session,
                     stream.info,
                     server_utc_ns(),

@@ -32,7 +32,7 @@ from service.estimation.fitting.effects_fit import (
 from service.estimation.fitting.rig.indentation import Indentation, select_loaded
 from service.estimation.fitting.rig.loading import has_weights
 from service.estimation.fitting.static_fit import fit_static_curve
-from service.estimation.fitting.weights_fit import fit_dead_weights
+from service.estimation.fitting.weights_fit import fit_curve_to_dead_weights
 from storage.schema import UNKNOWN_T_NS
 from storage.sessions.folder import Marker
 from storage.sessions.metadata import MARKERS_NAME, load_clock_table, read_existing_markers
@@ -256,7 +256,7 @@ def _fit_tile(pressed: Sequence[TileRecording], delay: Parameter) -> TileCalibra
                 where=", ".join(recording.where for recording in recordings),
                 remedy="Calibrate from one kind of recording",
             )
-        tile = fit_dead_weights(select_loaded(recordings))
+        tile = fit_curve_to_dead_weights(select_loaded(recordings))
         return tile.model_copy(update={"coefficient_words": pressed[0].coefficient_words})
     tile = fit_static_curve(*select_loaded(recordings))
     return tile.model_copy(

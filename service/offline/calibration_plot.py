@@ -11,8 +11,8 @@ import numpy as np
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.fitting.effects_fit import ReplaySection, simulate_release_and_tap_pressure
 from service.estimation.fitting.least_squares import (
-    compute_curve_n,
     compute_curve_student_t_half_width_95_n,
+    compute_curve_through_zero_n,
     compute_new_loading_half_width_95_n,
 )
 from service.estimation.fitting.rig.indentation import (
@@ -95,12 +95,12 @@ def _plot_curve(
     blocks = average_stroke_blocks(*select_loaded(recordings))
     end_kpa = tile.range_kpa[1]
     grid_kpa = np.linspace(0.0, end_kpa, 200)
-    force_n = compute_curve_n(tile, grid_kpa)
+    force_n = compute_curve_through_zero_n(tile, grid_kpa)
     mean_n, new_n = (
         compute_curve_student_t_half_width_95_n(tile, grid_kpa),
         compute_new_loading_half_width_95_n(tile, grid_kpa),
     )
-    left_n = blocks.force_n - compute_curve_n(tile, blocks.gauge_kpa)
+    left_n = blocks.force_n - compute_curve_through_zero_n(tile, blocks.gauge_kpa)
     for axis, centre_n in ((curve, force_n), (residual, np.zeros_like(force_n))):
         axis.fill_between(
             grid_kpa,

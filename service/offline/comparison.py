@@ -158,7 +158,7 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
         columns, force_n = _read_columns(session)
         markers, notes = _read_trial_markers(session, path, columns)
         notes += [remark] if (remark := session.time_axis.explain_shift_or_empty()) else []
-        tiles, identity = session.info.tiles, session.source_reference
+        tiles, identity = session.info.tiles, session.session_id_and_hashes
     known = np.isfinite(columns["grf_n"])
     if not known.any():
         raise ComparisonError("no frame of the session has a GRF", where=str(path))

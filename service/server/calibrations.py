@@ -153,7 +153,7 @@ class CalibrationStore:
         self._summaries[summary.id] = summary
         return summary
 
-    def delete_even_if_in_use(self, calibration_id: str) -> None:
+    def delete_leaving_copies_in_use(self, calibration_id: str) -> None:
         """Delete a calibration; nodes and sessions that use it have a copy.
 
         Raises:

@@ -95,7 +95,7 @@ class NodeIdentities:
             log.warning("%s", self.problems[-1])
             return None
 
-    def make_challenge(self, node: str, server_id: str) -> Challenge:
+    def read_secret_and_make_challenge(self, node: str, server_id: str) -> Challenge:
         """Make the challenge for a machine that connects as this node.
 
         Raises:
@@ -128,7 +128,7 @@ class NodeIdentities:
             "machine's",
         )
 
-    def try_store_first_secret(self, claim: IdentityClaim) -> None:
+    def try_store_claimed_secret(self, claim: IdentityClaim) -> None:
         """Try to store the secret of a first contact; a failure is logged: frames matter more."""
         try:
             if claim.proof.secret is not None:

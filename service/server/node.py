@@ -196,7 +196,7 @@ class ServerNode:
         return named
 
     @property
-    def frames_ahead_warnings(self) -> list[str]:
+    def refused_ahead_frames_warnings(self) -> list[str]:
         """Warnings about refused frames of the present stream."""
         if not self.refused_ahead_frames:
             return []
@@ -340,13 +340,13 @@ class ServerNode:
                 continue
             del self.unreadable_streams[name]
 
-    def to_server_t_ns(self, t_ns: int) -> int:
+    def to_server_t_ns_or_unchanged(self, t_ns: int) -> int:
         """Convert a time of the node's UTC to the server's; unchanged without an offset."""
         return t_ns + (
             self.clock_offset.server_minus_node_ns if self.clock_offset is not None else 0
         )
 
-    def to_node_t_ns(self, t_ns: int) -> int:
+    def to_node_t_ns_or_unchanged(self, t_ns: int) -> int:
         """Convert a time of the server's UTC to the node's."""
         return t_ns - (
             self.clock_offset.server_minus_node_ns if self.clock_offset is not None else 0

@@ -88,7 +88,7 @@ class Recorder:
         node = self._nodes.get(node_name)
         if not node.is_connected or node.last_seq is None or node.last_t_ns is None:
             raise StateError(f"node {node_name!r} sends no frames", remedy="Connect it and retry")
-        behind_s = (node.to_node_t_ns(server_utc_ns()) - node.last_t_ns) * 1e-9
+        behind_s = (node.to_node_t_ns_or_unchanged(server_utc_ns()) - node.last_t_ns) * 1e-9
         if node.clock_offset is not None and behind_s > MAX_DELAY_S:
             raise StateError(
                 f"node {node_name!r} is {behind_s:.1f} s behind: its link is too slow",
@@ -267,7 +267,7 @@ class Recorder:
             return "frames"
         return "end" if session.parts[-1].seq_last is None else None
 
-    def collect_unsealed_inputs(self, session_id: str) -> SessionInputs:
+    def collect_inputs_from_journals(self, session_id: str) -> SessionInputs:
         """Collect the inputs from which a session can be sealed or exported.
 
         Raises:

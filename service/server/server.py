@@ -380,7 +380,7 @@ class Server:
                 except StorageError as error:
                     self._on_storage_error(node, error)
                     return
-            streams = [stream for stream in node.streams.values() if stream.needs_sync]
+            streams = [stream for stream in node.streams.values() if stream.needs_sync_or_ack]
             await asyncio.gather(*(self._sync_stream(node, stream) for stream in streams))
 
     async def _sync_stream(self, node: ServerNode, stream: ServerStream) -> None:

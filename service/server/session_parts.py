@@ -23,7 +23,7 @@ from service.sessions.parts import (
     close_at_stream_end_or_newest_frame,
     close_part,
     close_unfinished,
-    continue_session,
+    stop_session_and_make_continuation,
 )
 from storage.clock.log import ClockOffset
 from storage.intervals import NO_END, Intervals
@@ -220,12 +220,12 @@ def _extend_once(session: Session, node: ServerNode) -> list[Session]:
     begin_t_ns = _stream_begin_t_ns(session, node, following)
     scene_content = node.hello.scene if info.scene == node.last_info.scene else {}
     return [
-        *continue_session(
+        *stop_session_and_make_continuation(
             closed,
             info,
             begin_t_ns,
             scene_content=scene_content,
-            calibration=node.estimator.configured_calibration,
+            calibration=node.estimator.assigned_or_node_calibration,
             calibration_source=node.estimator.calibration_source,
         )
     ]

@@ -152,7 +152,7 @@ class ServerStream:
             FileFormatError: nothing in its folder is readable.
             StorageError: it cannot be read.
         """
-        journal = Journal.open_and_recover(folder, is_write_deferred=True)
+        journal = Journal.open_existing_and_recover(folder, is_write_deferred=True)
         stream = cls(folder, journal.info)
         stream.journal = journal
         stream.problems = list(journal.problems)
@@ -402,7 +402,7 @@ class ServerStream:
             self._clock_log.sync()
 
     @property
-    def needs_sync(self) -> bool:
+    def needs_sync_or_ack(self) -> bool:
         """True if anything has to be synced or acknowledged."""
         unsaved = self._current_notes != self._notes_on_disk and self.journal is not None
         closing = self.journal is not None and self.journal.has_segment_to_close

@@ -93,7 +93,7 @@ class NodeWeighing:
     """Seals and fits."""
 
     @property
-    def present_pass(self) -> Weighing:
+    def present_tile_pass(self) -> Weighing:
         """The pass under way, or the last one."""
         return self.passes[self.at]
 
@@ -223,7 +223,7 @@ class Weighings:
             raise StateError(
                 f"the guided calibration of {node.name!r} has ended", remedy="Start another one"
             )
-        self._mark(weighing, node, weighing.present_pass.repeat_held_or_last_weight())
+        self._mark(weighing, node, weighing.present_tile_pass.repeat_held_or_last_weight())
         return weighing
 
     async def cancel_or_remove_weighing(self, node: str, session_id: str | None = None) -> None:
@@ -272,10 +272,10 @@ class Weighings:
 
     def _take(self, weighing: NodeWeighing, node: ServerNode, frames: FrameBatch) -> None:
         weighing.seen_s = time.monotonic()
-        i = node.last_info.serials.index(weighing.present_pass.serial)
+        i = node.last_info.serials.index(weighing.present_tile_pass.serial)
         kpa = Compensation(node.last_info.tiles).compute_usable_kpa(frames)[:, i]
-        self._mark(weighing, node, weighing.present_pass.feed_tile_pressures(frames.t_ns, kpa))
-        if weighing.present_pass.step != "done":
+        self._mark(weighing, node, weighing.present_tile_pass.feed_tile_pressures(frames.t_ns, kpa))
+        if weighing.present_tile_pass.step != "done":
             return
         if weighing.at + 1 < len(weighing.passes):
             weighing.at += 1
@@ -291,12 +291,12 @@ class Weighings:
             match action:
                 case Begin(label, t_ns):
                     event = self._sessions.add_marker(
-                        weighing.session_id, label, node.to_server_t_ns(t_ns)
+                        weighing.session_id, label, node.to_server_t_ns_or_unchanged(t_ns)
                     )
                     weighing.markers.append((event.id, True))
                 case End(t_ns):
                     event = self._sessions.add_marker(
-                        weighing.session_id, "end", node.to_server_t_ns(t_ns)
+                        weighing.session_id, "end", node.to_server_t_ns_or_unchanged(t_ns)
                     )
                     weighing.markers.append((event.id, False))
                     weighing.progress_s, weighing.warning = time.monotonic(), None

@@ -27,7 +27,7 @@ from storage.sessions.pyramid import (
     Bins,
     MergedBins,
     build_levels,
-    merge_bins,
+    merge_bins_within_parts,
 )
 
 GAP_STEPS = 3.5
@@ -53,7 +53,11 @@ class ComparisonSeries:
         steps = np.diff(table["t_ns"].to_numpy())
         self._gap_ns = GAP_STEPS * float(np.median(steps)) if len(steps) else np.inf
         frames = _make_bins(table, self._gap_ns)
-        self._levels = build_levels(merge_bins(frames, FRAMES_PER_FINEST_BIN)) if len(table) else []
+        self._levels = (
+            build_levels(merge_bins_within_parts(frames, FRAMES_PER_FINEST_BIN))
+            if len(table)
+            else []
+        )
 
     def get_bins(self, begin_ns: int | None, end_ns: int | None, min_bins: int) -> MergedBins:
         """Return a slice as `min_bins` to four times as many bins.
@@ -84,7 +88,7 @@ class ComparisonSeries:
         size = 1
         while len(bins["frames"]) // (size * BINS_PER_COARSER_BIN) >= min_bins:
             size *= BINS_PER_COARSER_BIN
-        return MergedBins(bins if size == 1 else merge_bins(bins, size), size)
+        return MergedBins(bins if size == 1 else merge_bins_within_parts(bins, size), size)
 
 
 class ComparisonSeriesCache:

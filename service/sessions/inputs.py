@@ -14,7 +14,7 @@ from service.estimation.calibration import Calibration
 from service.estimation.tare.tare import Tare
 from service.sessions.parts import RATE_MAX_HZ, SessionStream
 from service.sessions.tares import TareHistory
-from storage.clock.table import ClockTable, StreamClockFacts, group_rows_by_stream_without_sorting
+from storage.clock.table import ClockTable, StreamClockFacts, group_rows_by_stream_in_given_order
 from storage.intervals import NO_END
 from storage.journal.journal import Journal
 from storage.sessions.folder import Session
@@ -63,7 +63,7 @@ class SessionInputs:
         """Return the clock table of a session that is not sealed yet."""
         parts = [part.stream_id for part in self.session.parts]
         where = f"session {self.session.id}"
-        rows = group_rows_by_stream_without_sorting(self.session.clock, where=where)
+        rows = group_rows_by_stream_in_given_order(self.session.clock, where=where)
         return ClockTable(rows, self.stream_facts, parts, where=where)
 
     def compute_time_axis(self) -> TimeAxis:

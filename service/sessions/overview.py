@@ -34,7 +34,7 @@ from storage.sessions.pyramid import (
     bin_source_columns,
     concatenate_bins,
     make_single_frame_bins,
-    merge_bins,
+    merge_bins_within_parts,
     shift_bins_to_axis,
 )
 from storage.sessions.reader import SealedFileReader
@@ -197,7 +197,7 @@ def _bins_from_frames(
         concatenate_bins([{name: piece[name] for name in types} for piece in found]),
         session.time_axis,
     )
-    return (bins if size == 1 else merge_bins(bins, size)), size
+    return (bins if size == 1 else merge_bins_within_parts(bins, size)), size
 
 
 def _build_pyramid(session: SealedFileReader) -> PyramidBuilder:

@@ -68,7 +68,7 @@ class ContinuedSession(NamedTuple):
     continuation: Session
 
 
-def continue_session(
+def stop_session_and_make_continuation(
     session: Session,
     info: ArrayInfo,
     begin_t_ns: int,

@@ -177,7 +177,7 @@ def _open_and_mend_streams(
         report_step(f"journal {folder.parent.name}/{folder.name}")
         remove_dead_process_temporaries(folder)
         try:
-            journal = Journal.open_and_recover(folder)
+            journal = Journal.open_existing_and_recover(folder)
             problems += journal.problems
             notes = StreamNotes.load_or_set_aside(folder, problems)
         except FileFormatError as error:

@@ -289,7 +289,7 @@ class TareHistory:
         lost = any(isinstance(entry, LostTares) for entry in self._entries)
         return lost and not self._valid_since_lost(info)
 
-    def may_have_lost_tare(self, t_ns: int) -> bool:
+    def may_have_lost_tare_taken_at(self, t_ns: int) -> bool:
         """Return whether a lost tare may have this time."""
         return any(first <= t_ns <= last for first, last in self._lost_intervals())
 

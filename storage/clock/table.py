@@ -147,7 +147,7 @@ class ClockTable:
         )
 
 
-def group_rows_by_stream_without_sorting(
+def group_rows_by_stream_in_given_order(
     rows: Iterable[ClockOffset], *, where: str = ""
 ) -> dict[str, OffsetRows]:
     """Group the measurements of a session by stream_id, as columns.

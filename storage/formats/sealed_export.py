@@ -125,6 +125,6 @@ def make_sealed_export(
         selection,
         table,
         markers,
-        reader.source_reference,
+        reader.session_id_and_hashes,
         options,
     )

@@ -92,7 +92,7 @@ class FormatOptions(BaseModel):
     """Options of export formats. None: the format's default.
 
     REST and the command line offer these fields unchanged. A format refuses an option that it does
-    not support (`storage.formats.written.format.Format.describe_options`).
+    not support (`storage.formats.writers.format.ExportFormat`).
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -96,7 +96,7 @@ class Journal:
         self.lost.remove(self.stored)
 
     @classmethod
-    def open_and_recover(cls, folder: Path, *, is_write_deferred: bool = False) -> Journal:
+    def open_existing_and_recover(cls, folder: Path, *, is_write_deferred: bool = False) -> Journal:
         """Open an existing journal and recover its segments on disk.
 
         Raises:
@@ -165,7 +165,7 @@ class Journal:
                 )
         return new
 
-    def append_new_encoded_frames(self, message: EncodedBatch) -> None:
+    def append_unstored_frames_of_message(self, message: EncodedBatch) -> None:
         """Append a message encoded here; decode it only if some frames are stored already.
 
         Raises:

@@ -98,7 +98,7 @@ def is_index_closed(index: Records) -> bool:
     return bool(len(index)) and is_record_intact(index[-1]) and not index[-1]["count"]
 
 
-def select_intact_batch_records(index: Records) -> Records:
+def select_batch_records_by_checksum(index: Records) -> Records:
     """Return the valid records with frames."""
     return index[(index["count"] > 0) & mask_intact_records(index)]
 
@@ -242,7 +242,7 @@ class Segment:
             StorageError: the index cannot be read.
         """
         try:
-            found = select_intact_batch_records(read_existing_index(self.path))
+            found = select_batch_records_by_checksum(read_existing_index(self.path))
         except OSError as error:
             raise StorageError(
                 f"cannot be read: {error}", where=str(self.path), errno=error.errno
@@ -346,7 +346,7 @@ def recover_or_delete_segment(path: Path, schema: pa.Schema) -> RecoveredSegment
     except FileNotFoundError:
         index = _rebuild_index(path, end, schema)
     else:
-        batches = select_intact_batch_records(index)
+        batches = select_batch_records_by_checksum(index)
         was_closed = is_index_closed(index) and len(batches) == len(index) - 1
         if was_closed and len(batches) and find_end_offset(batches) == size:
             segment = Segment(path)

@@ -30,12 +30,12 @@ from storage.parquet_hash import (
     FORMAT,
     FORMAT_KEY,
     HASH_PLACEHOLDER,
-    check_file_hash,
-    check_footer_hash,
     footer_stated_and_actual_hash,
     read_footer_or_empty,
     read_footer_or_empty_from,
     read_stated_and_actual_hash,
+    refuse_wrong_or_missing_file_hash,
+    refuse_wrong_or_missing_footer_hash,
 )
 from storage.schema import ARRAY_INFO_KEY, COLUMNS_BY_NAME, read_array_info
 from storage.sessions.ledger import FrameOrderChecker
@@ -179,7 +179,7 @@ class SealedFileFooter:
         if hashes is None:
             self._check_format()  # of another program?
         if not skip_verification:
-            check_footer_hash(hashes, where=where)
+            refuse_wrong_or_missing_footer_hash(hashes, where=where)
         self._check_format()
         if not (skip_verification or only_slices) and file is None:
             self.verify_file_hash_once(path)
@@ -212,7 +212,7 @@ class SealedFileFooter:
             hashes = read_stated_and_actual_hash(path)
         except OSError as error:
             raise FileFormatError(f"cannot be read: {error}", where=self._where) from error
-        check_file_hash(hashes, where=self._where)
+        refuse_wrong_or_missing_file_hash(hashes, where=self._where)
         self.is_file_verified = True
 
     @cached_property

@@ -176,7 +176,7 @@ class MergedBins(NamedTuple):
     group_size: int
 
 
-def merge_bins(bins: Bins, group_size: int) -> Bins:
+def merge_bins_within_parts(bins: Bins, group_size: int) -> Bins:
     """Merge `group_size` bins at a time, or fewer at the end of a part."""
     if not len(bins["part"]):
         return bins
@@ -260,7 +260,7 @@ class PyramidBuilder:
     def get_finest_level(self) -> Bins | None:
         """Return all bins until now, the last one perhaps not full; None before the first frame."""
         rest = (
-            [merge_bins(concatenate_bins(self._open_frames), FRAMES_PER_FINEST_BIN)]
+            [merge_bins_within_parts(concatenate_bins(self._open_frames), FRAMES_PER_FINEST_BIN)]
             if self._open_frames
             else []
         )
@@ -271,7 +271,7 @@ class PyramidBuilder:
         """End the pyramid and return its levels, the finest first; the builder is empty then."""
         if self._open_frames:
             self._full_bins.append(
-                merge_bins(concatenate_bins(self._open_frames), FRAMES_PER_FINEST_BIN)
+                merge_bins_within_parts(concatenate_bins(self._open_frames), FRAMES_PER_FINEST_BIN)
             )
         pieces, self._full_bins, self._open_frames = self._full_bins, [], []
         return build_levels(_concatenate_and_release(pieces)) if pieces else []
@@ -297,7 +297,7 @@ def build_levels(finest: Bins) -> list[Bins]:
     """Return a level and its coarser ones, until one has at most `MAX_COARSEST_BINS` bins."""
     levels = [finest]
     while len(levels[-1]["part"]) > MAX_COARSEST_BINS:
-        levels.append(merge_bins(levels[-1], BINS_PER_COARSER_BIN))
+        levels.append(merge_bins_within_parts(levels[-1], BINS_PER_COARSER_BIN))
         if len(levels[-1]["part"]) == len(levels[-2]["part"]):  # parts of a bin each
             levels.pop()
             break
@@ -380,7 +380,11 @@ class PreviewBins:
         return concatenate_bins(pieces) if pieces else None
 
     def _merge_to_bins(self, frames: Bins) -> Bins:
-        return frames if self.frames_in_bin == 1 else merge_bins(frames, self.frames_in_bin)
+        return (
+            frames
+            if self.frames_in_bin == 1
+            else merge_bins_within_parts(frames, self.frames_in_bin)
+        )
 
     def _merge_full_bins(self) -> None:
         """Merge pending frames, except those of a bin that is not full yet."""
@@ -392,7 +396,9 @@ class PreviewBins:
         if full:
             self._bins.append(self._merge_to_bins(_copy_rows(frames, 0, full)))
         if sum(map(_count_bins, self._bins)) > self._most:
-            self._bins = [merge_bins(concatenate_bins(self._bins), BINS_PER_COARSER_BIN)]
+            self._bins = [
+                merge_bins_within_parts(concatenate_bins(self._bins), BINS_PER_COARSER_BIN)
+            ]
             self.frames_in_bin *= BINS_PER_COARSER_BIN
 
 
@@ -407,7 +413,10 @@ def select_and_downsample_bins(
         rows &= bins["t_first_ns"] < end_ns
     found, count = {name: values[rows] for name, values in bins.items()}, 1
     while _count_bins(found) > max_bins:
-        found, count = merge_bins(found, BINS_PER_COARSER_BIN), count * BINS_PER_COARSER_BIN
+        found, count = (
+            merge_bins_within_parts(found, BINS_PER_COARSER_BIN),
+            count * BINS_PER_COARSER_BIN,
+        )
         if count > len(rows):  # parts of a bin each
             break
     return MergedBins(found, count)

@@ -94,7 +94,7 @@ class SealedFileReader:
             yield from self._read_pieces(group, None)
 
     @property
-    def source_reference(self) -> dict[str, object]:
+    def session_id_and_hashes(self) -> dict[str, object]:
         """Source reference for derived files: session id, content hash, stated file hash."""
         metadata = self.footer.metadata.metadata or {}
         session = self.notes.get("session")

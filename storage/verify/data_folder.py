@@ -25,7 +25,7 @@ from storage.journal.stream_notes import NOTES_FILE
 from storage.server_id import SERVER_ID_NAME, read_existing_server_id
 from storage.sessions.folder import FRAMES_NAME, SESSION_ID, Ledger, SessionsFolder
 from storage.sessions.metadata import SESSION_NAME
-from storage.verify.export import ExportReport, recognise_export_and_check_readable
+from storage.verify.export import ExportReport, recognise_export_and_check_not_cut_off
 from storage.verify.journal import StreamReport, verify_journal
 from storage.verify.segment import SegmentReport, verify_segment
 from storage.verify.session import SessionReport, verify_lone_sealed_file, verify_session
@@ -180,7 +180,7 @@ def verify_path(path: Path, *, data_folder: Path | None = None) -> Report:
             others = OtherFilesReport()
             _verify_checksummed_json(path, path.name, others)
             return DataFolderReport(path, problems=others.problems)
-        return recognise_export_and_check_readable(path) or verify_lone_sealed_file(path)
+        return recognise_export_and_check_not_cut_off(path) or verify_lone_sealed_file(path)
     if not path.exists():
         raise FileFormatError("no such file or folder", where=str(path))
     if (path / "sessions").is_dir() or (path / "journal").is_dir():

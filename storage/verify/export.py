@@ -51,7 +51,7 @@ class ExportReport:
         }
 
 
-def recognise_export_and_check_readable(path: Path) -> ExportReport | None:
+def recognise_export_and_check_not_cut_off(path: Path) -> ExportReport | None:
     """Recognise an export; read Parquet and Arrow to their end, and both ends of CSV.
 
     Returns:

@@ -32,7 +32,7 @@ from storage.journal.segment import (
     read_messages_until_damage,
     read_schema_and_first_offset,
     read_verified_payload,
-    select_intact_batch_records,
+    select_batch_records_by_checksum,
     seq_range_of,
 )
 from storage.schema import read_array_info, wire_schema
@@ -128,7 +128,7 @@ def _verify(path: Path, report: SegmentReport) -> None:
             )
         return
     _BatchVerifier(report, schema, header_bytes).verify(index)
-    end = max(header_bytes, find_end_offset(select_intact_batch_records(index)))
+    end = max(header_bytes, find_end_offset(select_batch_records_by_checksum(index)))
     behind, at = 0, end
     for message in read_messages_until_damage(path, end, schema):
         at += len(message.payload)
@@ -260,7 +260,7 @@ def _find_batch_problem(payload: bytes, record: np.void, schema: pa.Schema, info
 def _has_any_batch(path: Path, index: Records) -> bool:
     """Return whether any batch in the segment matches the index."""
     with path.open("rb") as file:
-        batches = select_intact_batch_records(index)
+        batches = select_batch_records_by_checksum(index)
         return any(read_verified_payload(file.fileno(), record) is not None for record in batches)
 
 

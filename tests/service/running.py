@@ -185,7 +185,7 @@ class Running:
         """A journal as another process would find it now: opened from a copy of its files."""
         copy = self.data.with_name(f"copy-{uuid.uuid4().hex}")
         shutil.copytree(self.data / "journal" / name / stream_id, copy)
-        return Journal.open_and_recover(copy)
+        return Journal.open_existing_and_recover(copy)
 
     def held(self, stream_id: str, name: str = "bench") -> FrameBatch:
         """All that its journal holds, in order."""

@@ -40,7 +40,7 @@ from service.protocol import (
     strip_text_crc,
 )
 from storage.clock.log import ClockOffset
-from storage.clock.table import ClockTable, StreamClockFacts, group_rows_by_stream_without_sorting
+from storage.clock.table import ClockTable, StreamClockFacts, group_rows_by_stream_in_given_order
 from tests.builders.arrays import make_array, make_servo
 from tests.builders.calibrations import make_calibration, make_effects, newton_tile
 from tests.builders.odd_values import ODD_VALUES, places, with_value
@@ -248,9 +248,7 @@ def test_every_clock_row_that_is_taken_in_can_be_read_again(
             uncertainty_ns=abs(uncertainty_ns),
         )
         rows.append(ClockOffset(stream_id="b", **taken_in.model_dump(exclude={"type"})))
-    table = ClockTable(
-        group_rows_by_stream_without_sorting(rows), [StreamClockFacts("b", 0)], ["b"]
-    )
+    table = ClockTable(group_rows_by_stream_in_given_order(rows), [StreamClockFacts("b", 0)], ["b"])
     table.summarize_streams().model_dump_json()
     for row in rows:
         columns = table.compute_server_time_columns_or_unknown(

@@ -306,7 +306,7 @@ async def get_calibration(calibration_id: str, request: Request, server: ServerS
 )
 async def delete_calibration(calibration_id: str, server: ServerState) -> None:
     """Delete a calibration; sessions and nodes that use it have a copy."""
-    server.calibrations.delete_even_if_in_use(calibration_id)
+    server.calibrations.delete_leaving_copies_in_use(calibration_id)
 
 
 @router.get(

@@ -126,7 +126,7 @@ class FormatView(BaseModel):
     name: str
     title: str = Field(description="Title for people.")
     opened_by: str = Field(description="Programs that open it.")
-    ending: str = Field(description="File extension, without the dot.")
+    ending: str = Field(description="File extension, with the dot.")
     media_type: str
     options: list[str] = Field(description="Download parameters of this format.")
     takes_columns: bool = Field(description="True: columns can be selected.")

@@ -222,7 +222,7 @@ class WeighingView(View):
     @classmethod
     def of(cls, weighing: NodeWeighing, node: ServerNode) -> WeighingView:
         """Make the view of a weighing in its present state."""
-        now, plan, found = weighing.present_pass, weighing.plan, weighing.calibration
+        now, plan, found = weighing.present_tile_pass, weighing.plan, weighing.calibration
         rest_kpa = now.rest_kpa if isfinite(now.rest_kpa) else None
         recent_kpa = [round(kpa, 3) for kpa in now.recent_kpa]
         seen = now.repeatability

@@ -34,7 +34,7 @@ from service.estimation.fitting.rig.indentation import (
     Indentation,
     ThermalSoak,
     extract_soak_or_empty,
-    measure_initial_unloaded,
+    measure_last_second_before_first_load,
     select_loaded,
 )
 from service.estimation.fitting.rig.loading import (
@@ -96,9 +96,14 @@ def fit_determined_effects(
         reference_delay: of the reference; `late_s` of the answer contains it (see
             `separate_delays`).
     """
-    points, baseline_kpa = collect_loadings(recordings)
+    points, baseline_kpa = collect_loadings_at_common_baseline(recordings)
     noise_kpa = float(
-        np.mean([measure_initial_unloaded(each).noise_kpa for each in select_loaded(recordings)])
+        np.mean(
+            [
+                measure_last_second_before_first_load(each).noise_kpa
+                for each in select_loaded(recordings)
+            ]
+        )
     )
     soaked = _select_best_soak(
         [
@@ -142,7 +147,7 @@ def _subtract_recovery(
     if not before:
         return soaking
     last = max(before, key=lambda i: ends_ns[i])
-    zero = measure_initial_unloaded(pressed[last])
+    zero = measure_last_second_before_first_load(pressed[last])
     points = extract_loading_points(pressed[last], zero.reference_zero_n, zero.noise_kpa)
     since_s = (soak_ns - ends_ns[last]) * 1e-9
     t_s = np.concatenate([points.t_s, points.t_s[-1] + since_s])
@@ -230,10 +235,10 @@ class TileLoadings(NamedTuple):
     baseline_kpa: float
 
 
-def collect_loadings(recordings: Sequence[Indentation]) -> TileLoadings:
+def collect_loadings_at_common_baseline(recordings: Sequence[Indentation]) -> TileLoadings:
     """Collect every loading of a tile, shifted to one common baseline."""
     recordings = select_loaded(recordings)
-    zeros = [measure_initial_unloaded(recording) for recording in recordings]
+    zeros = [measure_last_second_before_first_load(recording) for recording in recordings]
     baseline_kpa = float(np.mean([zero.baseline_kpa for zero in zeros]))
     parts = []
     for recording, zero in zip(recordings, zeros, strict=True):
@@ -283,7 +288,7 @@ def simulate_release_and_tap_pressure(
     """
     if not any(np.isin(recording.phase, ("release", "tap")).any() for recording in recordings):
         return {}
-    points, baseline_kpa = collect_loadings(recordings)
+    points, baseline_kpa = collect_loadings_at_common_baseline(recordings)
     effects = tile.effects
     # The mean curve of slow strokes contains creep and loop.
     static = DomeModel(

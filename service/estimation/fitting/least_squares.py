@@ -158,7 +158,7 @@ def compute_student_t_95(repeats: int) -> float:
     return float(stdtrit(repeats - 1, _UPPER_95))
 
 
-def compute_curve_n(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
+def compute_curve_through_zero_n(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
     """Compute the cubic's force at gauge pressures (m,), zero at zero for any `zero_mode`."""
     coefficients = np.array(tile.coefficients[1:]) * tile.f_scale_n
     return np.asarray(_compute_tile_basis(tile, gauge_kpa) @ coefficients)
@@ -174,7 +174,7 @@ def compute_new_loading_half_width_95_n(tile: TileCalibration, gauge_kpa: Floats
 
     It consists of the mean's uncertainty, the gain of a new loading, and its hysteresis loop.
     """
-    force_n = compute_curve_n(tile, gauge_kpa)
+    force_n = compute_curve_through_zero_n(tile, gauge_kpa)
     variance = (
         _compute_mean_variance(tile, gauge_kpa)
         + (tile.relative_misfit * force_n) ** 2

@@ -24,8 +24,8 @@ from service.estimation.calibration import (
 )
 from service.estimation.fitting.least_squares import (
     compute_cubic_basis_through_zero,
-    compute_curve_n,
     compute_curve_student_t_half_width_95_n,
+    compute_curve_through_zero_n,
     compute_new_loading_half_width_95_n,
 )
 from service.estimation.fitting.rig.checks import (
@@ -42,7 +42,7 @@ from service.estimation.fitting.rig.indentation import (
     average_stroke_blocks,
     find_slow_stroke_rows,
     format_origin,
-    measure_initial_unloaded,
+    measure_last_second_before_first_load,
 )
 
 BAND_STEPS = 10  # of the band in the file
@@ -75,7 +75,7 @@ def fit_static_curve(*recordings: Indentation) -> TileCalibration:
         CalibrationError: the recordings give no valid curve (see `rig.checks`).
     """
     where = ", ".join(format_origin(recording) for recording in recordings)
-    zeros = [measure_initial_unloaded(recording) for recording in recordings]
+    zeros = [measure_last_second_before_first_load(recording) for recording in recordings]
     noise_kpa = _compute_rms(np.array([zero.noise_kpa for zero in zeros]))
     blocks = average_stroke_blocks(*recordings)
     reject_saturated_reference(recordings, blocks)
@@ -193,7 +193,7 @@ def _make_band(tile: TileCalibration) -> tuple[BandPoint, ...]:
     gauge_kpa = np.linspace(0.0, tile.range_kpa[1], BAND_STEPS + 1)
     columns = (
         gauge_kpa,
-        compute_curve_n(tile, gauge_kpa),
+        compute_curve_through_zero_n(tile, gauge_kpa),
         compute_curve_student_t_half_width_95_n(tile, gauge_kpa),
         compute_new_loading_half_width_95_n(tile, gauge_kpa),
     )

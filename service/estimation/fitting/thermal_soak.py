@@ -21,7 +21,7 @@ from service.estimation.fitting.least_squares import (
     minimize_squares,
 )
 from service.estimation.fitting.rig.indentation import ThermalSoak
-from service.estimation.models.temperature import compute_gas_temperature_counts_and_rise
+from service.estimation.models.temperature import compute_gas_counts_and_rise_per_s
 
 STEP_MIN_K = 1.0
 LAG_RANGE_S = (-10.0, 30.0)
@@ -54,7 +54,7 @@ def fit_temperature_effect(soak: ThermalSoak) -> TemperatureEffect | str:
 
     def gas_k(lag_s: float) -> tuple[Floats, Floats]:
         """Return the gas' temperature above the chip's first one, and its rise in K/s."""
-        counts, rise = compute_gas_temperature_counts_and_rise(
+        counts, rise = compute_gas_counts_and_rise_per_s(
             soak.temperature_raw[:, None], t_ns, np.array([lag_s])
         )
         return (

@@ -27,7 +27,7 @@ from service.estimation.dead_weights import check_enough_distinct_weights
 from service.estimation.effects import EffectName, Effects
 from service.estimation.fitting.least_squares import (
     compute_cubic_basis_through_zero,
-    compute_curve_n,
+    compute_curve_through_zero_n,
 )
 from service.estimation.fitting.rig.indentation import Indentation, format_origin
 from service.estimation.fitting.rig.loading import WeightHold, measure_holds
@@ -52,7 +52,7 @@ _NOT_SEEN: dict[EffectName, str] = {
 }
 
 
-def fit_dead_weights(recordings: Sequence[Indentation]) -> TileCalibration:
+def fit_curve_to_dead_weights(recordings: Sequence[Indentation]) -> TileCalibration:
     """Fit the curve of one tile to all its dead weights, in one recording or several.
 
     Raises:
@@ -158,7 +158,7 @@ def _make_band(tile: TileCalibration) -> tuple[BandPoint, ...]:
     )
     columns = (
         gauge_kpa,
-        compute_curve_n(tile, gauge_kpa),
+        compute_curve_through_zero_n(tile, gauge_kpa),
         mean_n,
         SIGMAS_95 * found.fit_sigma_n[:, 0],
     )

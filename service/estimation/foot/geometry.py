@@ -120,7 +120,7 @@ class ServoReading(KernelRecord):
 
 
 @jit_inlined
-def store_servo_reading_and_flag_wraps(
+def store_servo_reading_and_link_to_previous(
     readings: RecordArray[ServoReading],
     i: int,
     t_ns: int,

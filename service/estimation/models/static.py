@@ -109,7 +109,9 @@ class StaticCurves:
 
 
 @jit_cached
-def compute_force_slope_sigma(params: StaticParams, gauge_kpa: float) -> tuple[float, float, float]:
+def compute_capped_force_slope_and_fit_sigma(
+    params: StaticParams, gauge_kpa: float
+) -> tuple[float, float, float]:
     """Compute force (N), slope (N/kPa) and calibration uncertainty (N) at a gauge pressure."""
     inside = gauge_kpa if math.isnan(gauge_kpa) else min(max(gauge_kpa, 0.0), params.range_high_kpa)
     u, u0 = (inside - params.offset_kpa) / params.scale_kpa, params.u_zero
@@ -150,7 +152,7 @@ def _evaluate_curves(
     n, tiles = gauge_kpa.shape
     for i in range(n):
         for j in range(tiles):
-            force[i, j], slope[i, j], sigma[i, j] = compute_force_slope_sigma(
+            force[i, j], slope[i, j], sigma[i, j] = compute_capped_force_slope_and_fit_sigma(
                 params[j], gauge_kpa[i, j]
             )
 

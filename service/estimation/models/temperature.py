@@ -125,7 +125,7 @@ class GasTemperatures(NamedTuple):
     rise_counts_per_s: Floats
 
 
-def compute_gas_temperature_counts_and_rise(
+def compute_gas_counts_and_rise_per_s(
     temperature_raw: Floats, t_ns: Times, gas_lag_s: Floats
 ) -> GasTemperatures:
     """Compute every tile's gas temperature, from rest.

@@ -84,7 +84,7 @@ def compute_grf_cop(params: KernelParams, forces: RecordArray[TileForce], out: F
     Args:
         params: of the estimate.
         forces: (tiles,), with vertical fractions; their weights are overwritten.
-        out: (`LOAD_COLUMNS`,); its first seven columns and `Z`, left as they are where undefined.
+        out: (`N_COLUMNS`,); its first seven columns and `COP_Z`, left as they are where undefined.
     """
     tiles = params.tiles
     total, known, measured = 0.0, 0, 0
@@ -140,7 +140,9 @@ def is_cop_unreliable(params: KernelParams, out: Floats) -> bool:
 
 
 @jit_inlined
-def compute_cop_index(params: KernelParams, samples: RecordArray[TileSample], out: Floats) -> None:
+def compute_gauge_weighted_cop_index(
+    params: KernelParams, samples: RecordArray[TileSample], out: Floats
+) -> None:
     """Compute the COP in grid indices from 1, weighted by gauge pressure (paper eq. 4)."""
     total_kpa = x = y = 0.0
     for j in range(len(params.tiles)):

@@ -31,12 +31,12 @@ from service.estimation.fault_detection.clipping import update_clipping_limit_kp
 from service.estimation.fault_detection.stuck import update_stuck_and_toggles
 from service.estimation.fault_detection.thermal_drift import update_thermal_drift_kpa
 from service.estimation.foot.contact import update_candidate
-from service.estimation.foot.geometry import store_servo_reading_and_flag_wraps
+from service.estimation.foot.geometry import store_servo_reading_and_link_to_previous
 from service.estimation.models import gas
 from service.estimation.models.ambient import low_pass_ambient_kpa
 from service.estimation.models.denoise import WINDOW_READINGS_MAX, is_outlier
 from service.estimation.models.skew import interpolate_to_frame
-from service.estimation.models.static import compute_force_slope_sigma
+from service.estimation.models.static import compute_capped_force_slope_and_fit_sigma
 from service.estimation.models.temperature import refer_to_tare_temperature_with_sigma
 from service.estimation.pipeline.params import FootParams, KernelParams, TileParams
 from service.estimation.pipeline.plan import SUCTION_MAX_KPA, TARE_OLD_NS
@@ -271,7 +271,9 @@ def _compute_apparent_force(
         if baseline_error_kpa > 0.0 or abs(drift_kpa) > ERROR_MIN_KPA:
             flags |= _BASELINE_LOST
     variance += baseline_error_kpa**2
-    force_n, slope, fit_sigma_n = compute_force_slope_sigma(tile_params.static, static_kpa)
+    force_n, slope, fit_sigma_n = compute_capped_force_slope_and_fit_sigma(
+        tile_params.static, static_kpa
+    )
     if math.isnan(sample.pressure_kpa if foot_params.is_tare_lost == 1 else force_n):
         flags |= _TILE_MISSING
     is_saturated = is_hidden or static_kpa > tile_params.static.range_high_kpa
@@ -279,7 +281,7 @@ def _compute_apparent_force(
     if is_saturated:
         flags |= _SATURATED
         gauge_kpa = cooled_kpa - tile_params.baseline_kpa
-        curve_n, _, _ = compute_force_slope_sigma(tile_params.static, gauge_kpa)
+        curve_n, _, _ = compute_capped_force_slope_and_fit_sigma(tile_params.static, gauge_kpa)
         sample.extrapolated_n = extrapolate_capped_force_n(
             tile_params.saturation, curve_n, gauge_kpa
         )
@@ -388,7 +390,7 @@ def append_frames_to_buffer(
         foot_state.run_count += row.after_gap
         buffer.run[i] = foot_state.run_count
         if foot_params.has_servo == 1:
-            store_servo_reading_and_flag_wraps(
+            store_servo_reading_and_link_to_previous(
                 buffer.readings, i, now_ns, int(servo_counts[k]), int(servo_age_us[k]),
                 frame_flags[k], foot_params.counts_per_turn, gap,
             )  # fmt: skip

@@ -94,7 +94,7 @@ def compute_newest_unloaded_tare(
         _reject_above(tare, present, recent.serials, is_load_bearing)
     _reject_warming(frames, tare, recent.serials)
     recent.reject_above_rig_baseline(tare)
-    recent.reject_stuck(tare, low[0].rows)
+    recent.reject_stuck_for_half_of_rows(tare, low[0].rows)
     return tare
 
 
@@ -258,7 +258,7 @@ def _has_shifted(tare: Tare, present: Tare, is_load_bearing: Bools) -> bool:
     return bool((shift_kpa > limit_kpa)[is_load_bearing].any())
 
 
-def propose_first_flight_tare(recent: TareFrames) -> FlightTareResult:
+def propose_first_tare_between_steps(recent: TareFrames) -> FlightTareResult:
     """Propose the first tare of a stream, if the foot has certainly been lifted.
 
     It has to have been loaded in these seconds and to be off the ground at their end, every tile

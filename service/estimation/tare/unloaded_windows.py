@@ -284,7 +284,7 @@ class TareFrames:
                     "this temperature",
                 )
 
-    def reject_stuck(self, tare: Tare, rows: Bools | slice) -> None:
+    def reject_stuck_for_half_of_rows(self, tare: Tare, rows: Bools | slice) -> None:
         """Reject a baseline with half of its counts equal in a row, unless the rig showed no noise.
 
         Raises:
@@ -374,14 +374,14 @@ def compute_recording_tare(
         rows = (t_s >= begin_s) & (t_s <= end_s)
         tare = seen.compute_tare(rows, "interval")
         seen.reject_above_rig_baseline(tare)
-        seen.reject_stuck(tare, rows)
+        seen.reject_stuck_for_half_of_rows(tare, rows)
         return seen.remove_recovery(tare)
     lead = np.logical_and.accumulate((frames.frame_flags & FrameFlag.LEAD) != 0)
     if lead[0]:
         seen = TareFrames(frames, compensation, calibration, serials)
         tare = seen.compute_tare(lead, "lead")
         seen.reject_above_rig_baseline(tare)
-        seen.reject_stuck(tare, lead)
+        seen.reject_stuck_for_half_of_rows(tare, lead)
         return tare
     # The result must not depend on the number of frames passed.
     last_ns = frames.t_ns[0] + RECOGNITION_SPAN_NS
@@ -389,7 +389,7 @@ def compute_recording_tare(
     seen = TareFrames(frames, compensation, calibration, serials, remove_recovery)
     found = _find_unloaded_rows(seen, calibration)
     tare = seen.compute_tare(found, "recognised")
-    seen.reject_stuck(tare, found)
+    seen.reject_stuck_for_half_of_rows(tare, found)
     return seen.remove_recovery(tare)
 
 

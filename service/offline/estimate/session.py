@@ -225,7 +225,7 @@ def _make_part_notes(
     """Return the notes that hold for a part of the session."""
     notes = {name: note for name, note in notes.items() if name not in _WHOLE_SESSION_NOTES}
     seconds = {"start_s": part.start_s, "end_s": part.end_s, "warm_up_s": stretch.warm_up_s}
-    return {**notes, "part_of": {**session.source_reference, **seconds}}
+    return {**notes, "part_of": {**session.session_id_and_hashes, **seconds}}
 
 
 NEEDED_SUFFIXES = ("json", "npz")

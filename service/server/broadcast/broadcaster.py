@@ -324,7 +324,7 @@ def encode_websocket_messages(texts: Iterable[str]) -> bytes:
 def _newest_frame_ages_ms(nodes: Iterable[ServerNode]) -> dict[str, float]:
     now_t_ns = server_utc_ns()
     return {
-        node.name: (now_t_ns - node.to_server_t_ns(node.published_t_ns)) * 1e-6
+        node.name: (now_t_ns - node.to_server_t_ns_or_unchanged(node.published_t_ns)) * 1e-6
         for node in nodes
         if node.clock_offset is not None and node.published_t_ns is not None
     }

@@ -27,7 +27,7 @@ from service.estimation.tare.automatic import (
     HISTORY_NS,
     FlightTareResult,
     compute_newest_unloaded_tare,
-    propose_first_flight_tare,
+    propose_first_tare_between_steps,
     propose_flight_tare,
 )
 from service.estimation.tare.tare import Tare
@@ -254,7 +254,7 @@ class LiveEstimator:
             lead, self._compensation, self._require_calibration(), self._info.serials
         )
 
-    def find_flight_tare(self, anchor: Tare | None) -> FlightTareResult:
+    def find_ongoing_flight_or_first_tare(self, anchor: Tare | None) -> FlightTareResult:
         """Look for an automatic tare in the last seconds.
 
         Args:
@@ -265,7 +265,7 @@ class LiveEstimator:
             return FlightTareResult()
         frames = FrameBatch.concatenate(list(self._recent))
         if tare is None:
-            return propose_first_flight_tare(self._tare_frames(frames, calibration))
+            return propose_first_tare_between_steps(self._tare_frames(frames, calibration))
         if self.airborne_since_t_ns is None or self._estimated_t_ns is None:
             return FlightTareResult()
         # Contact of newer frames is not estimated yet.

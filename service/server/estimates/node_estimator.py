@@ -154,7 +154,7 @@ class NodeEstimator:
         return [problem for problem in texts if problem is not None]
 
     @property
-    def configured_calibration(self) -> Calibration | None:
+    def assigned_or_node_calibration(self) -> Calibration | None:
         """Calibration to use for its tiles: the assigned one, else the node's own.
 
         It may not fit them; the calibration in use is `live.calibration`.
@@ -166,7 +166,7 @@ class NodeEstimator:
 
     @property
     def calibration_source(self) -> Literal["node", "server"]:
-        """Origin of `configured_calibration`."""
+        """Origin of `assigned_or_node_calibration`."""
         chosen = self.assignment.current is not None or self.assignment.problem is not None
         return "server" if chosen else "node"
 
@@ -248,7 +248,9 @@ class NodeEstimator:
         self._has_failed = False
         try:
             tare = self.tare_history.tare_in_force_or_lost(self.last_info)
-            self.live = LiveEstimator(self.last_info, self.configured_calibration, tare, self.live)
+            self.live = LiveEstimator(
+                self.last_info, self.assigned_or_node_calibration, tare, self.live
+            )
         except Exception as error:
             self._disable(error)
             return

@@ -86,7 +86,7 @@ class TareController:
             else None
         )
 
-    def list_warnings(self) -> list[str]:
+    def list_reasons_to_tare_again(self) -> list[str]:
         """Return the reasons why the tare in force may no longer fit, as text."""
         tare, newest_t_ns = self._live.tare_in_use_unless_lost, self._live.newest_t_ns
         if tare is None or newest_t_ns is None:
@@ -193,7 +193,7 @@ class TareController:
             return
         keys = {(t.tare.source, t.tare.t_ns) for t in self._history.all_tares_with_undone}
         # In the history, or lost: the server was restarted, and another tare may have followed.
-        is_older = not self._has_seen_lead and self._history.may_have_lost_tare(tare.t_ns)
+        is_older = not self._has_seen_lead and self._history.may_have_lost_tare_taken_at(tare.t_ns)
         if ("lead", tare.t_ns) not in keys and not is_older:
             self._live.set_tare(self._history.store_and_apply_tare(tare, self._info).tare)
         self._is_lead_done = True
@@ -214,7 +214,7 @@ class TareController:
 
     def _tare_in_flight(self) -> None:
         anchor = self._history.last_not_in_flight_or_oldest(self._info)
-        found: FlightTareResult = self._live.find_flight_tare(
+        found: FlightTareResult = self._live.find_ongoing_flight_or_first_tare(
             anchor.tare if anchor is not None else None
         )
         self._flight_warning = found.rejection

@@ -240,7 +240,7 @@ Policy = Literal["lossless", "drop_oldest", "latest"]
 POLICIES: tuple[Policy, ...] = get_args(Policy)
 
 
-def find_requested_position(
+def check_stream_and_get_requested_position(
     node: ServerNode, stream_id: str | None, from_seq: int | None
 ) -> Position | None:
     """Return the first frame for a reader; None: the next one that comes.

@@ -77,7 +77,7 @@ class C3dFile:
         ]
         return texts + [""] * (self.channel_count - len(texts))
 
-    def get_scaled_samples(self, channels: Sequence[int]) -> Floats:
+    def get_scaled_samples_by_channel(self, channels: Sequence[int]) -> Floats:
         """Return the scaled samples of channels, (len(channels), n), each in its unit.
 
         Raises:

@@ -129,7 +129,7 @@ def _read_plate(file: C3dFile, i: int, values_max: int) -> PlateSignals:
             "file",
         )
     check_table_size(len(file.raw), len(numbers), values_max, file.where)
-    channels = file.get_scaled_samples([n - 1 for n in numbers])
+    channels = file.get_scaled_samples_by_channel([n - 1 for n in numbers])
     notes = [*_mask_unrecorded_samples(file, numbers, channels)]
     stated = file.get_channel_texts("UNITS")
     units = [stated[n - 1].strip() for n in numbers]

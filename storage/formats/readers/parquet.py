@@ -23,7 +23,11 @@ from storage.formats.readers.table import (
     select_needed_names_or_empty,
 )
 from storage.formats.readers.text import arrow_to_floats
-from storage.parquet_hash import FORMAT_KEY, check_file_hash, read_stated_and_actual_hash
+from storage.parquet_hash import (
+    FORMAT_KEY,
+    read_stated_and_actual_hash,
+    refuse_wrong_or_missing_file_hash,
+)
 from storage.schema import ARRAY_INFO_KEY, COLUMNS_BY_NAME
 from storage.sessions.reader import SealedFileReader
 from storage.sessions.time_axis import NODE_AXIS, TimeAxis
@@ -43,7 +47,7 @@ def read_parquet_table(path: Path, is_needed: ColumnFilter, values_max: int) -> 
             schema = file.schema_arrow
             hashes = read_stated_and_actual_hash(path)
             if hashes is not None or FORMAT_KEY in (schema.metadata or {}):
-                check_file_hash(hashes, where=where)
+                refuse_wrong_or_missing_file_hash(hashes, where=where)
             needed = select_needed_names_or_empty(schema.names, is_needed, where)
             check_table_size(file.metadata.num_rows, len(needed), values_max, where)
             table = file.read(columns=needed)

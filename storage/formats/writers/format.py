@@ -84,7 +84,7 @@ class ExportFormat:
         """Yield one file of several sessions on one time axis, in chunks.
 
         Raises:
-            UsageError: as for `encode_frames`, for any session; the format holds one session only,
+            UsageError: as for `encode`, for any session; the format holds one session only,
                 or a session does not have the server's time.
         """
         if self.group_encoder is None:
@@ -202,7 +202,7 @@ def encode_tables(
 
     Args:
         tables: at least one table; all have one schema.
-        open_writer: function that returns a writer with `write_hashed_table` and `close`.
+        open_writer: function that returns a writer with `write_table` and `close`.
     """
     first = next(tables)
     sink = DrainedBuffer()

@@ -93,7 +93,7 @@ def _open_stream(folder: Path, problems: list[str]) -> NodeStream | None:
     notes = StreamNotes.load_or_set_aside(folder, problems)
     journal: Journal | None = None
     with suppress(FileFormatError):
-        journal = Journal.open_and_recover(folder)
+        journal = Journal.open_existing_and_recover(folder)
         problems += journal.problems
     if notes is None and journal is not None:  # the segments have the array's description, too
         notes = StreamNotes(array_info=journal.info)
@@ -261,7 +261,7 @@ class NodeJournal:
         reason = problem[0] if problem is not None else DISK_SLOW
         newest = self.streams[-1]
         return any(
-            stream.drop_oldest_waiting(
+            stream.drop_oldest_waiting_and_record_unacked_loss(
                 reason, self.retention_requests, min_batches_left=1 if stream is newest else 0
             )
             for stream in self.streams

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from devices.errors import DamagedFileError, StorageError
 from storage.checksummed_json import read_checksummed_json, write_checksummed_json
 from storage.durable_files import ASIDE_SUFFIX, try_set_aside_and_describe
-from storage.intervals import NO_END, Intervals, OpenPairs, intervals_from_open_pairs, union
+from storage.intervals import NO_END, Intervals, OpenPairs, intervals_from_inclusive_pairs, union
 
 
 class RetentionRequest(BaseModel):
@@ -36,7 +36,7 @@ class RetentionRequest(BaseModel):
     def required_numbers_of_known_or_new_stream(self, stream_id: str) -> Intervals:
         """Return the requested numbers of a stream."""
         if stream_id in self.streams:
-            return intervals_from_open_pairs(self.streams[stream_id])
+            return intervals_from_inclusive_pairs(self.streams[stream_id])
         if self.recording and stream_id not in self.known:
             return Intervals([(0, NO_END)])
         return Intervals()

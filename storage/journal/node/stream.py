@@ -206,7 +206,7 @@ class NodeStream:
             self._acked_by.setdefault(server_id, Intervals()).add(seq_first, seq_last)
             self._lost.remove(Intervals([(seq_first, seq_last)]))
 
-    def drop_oldest_waiting(
+    def drop_oldest_waiting_and_record_unacked_loss(
         self, reason: str, requests: RetentionRequests, *, min_batches_left: int = 0
     ) -> bool:
         """Drop the oldest batch that waits to be written; return whether there was one.
@@ -310,7 +310,7 @@ class NodeStream:
             batch = next(iter(self._waiting.batches), None)
         if journal is None or batch is None:
             return
-        journal.append_new_encoded_frames(batch)
+        journal.append_unstored_frames_of_message(batch)
         with self._lock:
             if self._waiting.batches and self._waiting.batches[0] is batch:  # not dropped meanwhile
                 self._waiting.popleft()

@@ -112,7 +112,7 @@ def test_a_killed_server_has_every_acknowledged_frame(
     assert process.ended(5.0) == -signal.SIGKILL
     copy = tmp_path / "copy"
     shutil.copytree(data / "journal" / "bench" / node.stream_id, copy)
-    journal = Journal.open_and_recover(copy)
+    journal = Journal.open_existing_and_recover(copy)
     assert not (node.acked - journal.stored)
     last = journal.stored.last
     assert last is not None

@@ -157,7 +157,7 @@ def test_a_node_without_a_server_keeps_its_frames(
     (folder,) = (tmp_path / "node" / "journal" / "leg").glob("?" * 32)
     notes = StreamNotes.load(folder)
     assert notes is not None
-    with closing(Journal.open_and_recover(folder)) as journal:
+    with closing(Journal.open_existing_and_recover(folder)) as journal:
         assert journal.stored == Intervals([(0, (notes.next_seq or 0) - 1)])
 
 

@@ -37,7 +37,7 @@ class Machine:
 
     def connect(self, server: NodeIdentities, *, dies_after: str = "") -> bool:
         """Connect once; return whether the server welcomes it. A step may be its last one."""
-        challenge = server.make_challenge(NODE, SERVER)
+        challenge = server.read_secret_and_make_challenge(NODE, SERVER)
         secret = ServerSecrets(self.folder, lambda _: None).get_or_create_secret(SERVER)
         if dies_after == "share":
             raise _Killed
@@ -52,7 +52,7 @@ class Machine:
             self.is_refused = end.code == LinkCloseCode.WRONG_IDENTITY
             return False
         if verified == "first_contact":
-            server.try_store_first_secret(claim)
+            server.try_store_claimed_secret(claim)
         if dies_after == "keep":
             raise _Killed
         self.is_refused = False
@@ -173,7 +173,7 @@ def test_an_unreadable_secret_refuses_every_machine(
     with monkeypatch.context() as unreadable:
         unreadable.setattr("storage.durable_files.open", refusing(PermissionError), raising=False)
         with pytest.raises(StorageError):
-            server.make_challenge(NODE, SERVER)
+            server.read_secret_and_make_challenge(NODE, SERVER)
     assert machine.connect(server)
 
 
@@ -185,6 +185,8 @@ def test_a_wrong_proof_is_refused(
     server: NodeIdentities, machine: Machine, answer: Callable[[], Proof]
 ) -> None:
     assert machine.connect(server)
-    claim = IdentityClaim(NODE, server.make_challenge(NODE, SERVER), answer(), ADDRESS)
+    claim = IdentityClaim(
+        NODE, server.read_secret_and_make_challenge(NODE, SERVER), answer(), ADDRESS
+    )
     with pytest.raises(CloseConnection, match="foottile accept-node leg"):
         server.verify_or_refuse_claim(claim, NOW_T_NS)

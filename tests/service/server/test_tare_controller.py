@@ -318,10 +318,10 @@ def test_a_foot_in_contact_is_left_alone_however_long(foot: Foot) -> None:
 def test_a_light_load_that_stays_is_said_and_not_tared_away(foot: Foot) -> None:
     foot.live(90.0, 2.0)  # below contact: two newtons on each of two tiles
     assert foot.history == [("lead", False)]
-    (warning,) = foot.node.estimator.tare_controller.list_warnings()
+    (warning,) = foot.node.estimator.tare_controller.list_reasons_to_tare_again()
     assert "a light load, or a baseline that has moved" in warning
     foot.live(20.0)
-    assert foot.node.estimator.tare_controller.list_warnings() == []
+    assert foot.node.estimator.tare_controller.list_reasons_to_tare_again() == []
 
 
 def test_a_scene_can_turn_it_off(foot_of: Any) -> None:
@@ -372,14 +372,14 @@ def test_an_automatic_tare_that_cannot_be_kept_is_not_in_force(
 
 
 def test_a_foot_that_has_warmed_up_since_its_tare_is_told_of_in_newtons(foot: Foot) -> None:
-    assert foot.node.estimator.tare_controller.list_warnings() == []
+    assert foot.node.estimator.tare_controller.list_reasons_to_tare_again() == []
     foot.live(2.0, 20.0, warmer_k=5.0)
-    (warning,) = foot.node.estimator.tare_controller.list_warnings()
+    (warning,) = foot.node.estimator.tare_controller.list_reasons_to_tare_again()
     # 5 K of 0.336 kPa/K are 13.2 N on each of two tiles of a newton a count
     assert warning.startswith("the tiles are 5.0 K warmer than when tared")
     assert "about +26." in warning
     foot.live(2.0, 20.0, warmer_k=-2.0)
-    (warning,) = foot.node.estimator.tare_controller.list_warnings()
+    (warning,) = foot.node.estimator.tare_controller.list_reasons_to_tare_again()
     assert "2.1 K colder" in warning
 
 
@@ -389,14 +389,14 @@ def test_an_old_tare_is_told_of(foot_of: Any) -> None:
     foot.live(1.0)
     foot.seq += 31 * 60 * 100
     foot.live(1.0)
-    assert foot.node.estimator.tare_controller.list_warnings() == [
+    assert foot.node.estimator.tare_controller.list_reasons_to_tare_again() == [
         "tared 31 min ago: lift the foot, hold it still, and tare"
     ]
 
 
 def test_a_tile_whose_temperature_is_not_known_warns_of_nothing(foot: Foot) -> None:
     foot.live(2.0, warmer_k=0.0, silent=0)
-    assert foot.node.estimator.tare_controller.list_warnings() == []
+    assert foot.node.estimator.tare_controller.list_reasons_to_tare_again() == []
 
 
 def test_a_node_without_calibration_is_not_tared_and_frames_pass(foot_of: Any) -> None:

@@ -206,7 +206,7 @@ def test_a_server_and_recovery_in_its_folder_come_to_the_same_session(
             history = TareHistory(data / "nodes" / "bench" / "tares.json")
             history.store_and_apply_tare(make_tare(t_ns=t_ns(tared)), INFO)
         recorder, node = server_on(data, begun)
-        made = recorder.collect_unsealed_inputs(ID)
+        made = recorder.collect_inputs_from_journals(ID)
         waiting = recorder.get_ledger(ID)
         if end is not None:
             counted = verify_session(data / "sessions" / ID).ledger

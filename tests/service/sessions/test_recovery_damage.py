@@ -88,7 +88,7 @@ def test_a_damaged_batch_at_the_stop_is_lost_and_the_others_tell_the_end(tmp_pat
 
 def test_a_stop_where_time_runs_back_fails_one_session_and_not_the_recovery(tmp_path: Path) -> None:
     folder = stream(servers(tmp_path), info_of(), (0, 99))
-    journal = Journal.open_and_recover(folder)
+    journal = Journal.open_existing_and_recover(folder)
     late = frames(100, 109)
     back_ns = PERIOD_NS * 60
     journal.append_new_frames(

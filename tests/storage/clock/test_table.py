@@ -19,7 +19,7 @@ from storage.clock.log import ClockOffset
 from storage.clock.table import (
     ClockTable,
     StreamClockFacts,
-    group_rows_by_stream_without_sorting,
+    group_rows_by_stream_in_given_order,
     read_clock_file,
     write_clock_file,
 )
@@ -147,7 +147,7 @@ def test_a_row_out_of_range_is_refused_by_column(
 ) -> None:
     row = row_of("b", t_mono_ns, offset_ns, uncertainty_ns)
     with pytest.raises(FileFormatError, match=named):
-        ClockTable(group_rows_by_stream_without_sorting([row]), [StreamClockFacts("b")], ["b"])
+        ClockTable(group_rows_by_stream_in_given_order([row]), [StreamClockFacts("b")], ["b"])
 
 
 # --- clock.parquet --------------------------------------------------------------------------------

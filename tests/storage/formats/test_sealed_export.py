@@ -147,7 +147,7 @@ def of_the_whole(
                 part,
                 table if clock == "server" else None,
                 markers,
-                reader.source_reference,
+                reader.session_id_and_hashes,
             )
         )
 

@@ -66,7 +66,7 @@ def begun(folder: Path) -> Journal:
 
 def reopened(folder: Path) -> Journal:
     """The journal as somebody finds it who knows its folder only."""
-    OPENED.append(Journal.open_and_recover(folder))
+    OPENED.append(Journal.open_existing_and_recover(folder))
     return OPENED[-1]
 
 

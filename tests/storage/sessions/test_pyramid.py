@@ -27,7 +27,7 @@ from storage.sessions.pyramid import (
     bin_source_columns,
     build_levels,
     make_single_frame_bins,
-    merge_bins,
+    merge_bins_within_parts,
     select_and_downsample_bins,
 )
 
@@ -162,7 +162,7 @@ def test_each_level_has_the_extremes_of_the_frames() -> None:
         assert level["frames"].sum() == len(columns["seq"])
         assert np.nanmax(level["grf_n_max"]) == np.nanmax(columns["grf_n"])
         assert level["missing"].sum() == finest["missing"].sum()
-    same(levels[1], merge_bins(finest, BINS_PER_COARSER_BIN))
+    same(levels[1], merge_bins_within_parts(finest, BINS_PER_COARSER_BIN))
 
 
 def test_levels_end_where_parts_have_one_bin_each() -> None:

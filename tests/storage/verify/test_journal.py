@@ -246,7 +246,7 @@ def test_bytes_set_aside_after_a_crash_are_remarked(tmp_path: Path) -> None:
     path = segment_of(folder)
     path.write_bytes(path.read_bytes() + b"half a batch")
     assert verify_journal(folder).problems == []
-    Journal.open_and_recover(folder).close()
+    Journal.open_existing_and_recover(folder).close()
     report = verify_journal(folder)
     assert (report.problems, report.stored.number_count) == ([], 40)
     assert "no whole batch" in "; ".join(report.remarks)

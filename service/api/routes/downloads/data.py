@@ -158,7 +158,7 @@ def _place_markers(session: Session, query: DataQuery, server: Server) -> Placed
     if session.sha256 is not None:
         with server.sessions.open_frames(session.id, only_slices=True) as reader:
             return place_session_markers(reader, session.markers, query.slice)
-    sources = server.recorder.collect_unsealed_inputs(session.id)
+    sources = server.recorder.collect_inputs_from_journals(session.id)
     times = (
         {name: getattr(frames, name) for name in PLACEMENT_COLUMNS} | {"part": columns["part"]}
         for frames, columns in SessionFrames(sources).iterate_raw_with_part()
@@ -171,7 +171,7 @@ def _write_export(
     session: Session, query: DataQuery, server: Server, markers: PlacedMarkers | None
 ) -> Chunks:
     if session.sha256 is None:
-        sources = server.recorder.collect_unsealed_inputs(session.id)
+        sources = server.recorder.collect_inputs_from_journals(session.id)
         clock = sources.make_clock_table() if query.clock == "server" else None
         # A whole session is estimated once: no cached preview is needed.
         is_some, so_fars = query.slice.has_time_bounds, server.previews

@@ -155,7 +155,7 @@ def _read_frames_hash(session: Session, server: Server) -> object:
     """Return the hash that the frames state; None if they cannot be read."""
     try:
         with server.sessions.open_frames(session.id, only_slices=True) as reader:
-            return reader.source_reference["file_sha256"]
+            return reader.session_id_and_hashes["file_sha256"]
     except FileFormatError:
         return None
 

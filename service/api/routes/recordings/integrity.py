@@ -81,7 +81,7 @@ async def list_tiles(session_id: str, server: ServerState) -> ArrayView:
         raise UnknownError(f"session {session_id}: {session.problem}")
     if session.state == "sealed":
         return await run_in_threadpool(_read_sealed_array, session_id, server)
-    sources = server.recorder.collect_unsealed_inputs(session_id)
+    sources = server.recorder.collect_inputs_from_journals(session_id)
     content = sources.calibration
     lag_ms = None if content is None else LIVE_LAG_MS
     tares = [SessionTareView(t_ns=tare.t_ns, source=tare.source) for tare in sources.tares]
@@ -178,7 +178,7 @@ async def get_clock(
             session, server.sessions.folder.get_path(session_id) / CLOCK_NAME
         )
     if session.sha256 is None:
-        table = server.recorder.collect_unsealed_inputs(session_id).make_clock_table()
+        table = server.recorder.collect_inputs_from_journals(session_id).make_clock_table()
         return await run_in_threadpool(table.summarize_streams)
     return await run_in_threadpool(_read_sealed_clock, session_id, server)
 

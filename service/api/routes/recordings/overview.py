@@ -138,7 +138,7 @@ async def get_timeseries(
 async def _preview_response(
     session: Session, query: OverviewQuery, server: Server, *, as_arrow: bool, as_gzip: bool
 ) -> Response:
-    sources = server.recorder.collect_unsealed_inputs(session.id)
+    sources = server.recorder.collect_inputs_from_journals(session.id)
     part = Slice(query.start_s, query.end_s)
 
     def make() -> bytes:

@@ -93,7 +93,7 @@ async def _challenge_node(socket: WebSocket, server: Server, offered: list[str])
             f"{who.node[:80]!r} is no name of a node: letters, digits, '.', '_', '-'",
         )
     with _close_on_storage_error():
-        challenge = server.identities.make_challenge(who.node, server.id)
+        challenge = server.identities.read_secret_and_make_challenge(who.node, server.id)
     await send_message(socket, encode_message(challenge))
     answer = _require_message(Proof, await _receive_message(socket))
     client = socket.client
@@ -175,7 +175,7 @@ def _registered_node(server: Server, hello: Hello, claim: IdentityClaim) -> Iter
         code = LinkCloseCode.TRY_LATER if isinstance(error, StorageError) else LinkCloseCode.REFUSED
         raise CloseConnection(code, str(error)) from error
     if verified == "first_contact":
-        server.identities.try_store_first_secret(claim)
+        server.identities.try_store_claimed_secret(claim)
     link = server.links[name] = NodeLink(node)
     node.is_connected = True
     try:

@@ -21,7 +21,12 @@ from service.server.broadcast.views import SessionView
 from service.server.data_folder import start_key
 from service.server.live_feed.encoder import ArrowEncoder, check_columns
 from service.server.live_feed.events import FeedEvent, Gap, Position, StreamStart
-from service.server.live_feed.reader import POLICIES, FeedReader, Policy, find_requested_position
+from service.server.live_feed.reader import (
+    POLICIES,
+    FeedReader,
+    Policy,
+    check_stream_and_get_requested_position,
+)
 from service.server.node import ServerNode
 from service.server.server import Server
 from service.server_clock import server_utc_ns
@@ -61,7 +66,7 @@ class LiveFeedSession:
             check_columns(self._node.last_info, self._columns)
         except UsageError as error:
             raise CloseConnection(LinkCloseCode.POLICY, error.what) from error
-        position = find_requested_position(
+        position = check_stream_and_get_requested_position(
             self._node,
             _require_match(parameters.get("stream_id"), _STREAM_ID, "stream_id", "32 hex digits"),
             _parse_seq(parameters.get("from_seq")),

@@ -26,7 +26,7 @@ from service.estimation.fitting.rig.indentation import (
     compute_rest_before_strokes_absolute_kpa,
     find_slow_stroke_rows,
     format_origin,
-    measure_initial_unloaded,
+    measure_last_second_before_first_load,
 )
 
 _CREEP_S = np.array([0.3, 1.0, 3.0, 10.0])
@@ -193,7 +193,7 @@ def reject_saturated_reference(recordings: Sequence[Indentation], blocks: Stroke
                 remedy=remedy,
             )
     for recording in recordings:
-        zero = measure_initial_unloaded(recording)
+        zero = measure_last_second_before_first_load(recording)
         silent = recording.is_under_indenter & np.isin(recording.phase, ("load", "unload"))
         silent &= np.isnan(recording.reference_n) & np.isfinite(recording.kpa)
         if silent.sum() < _RAIL_READINGS or not find_slow_stroke_rows(recording):

@@ -98,7 +98,7 @@ class ThermalSoak:
     noise_kpa: float
 
 
-def measure_initial_unloaded(recording: Indentation) -> UnloadedState:
+def measure_last_second_before_first_load(recording: Indentation) -> UnloadedState:
     """Measure baseline, noise and reference zero in the last second before the first loading.
 
     Raises:
@@ -140,12 +140,12 @@ def average_stroke_blocks(*recordings: Indentation) -> Strokes:
     another one has.
 
     Raises:
-        CalibrationError: as for `measure_initial_unloaded`, or no file has a slow stroke.
+        CalibrationError: as for `measure_last_second_before_first_load`, or no slow stroke is there.
     """
     blocks: list[_Block] = []
     count = 0
     for recording in recordings:
-        zero = measure_initial_unloaded(recording)
+        zero = measure_last_second_before_first_load(recording)
         for begin, turn, end in find_slow_stroke_rows(recording):
             for rows, loading in (
                 (np.arange(begin, turn), True),

@@ -18,7 +18,7 @@ from service.estimation.dead_weights import (
     parse_weight,
 )
 from service.estimation.fitting.rig.indentation import Indentation
-from service.estimation.fitting.weights_fit import fit_dead_weights
+from service.estimation.fitting.weights_fit import fit_curve_to_dead_weights
 from service.server import weighing, weighings
 from service.server.weighing import Begin, MarkerChange, Withdraw
 from service.sessions.calibration_file import parse_calibration, write_calibration
@@ -84,7 +84,7 @@ def test_another_load_lies_within_the_interval_that_five_weights_state(run: Run)
         asked = ("--scene", "one.toml", "--load", f"{name}.csv", "--truth", "--no-estimates")
         assert run("simulate", *asked, "--out", f"{name}.parquet").code == 0
     weights = check_and_label_weights(FIVE.split(","), 0.5)
-    tile = fit_dead_weights([follow(Path("five.parquet"), weights)])
+    tile = fit_curve_to_dead_weights([follow(Path("five.parquet"), weights)])
     made = Calibration(name="five", reference="weights", date="2026-11-25", tiles=(tile,))
     write_calibration(Path("five.json"), made)
     asked_for = ("--calibration", "five.json", "--out", "estimated.parquet")

@@ -125,7 +125,7 @@ def test_temperature_is_within_a_billionth_of_a_count(lag_s: float, seed: int) -
     rng = np.random.default_rng(seed)
     temperature_raw = damage(rng, 480.0 - rng.integers(0, 40, 60))
     t_ns = draw_instants(rng, 60)
-    found = temperature.compute_gas_temperature_counts_and_rise(
+    found = temperature.compute_gas_counts_and_rise_per_s(
         temperature_raw[:, None], t_ns[:, None], np.array([lag_s])
     )
     exactly = sample_stage.temperature(digits.exact(temperature_raw), t_ns.tolist(), mpf(lag_s))

@@ -9,7 +9,7 @@ from devices.errors import CalibrationError
 from service.estimation.calibration import TileCalibration
 from service.estimation.dead_weights import STANDARD_GRAVITY_M_S2, parse_weight
 from service.estimation.fitting.rig.indentation import Indentation
-from service.estimation.fitting.weights_fit import fit_dead_weights
+from service.estimation.fitting.weights_fit import fit_curve_to_dead_weights
 
 RATE_HZ = 50
 BASELINE_KPA = 100.0
@@ -81,7 +81,7 @@ def test_another_text_is_no_weight(text: str) -> None:
 
 
 def test_five_weights_give_the_curve_of_a_tile() -> None:
-    tile = fit_dead_weights([record_weights(FIVE)])
+    tile = fit_curve_to_dead_weights([record_weights(FIVE)])
     assert tile.absolute_scale == "measured"
     assert tile.weights is not None
     assert [step.weight for step in tile.weights.steps] == list(FIVE)
@@ -93,15 +93,19 @@ def test_five_weights_give_the_curve_of_a_tile() -> None:
 def test_different_loadings_and_fewer_weights_widen_the_interval() -> None:
     apart = dict(zip(FIVE, (1.04, 0.97, 1.02, 0.95, 1.03), strict=True))
     alike_n, apart_n = (
-        read_half_width_n(fit_dead_weights([record_weights(each)])) for each in (FIVE, apart)
+        read_half_width_n(fit_curve_to_dead_weights([record_weights(each)]))
+        for each in (FIVE, apart)
     )
     assert apart_n > 2.0 * alike_n
-    assert read_half_width_n(fit_dead_weights([record_weights(apart, repeats=3)])) < 0.8 * apart_n
+    assert (
+        read_half_width_n(fit_curve_to_dead_weights([record_weights(apart, repeats=3)]))
+        < 0.8 * apart_n
+    )
 
 
 def test_a_tolerance_of_all_weights_does_not_average_out() -> None:
     loose = {f"{text} +-5 %": gain for text, gain in FIVE.items()}
-    tile = fit_dead_weights([record_weights(loose, repeats=4)])
+    tile = fit_curve_to_dead_weights([record_weights(loose, repeats=4)])
     assert read_half_width_n(tile) > 1.96 * 0.05 / np.sqrt(3.0) * 2.0 * STANDARD_GRAVITY_M_S2
 
 
@@ -129,4 +133,4 @@ DRIFTING = [
 )
 def test_weights_that_show_no_curve_are_refused(recording: Indentation, match: str) -> None:
     with pytest.raises(CalibrationError, match=match):
-        fit_dead_weights([recording])
+        fit_curve_to_dead_weights([recording])

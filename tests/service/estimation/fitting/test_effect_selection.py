@@ -14,7 +14,7 @@ from service.estimation.effects import WALL_PER_KPA, Effects
 from service.estimation.fitting.dome_model import DomeModel, FittedEffects
 from service.estimation.fitting.effects_fit import (
     _convert_centred_cubic_to_c1_c2_c3,
-    collect_loadings,
+    collect_loadings_at_common_baseline,
 )
 from service.estimation.fitting.output_error import OutputErrorProblem
 from service.estimation.fitting.static_fit import fit_static_curve
@@ -146,7 +146,7 @@ def test_temperature_without_a_soak_at_two_temperatures_is_refused(
 def test_the_error_of_a_left_out_loading_is_that_of_a_fit_without_it() -> None:
     recording = record(strokes=3, holds=3, taps=6)
     tile = fit_static_curve(recording)
-    points, baseline_kpa = collect_loadings([recording])
+    points, baseline_kpa = collect_loadings_at_common_baseline([recording])
     static = DomeModel(
         _convert_centred_cubic_to_c1_c2_c3(tile.coefficients),
         tile.range_kpa[1],

@@ -17,11 +17,11 @@ from service.estimation.fitting.dome_model import (
 )
 from service.estimation.fitting.effects_fit import (
     _convert_centred_cubic_to_c1_c2_c3,
-    collect_loadings,
+    collect_loadings_at_common_baseline,
 )
 from service.estimation.fitting.least_squares import (
-    compute_curve_n,
     compute_curve_student_t_half_width_95_n,
+    compute_curve_through_zero_n,
     compute_new_loading_half_width_95_n,
     compute_student_t_95,
     minimize_squares,
@@ -84,7 +84,7 @@ def test_a_bent_valley_is_left() -> None:
 def test_a_tiles_fit_is_within_a_tenth_of_sigma_of_a_long_search() -> None:
     recording = record(seed=0)
     tile = fit_static_curve(recording)
-    points, baseline_kpa = collect_loadings([recording])
+    points, baseline_kpa = collect_loadings_at_common_baseline([recording])
     static = DomeModel(
         _convert_centred_cubic_to_c1_c2_c3(tile.coefficients),
         tile.range_kpa[1],
@@ -152,7 +152,7 @@ def test_the_band_of_the_mean_is_t_times_the_standard_error() -> None:
     # One newton per unit, gain known to 2 %: 3.1824 x 2 % of the force.
     tile = newton_tile("T01", covariance=((0.02**2, 0.0, 0.0), (0.0,) * 3, (0.0,) * 3), repeats=4)
     gauge_kpa = np.linspace(0.0, tile.range_kpa[1], 7)
-    expected_n = 3.182446 * 0.02 * compute_curve_n(tile, gauge_kpa)
+    expected_n = 3.182446 * 0.02 * compute_curve_through_zero_n(tile, gauge_kpa)
     assert compute_curve_student_t_half_width_95_n(tile, gauge_kpa) == pytest.approx(
         expected_n, rel=1e-6
     )

@@ -15,7 +15,7 @@ from devices.frames import NO_SERVO_COUNTS, FrameBatch
 from service.estimation.foot.geometry import (
     ServoReading,
     interpolate_servo_counts,
-    store_servo_reading_and_flag_wraps,
+    store_servo_reading_and_link_to_previous,
 )
 from service.estimation.records import RecordArray
 from tests.builders.arrays import array_at, make_servo
@@ -50,7 +50,7 @@ def store_readings(
     """Store the servo readings of frames, some of them after a gap."""
     readings = ServoReading.array(len(frames))
     for i in range(len(frames)):
-        store_servo_reading_and_flag_wraps(
+        store_servo_reading_and_link_to_previous(
             readings, i, frames.t_mono_ns[i], int(frames.servo_counts[i]),
             int(frames.servo_age_us[i]), frames.frame_flags[i], TURN,
             broken is not None and bool(broken[i]),

@@ -27,7 +27,7 @@ from service.estimation.tare.automatic import (
     TOTAL_SHIFT_MAX_KPA,
     WINDOW_NS,
     FlightTareResult,
-    propose_first_flight_tare,
+    propose_first_tare_between_steps,
     propose_flight_tare,
 )
 from service.estimation.tare.tare import Tare
@@ -245,7 +245,7 @@ def make_steps(rest: float = 0.0) -> np.ndarray:
 
 
 def test_a_stepping_foot_is_first_tared_between_two_steps() -> None:
-    found = propose_first_flight_tare(collect_recent(draw_frames(20.0, make_steps(3.0))))
+    found = propose_first_tare_between_steps(collect_recent(draw_frames(20.0, make_steps(3.0))))
     assert found.tare is not None
     assert found.tare.source == "flight"
     assert found.tare.baseline_kpa == pytest.approx([UNLOADED_KPA + 3 * COUNT_KPA] * 2, abs=0.1)
@@ -257,7 +257,7 @@ def test_a_step_counts_where_temperature_is_seldom_read() -> None:
     counts[100:120] = 40.0  # 0.2 s
     frames = draw_frames(20.0, counts)
     frames.temperature_raw[np.arange(500) % 4 > 0] = NOT_READ
-    assert propose_first_flight_tare(collect_recent(frames)).tare is not None
+    assert propose_first_tare_between_steps(collect_recent(frames)).tare is not None
 
 
 @pytest.mark.parametrize(
@@ -276,4 +276,4 @@ def test_a_foot_without_certain_steps_is_not_tared(
     counts: np.ndarray, calibration: Calibration
 ) -> None:
     recent = collect_recent(draw_frames(20.0, counts), calibration)
-    assert propose_first_flight_tare(recent) == FlightTareResult()
+    assert propose_first_tare_between_steps(recent) == FlightTareResult()

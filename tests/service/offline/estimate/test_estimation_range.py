@@ -111,7 +111,7 @@ def test_a_file_of_a_part_says_so_and_proves_itself(raw: Path, tmp_path: Path) -
     estimated(raw, tmp_path / "part.parquet", Slice(100.0, 110.0))
     with SealedFileReader(raw) as whole, SealedFileReader(tmp_path / "part.parquet") as part:
         assert part.notes["part_of"] == {
-            **whole.source_reference,
+            **whole.session_id_and_hashes,
             "start_s": 100.0,
             "end_s": 110.0,
             "warm_up_s": SETTLING_MIN_S,

@@ -55,7 +55,7 @@ def fake_node(name: str = "bench", *, has_clock: bool = False) -> ServerNode:
         stream_id="0" * 32,
         published_t_ns=None,
         clock_offset=object() if has_clock else None,
-        to_server_t_ns=lambda t_ns: t_ns,
+        to_server_t_ns_or_unchanged=lambda t_ns: t_ns,
     )
     return cast(ServerNode, node)
 

@@ -244,14 +244,14 @@ def test_a_journal_that_cannot_be_read_now_is_not_taken_for_one_that_is_not_ther
     world.reboot()
     world.send_newest(20)
 
-    whole = Journal.open_and_recover
+    whole = Journal.open_existing_and_recover
 
     def opens(folder: Path, **how: object) -> Journal:
         if folder.name == FIRST:
             raise StorageError("no descriptor is left", errno=errno.EMFILE)
         return whole(folder, **how)  # type: ignore[arg-type]  # of several types
 
-    monkeypatch.setattr(Journal, "open_and_recover", opens)
+    monkeypatch.setattr(Journal, "open_existing_and_recover", opens)
     world.restart()
     world.connect()
     assert (

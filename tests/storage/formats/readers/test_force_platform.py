@@ -427,6 +427,6 @@ def test_too_little_memory_is_the_cause(tmp_path: Path, monkeypatch: pytest.Monk
     def refuse(*_: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr(C3dFile, "get_scaled_samples", refuse)
+    monkeypatch.setattr(C3dFile, "get_scaled_samples_by_channel", refuse)
     with pytest.raises(FileFormatError, match=r"not enough memory.*ulimit -v"):
         read(path)

@@ -117,7 +117,9 @@ def test_recovery_stores_frames_in_flight_and_drops_nothing(
     notes = StreamNotes.load(folder / "journal" / "leg" / ("0" * 32))
     assert notes is not None
     assert notes.next_seq == 118
-    with closing(Journal.open_and_recover(folder / "journal" / "leg" / ("0" * 32))) as found:
+    with closing(
+        Journal.open_existing_and_recover(folder / "journal" / "leg" / ("0" * 32))
+    ) as found:
         assert found.stored == Intervals([(0, 117)])
     assert not list(folder.rglob("in_flight"))
 

@@ -11,7 +11,7 @@ from devices.errors import CalibrationError
 from service.estimation.fitting.rig.indentation import (
     Indentation,
     average_stroke_blocks,
-    measure_initial_unloaded,
+    measure_last_second_before_first_load,
 )
 
 Segment = tuple[str, list[float], list[float]]
@@ -47,7 +47,7 @@ def ramp(phase: str, begin: float, end: float, n: int = 60) -> Segment:
 def test_baseline_noise_and_zero_are_of_the_second_before_the_first_press() -> None:
     early = rest(50, kpa=90.0, force_n=9.0)  # more than a second before
     late = ("rest", [99.0, 101.0] * 50, [0.1, 0.3] * 50)
-    zero = measure_initial_unloaded(record(early, late, ramp("load", 0, 10)))
+    zero = measure_last_second_before_first_load(record(early, late, ramp("load", 0, 10)))
     assert zero.baseline_kpa == pytest.approx(100.0)
     assert zero.noise_kpa == pytest.approx(np.sqrt(100 / 99))
     assert zero.reference_zero_n == pytest.approx(0.2)
@@ -63,19 +63,22 @@ def test_baseline_noise_and_zero_are_of_the_second_before_the_first_press() -> N
     ids=["reference over another tile", "reference without readings", "unreadable pressures"],
 )
 def test_missing_readings_are_in_no_baseline_and_no_zero(rest_segment: Segment) -> None:
-    state = measure_initial_unloaded(record(rest_segment, ramp("load", 0, 10)))
+    state = measure_last_second_before_first_load(record(rest_segment, ramp("load", 0, 10)))
     assert (state.reference_zero_n, state.baseline_kpa) == (0.0, 100.0)
 
 
 def test_a_short_rest_before_the_press_is_refused() -> None:
     with pytest.raises(CalibrationError, match=r"bench\.parquet, tile T01: only 9 readings"):
-        measure_initial_unloaded(record(rest(9), ramp("load", 0, 10)))
-    assert measure_initial_unloaded(record(rest(10), ramp("load", 0, 10))).baseline_kpa == 100.0
+        measure_last_second_before_first_load(record(rest(9), ramp("load", 0, 10)))
+    assert (
+        measure_last_second_before_first_load(record(rest(10), ramp("load", 0, 10))).baseline_kpa
+        == 100.0
+    )
 
 
 def test_a_tile_that_is_never_pressed_is_refused() -> None:
     with pytest.raises(CalibrationError, match="never presses this tile"):
-        measure_initial_unloaded(record(rest(), ("load*", [110.0] * 50, [20.0] * 50)))
+        measure_last_second_before_first_load(record(rest(), ("load*", [110.0] * 50, [20.0] * 50)))
 
 
 def test_a_stroke_is_averaged_in_sixty_blocks_each_way() -> None:
