@@ -140,7 +140,7 @@ def average_stroke_blocks(*recordings: Indentation) -> Strokes:
     another one has.
 
     Raises:
-        CalibrationError: as for `measure_last_second_before_first_load`, or no slow stroke is there.
+        CalibrationError: no slow stroke, or as for `measure_last_second_before_first_load`.
     """
     blocks: list[_Block] = []
     count = 0
