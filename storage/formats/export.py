@@ -140,7 +140,7 @@ def make_one_pass_frame_source(
 
     Args:
         frame_chunks: frames with their further columns, in order.
-        span_ns: first and last instant on the session's time axis; None: `frame_chunks` has all frames.
+        span_ns: first and last instant on the session's time axis; None: of `frame_chunks`.
         axis: time axis of the session.
 
     Raises:
