@@ -28,7 +28,7 @@ ViolationMask = npt.NDArray[np.bool_]
 """Mask of the rows that break a rule."""
 
 
-def describe_first_impossible_value(frames: FrameBatch, info: ArrayInfo) -> str:
+def describe_first_broken_rule(frames: FrameBatch, info: ArrayInfo) -> str:
     """Return a text that names the first broken rule and frame; empty if there is none.
 
     Args:

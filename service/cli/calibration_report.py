@@ -8,7 +8,6 @@ from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
-from service.cli.report import ASSUMED_SCALE
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.effects import Effects, Parameter
 from service.estimation.fitting.least_squares import compute_student_t_95
@@ -76,7 +75,6 @@ def _make_table(title: str, notes: Sequence[str], *headings: str) -> Table:
 
 
 def _tabulate_curves(calibration: Calibration) -> Table:
-    assumed = any(tile.absolute_scale == "assumed" for tile in calibration.tiles)
     table = _make_table(
         f"Calibration {calibration.name} ({calibration.id})",
         [
@@ -84,7 +82,6 @@ def _tabulate_curves(calibration: Calibration) -> Table:
             "fit has not seen; mean, new: half width at full load of the 95 % band of",
             "the mean curve, and of a new loading; loop: hysteresis",
             f"reference: {calibration.reference}; {calibration.date}",
-            *([ASSUMED_SCALE] if assumed else []),
         ],
         *("tile", "R2", "of mean", "RMSE\nN", "left out\nN", "mean\nN", "new\nN", "loop\nN"),
         *("rises", "repeats"),

@@ -42,7 +42,7 @@ class MountCalibration(CalibrationPart):
     """
 
     reference: Text
-    """Session and reference."""
+    """Session on the force plate, options and file of the plate's recording, as text."""
     gains: Annotated[dict[Identifier, Parameter], Field(min_length=1, max_length=_TILES_MAX)]
     """Gains by serial: newtons of the ground on the tile's part of the foot for one of the dome."""
     shear: Parameter | None = None

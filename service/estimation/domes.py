@@ -151,7 +151,7 @@ def list_saturation_loads() -> list[SlowSaturationLoad]:
     return sorted((compute_saturation_load(dome) for dome in DOMES), key=lambda found: found.low_n)
 
 
-def select_likely_covering_dome(load_n: float) -> SlowSaturationLoad | None:
+def select_weakest_covering_dome(load_n: float) -> SlowSaturationLoad | None:
     """Return the weakest dome that covers a slow load; it resolves the load best.
 
     If none does for certain, the weakest that perhaps does; None if all saturate.

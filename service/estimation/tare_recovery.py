@@ -25,7 +25,7 @@ RECOVERY_UNCERTAINTY = 0.5
 
 def remove_recovery(
     tare: Tare,
-    frames_through_tare: FrameBatch,
+    frames: FrameBatch,
     *,
     info: ArrayInfo,
     calibration: Calibration,
@@ -38,8 +38,8 @@ def remove_recovery(
 
     Args:
         tare: from an interval of these frames.
-        frames_through_tare: the interval and `HISTORY_NS` before it; the tare is returned
-            unchanged without frames before its interval.
+        frames: the interval and `HISTORY_NS` before it, or more; without frames before the interval
+            the tare is returned unchanged.
         info: the array.
         calibration: of its tiles.
         models: of the estimate; without loop and creep nothing is removed.
@@ -48,14 +48,14 @@ def remove_recovery(
         The tare with lower baselines of load-bearing tiles, and with larger uncertainties.
     """
     begin_t_ns = tare.t_ns - round((tare.end_s - tare.begin_s) * 1e9)
-    first = int(np.searchsorted(frames_through_tare.t_ns, begin_t_ns - HISTORY_NS))
-    begin = int(np.searchsorted(frames_through_tare.t_ns, begin_t_ns))
+    first = int(np.searchsorted(frames.t_ns, begin_t_ns - HISTORY_NS))
+    begin = int(np.searchsorted(frames.t_ns, begin_t_ns))
     if begin == first:  # no load is known before it
         return tare
-    end = int(np.searchsorted(frames_through_tare.t_ns, tare.t_ns, side="right"))
+    end = int(np.searchsorted(frames.t_ns, tare.t_ns, side="right"))
     plan = make_plan(info, calibration, tare, models=models, lag_ms=LIVE_LAG_MS)
     estimator = Estimator(plan)
-    due = estimator.process_frames(frames_through_tare.slice_rows(first, end))
+    due = estimator.process_frames(frames.slice_rows(first, end))
     last = estimator.finish()
     force_n = due.force_n if last is None else np.concatenate([due.force_n, last.force_n])
     columns = plan.load_bearing_columns

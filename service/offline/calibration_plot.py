@@ -11,8 +11,8 @@ import numpy as np
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.fitting.effects_fit import ReplaySection, simulate_release_and_tap_pressure
 from service.estimation.fitting.least_squares import (
-    compute_curve_student_t_half_width_95_n,
     compute_curve_through_zero_n,
+    compute_mean_curve_half_width_95_n,
     compute_new_loading_half_width_95_n,
 )
 from service.estimation.fitting.rig.indentation import (
@@ -97,7 +97,7 @@ def _plot_curve(
     grid_kpa = np.linspace(0.0, end_kpa, 200)
     force_n = compute_curve_through_zero_n(tile, grid_kpa)
     mean_n, new_n = (
-        compute_curve_student_t_half_width_95_n(tile, grid_kpa),
+        compute_mean_curve_half_width_95_n(tile, grid_kpa),
         compute_new_loading_half_width_95_n(tile, grid_kpa),
     )
     left_n = blocks.force_n - compute_curve_through_zero_n(tile, blocks.gauge_kpa)

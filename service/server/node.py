@@ -126,8 +126,7 @@ class ServerNode:
                 except DamagedFileError as error:
                     self._problems.append(f"a journal is left out: {error}")
                 except FootTileError as error:  # a full disk, or another version's file
-                    text = f"a journal is left out until it can be read: {error}"
-                    self.unreadable_streams[path.name] = text
+                    self.unreadable_streams[path.name] = _describe_unreadable(error)
         self._problems += self.estimator.file_problems
         for text in self.file_problems:
             log.warning("%s", text)
@@ -336,7 +335,8 @@ class ServerNode:
                             opened.expect_no_more_frames()
             except DamagedFileError as error:
                 self._problems.append(f"a journal is left out: {error}")
-            except FootTileError:
+            except FootTileError as error:
+                self.unreadable_streams[name] = _describe_unreadable(error)
                 continue
             del self.unreadable_streams[name]
 
@@ -430,3 +430,7 @@ def _join_adjacent(numbers: list[tuple[int, int]]) -> list[tuple[int, int]]:
         else:
             joined.append((first, last))
     return joined
+
+
+def _describe_unreadable(error: FootTileError) -> str:
+    return f"a journal is left out until it can be read: {error}"

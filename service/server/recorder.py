@@ -63,7 +63,7 @@ class Recorder:
         """Return the sessions that are being recorded on a node."""
         return [s for s in self._store.list_unsealed(node) if s.state == "recording"]
 
-    def start_another_session(
+    def start_session(
         self,
         node_name: str,
         name: str,
@@ -73,7 +73,7 @@ class Recorder:
         notes: str = "",
         tags: tuple[str, ...] = (),
         take: str | None = None,
-        request_to_store: IdempotencyRecord | None = None,
+        request: IdempotencyRecord | None = None,
     ) -> Session:
         """Start a session with the next frame, or `pre_roll_s` earlier if still stored.
 
@@ -106,7 +106,7 @@ class Recorder:
             notes=notes,
             tags=tags,
             take=take,
-            request=request_to_store,
+            request=request,
             missed_slots_at_start=node.present_stream.missed_slots,
             clock=session_parts.list_clock_offsets_since(node.present_stream, part.seq_first),
         )

@@ -55,7 +55,7 @@ class SessionSealer:
         *,
         unquantized: bool = False,
     ) -> None:
-        self._exact = unquantized
+        self._unquantized = unquantized
         self._store = store
         self._nodes = nodes
         self._request_resend = request_resend
@@ -81,7 +81,7 @@ class SessionSealer:
 
     def collect_inputs(self, session: Session) -> SessionInputs:
         """Collect the present inputs of a session; missing ones are left out (`problem`)."""
-        return current_inputs(session, self._nodes.get(session.node), unquantized=self._exact)
+        return current_inputs(session, self._nodes.get(session.node), unquantized=self._unquantized)
 
     def advance_unsealed_sessions(self) -> None:
         """Find the ends of stopped sessions, and start to seal those whose frames are all here."""

@@ -77,7 +77,7 @@ class NodeLink:
 
 
 class DeletedTotals(NamedTuple):
-    """Sessions that were deleted from the trash."""
+    """Number and size of the sessions that were deleted from the trash."""
 
     session_count: int
     size_bytes: int

@@ -25,7 +25,7 @@ from service.protocol import ClockSample, EarlierStream, Hello, SeqIntervalsByRe
 from service.sessions.parts import SeqsAround, SessionStream, find_seqs_around_once_passed
 from storage.clock.bounds import DISCIPLINE_RATE_LIMIT
 from storage.clock.log import ClockLog, ClockOffset
-from storage.frame_rules import describe_first_impossible_value
+from storage.frame_rules import describe_first_broken_rule
 from storage.intervals import CORRUPT, NO_END, REFUSED, Intervals, Losses
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
@@ -349,7 +349,7 @@ class ServerStream:
         """
         first, last = int(frames.seq[0]), int(frames.seq[-1])
         end = self.notes.next_seq
-        wrong = describe_first_impossible_value(frames, self.info)
+        wrong = describe_first_broken_rule(frames, self.info)
         if not wrong and self.limit is not None:
             ahead = self.limit.describe_frames_ahead(frames, now_t_ns)
             if ahead:

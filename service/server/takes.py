@@ -87,7 +87,7 @@ class TakeRecorder:
         take = Take(secrets.token_hex(6))
         for node in dict.fromkeys(nodes):
             try:
-                session = self._recorder.start_another_session(
+                session = self._recorder.start_session(
                     node,
                     name,
                     pre_roll_s=pre_roll_s,
@@ -95,7 +95,7 @@ class TakeRecorder:
                     notes=notes,
                     tags=tags,
                     take=take.id,
-                    request_to_store=request,
+                    request=request,
                 )
             except FootTileError as error:
                 take.errors_by_node[node] = str(error)

@@ -184,7 +184,7 @@ class Weighings:
                 f"the clock of node {node.name!r} was not compared with the server's yet",
                 remedy="Start again in some seconds",
             )
-        session = self._recorder.start_another_session(
+        session = self._recorder.start_session(
             node.name, f"weights on {', '.join(plan.tiles)}"[:200], tags=("calibration",)
         )
         now_s = time.monotonic()

@@ -186,7 +186,7 @@ class SessionPreview:
 
     Args:
         inputs: inputs of the session.
-        folder: folder on the disk for states of estimators (`service.sessions.preview`).
+        folder: folder on the disk for states of estimators (`Checkpoints`).
     """
 
     def __init__(self, inputs: SessionInputs, folder: Path) -> None:
@@ -273,7 +273,7 @@ class SessionPreview:
         )
         self.checkpoints.truncate(index + 1)
         place = all_[index]
-        self.measure_repeated_work_up_to(self)
+        self.reset_repeated_work_timer(self)
         self._position = Checkpoint(
             place.part,
             place.seq,
@@ -285,12 +285,12 @@ class SessionPreview:
         self._repeated_frames = kept_frames - place.estimated_frames
         self._inputs = inputs
 
-    def measure_repeated_work_up_to(self, previous: SessionPreview) -> None:
+    def reset_repeated_work_timer(self, previous: SessionPreview) -> None:
         """Reset the time of repeated work, which is measured up to another preview's position."""
         self._fed_before_rewind, self.repeated_work_s = previous._position.fed_frames, 0.0
 
     def get_bins(self, time_slice: Slice, min_bins: int) -> BinnedSlice:
-        """Return a slice as bins, at most four times as many as points.
+        """Return a slice as about `min_bins` to four times as many bins; fewer of few frames.
 
         Raises:
             StateError: there is no frame yet.
@@ -384,7 +384,7 @@ class SessionPreviews:
         with self._one_at_a_time:
             return self._advance_preview(inputs)
 
-    def advance_unless_behind_journals(self, inputs: SessionInputs) -> SessionPreview:
+    def advance_unless_catching_up(self, inputs: SessionInputs) -> SessionPreview:
         """Return a session's preview; it is advanced first unless it is catching up.
 
         Raises:
@@ -412,7 +412,7 @@ class SessionPreviews:
                 preview.rewind_to_valid_checkpoint(inputs)
             else:
                 before, preview = preview, SessionPreview(inputs, self._folder)
-                preview.measure_repeated_work_up_to(before)
+                preview.reset_repeated_work_timer(before)
                 self._previews[name] = preview
         self._previews.move_to_end(name)
         while len(self._previews) > _PREVIEWS_KEPT:

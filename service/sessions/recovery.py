@@ -243,7 +243,7 @@ class RecoveryReport:
 
     @property
     def is_empty_or_all_waiting(self) -> bool:
-        """True if there was nothing to do."""
+        """True if nothing was changed; sessions may wait for their node."""
         done = any(one.outcome != "waiting" for one in self.sessions)
         made = (
             self.removed_temporaries,

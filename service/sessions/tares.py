@@ -361,8 +361,8 @@ class TareHistory:
         entry = self._entries[at] if 0 <= at < len(self._entries) else None
         return entry.tare.t_ns if isinstance(entry, RecordedTare) else otherwise
 
-    def store_and_apply_tare(self, tare: Tare, info: ArrayInfo, reason: str = "") -> RecordedTare:
-        """Store a tare, which puts it in force.
+    def store_tare_in_force(self, tare: Tare, info: ArrayInfo, reason: str = "") -> RecordedTare:
+        """Store a tare, which puts it in force in the history; the caller sets it in the estimator.
 
         Args:
             tare: the tare.
@@ -379,8 +379,8 @@ class TareHistory:
         self._store(_thin_out((*self._entries, recorded)))
         return recorded
 
-    def undo_any_tare_and_pause_automatic(self, tare_id: str) -> None:
-        """Undo a tare; the one before it is in force again.
+    def undo_tare(self, tare_id: str) -> None:
+        """Undo a tare. If it was in force, the one before it is again, and automatic tares pause.
 
         Raises:
             UnknownError: no such tare, or it was undone already.

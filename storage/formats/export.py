@@ -140,7 +140,8 @@ def make_one_pass_frame_source(
 
     Args:
         frame_chunks: frames with their further columns, in order.
-        span_ns: first and last instant on the session's time axis; None: of `frame_chunks`.
+        span_ns: first and last instant on the session's time axis; None: begins with the
+            first of `frame_chunks`; the end is unknown.
         axis: time axis of the session.
 
     Raises:

@@ -26,8 +26,8 @@ from storage.journal.segment import (
     INDEX_SUFFIX,
     SUFFIX,
     Segment,
-    had_frames_written,
     make_free_unread_path,
+    may_have_indexed_batches,
     read_schema_and_first_offset,
     recover_or_delete_segment,
     set_aside_irregular_or_forbidden_files,
@@ -78,7 +78,7 @@ class Journal:
             self.problems += set_aside_irregular_or_forbidden_files(folder)
             for path in sorted(folder.glob("*" + SUFFIX)):
                 index = path.with_suffix(INDEX_SUFFIX)
-                is_indexed = index.exists() and had_frames_written(path, self._schema)
+                is_indexed = index.exists() and may_have_indexed_batches(path, self._schema)
                 segment, damaged = recover_or_delete_segment(path, self._schema)
                 self.lost.add_if_new(damaged, CORRUPT)
                 if segment is not None:

@@ -306,7 +306,7 @@ def make_free_unread_path(path: Path) -> Path:
     return path.with_name(next(name for name in names if name not in existing))
 
 
-def had_frames_written(path: Path, schema: pa.Schema) -> bool:
+def may_have_indexed_batches(path: Path, schema: pa.Schema) -> bool:
     """Return whether the index is not empty, or the segment has two batches or more.
 
     Raises:

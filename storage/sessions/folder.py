@@ -151,7 +151,7 @@ class Session(_Record):
     max_lost_tail_frames: dict[str, int] = Field(default_factory=dict)
     """Count by stream_id, of parts that ended because the node went away."""
     is_abandoned: bool = False
-    """True: a person has given up the pending frames."""
+    """True: a person has abandoned the pending frames."""
     take: str | None = None
     """Id of the take that it was recorded in together with other nodes."""
     request: IdempotencyRecord | None = None

@@ -134,7 +134,7 @@ def mark_damaged_and_abandoned_lost(
     """Return the streams' states with their losses settled, as the ledger counts them.
 
     A damaged number is lost unless it is obtainable, and an obtainable one is lost once the session
-    was given up. Slots count only from start to stop, and a tail counts only if a part reaches the
+    was abandoned. Slots count only from start to stop, and a tail counts only if a part reaches the
     end of its stream.
 
     Args:

@@ -17,7 +17,7 @@ import pyarrow as pa
 
 from devices.errors import DamagedFileError, FileFormatError
 from devices.frames import ArrayInfo
-from storage.frame_rules import describe_first_impossible_value
+from storage.frame_rules import describe_first_broken_rule
 from storage.intervals import Intervals
 from storage.journal.segment import (
     INDEX_SUFFIX,
@@ -201,7 +201,7 @@ class _BatchVerifier:
         t_ns_first, t_ns_last = frames.t_ns[ends - records["count"]], frames.t_ns[ends - 1]
         if (t_ns_first != records["t_ns_first"]).any() or (t_ns_last != records["t_ns_last"]).any():
             return False
-        if describe_first_impossible_value(frames, self._info):
+        if describe_first_broken_rule(frames, self._info):
             return False
         self._report.stored.add_ranges(records["seq_first"], records["count"])
         self._report_pending()
@@ -254,7 +254,7 @@ def _find_batch_problem(payload: bytes, record: np.void, schema: pa.Schema, info
         return f"the batch holds {len(batch)} frames from {int(batch.seq[0])} on"
     if (int(batch.t_ns[0]), int(batch.t_ns[-1])) != (record["t_ns_first"], record["t_ns_last"]):
         return "the index has other instants than the batch"
-    return describe_first_impossible_value(batch, info)
+    return describe_first_broken_rule(batch, info)
 
 
 def _has_any_batch(path: Path, index: Records) -> bool:

@@ -9,8 +9,8 @@ import numpy as np
 
 from devices.arrays import Bools, Floats
 from service.estimation.fitting.least_squares import (
-    compute_curve_student_t_half_width_95_n,
     compute_curve_through_zero_n,
+    compute_mean_curve_half_width_95_n,
 )
 from service.estimation.records import SIGMAS_95
 from service.offline.compare.plot import OUR_COLOUR, REFERENCE_COLOUR, TILE_COLOURS
@@ -61,7 +61,7 @@ def _draw_domes(domes: Sequence[DomeResult]) -> bytes:
         grid_kpa = np.linspace(0.0, min(tile.range_kpa[1], found.end_kpa), 120)
         force_n, half_n = (
             compute_curve_through_zero_n(tile, grid_kpa),
-            compute_curve_student_t_half_width_95_n(tile, grid_kpa),
+            compute_mean_curve_half_width_95_n(tile, grid_kpa),
         )
         curves.fill_between(
             grid_kpa, force_n - half_n, force_n + half_n, color=colour, alpha=0.25, linewidth=0

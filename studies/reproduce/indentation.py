@@ -16,8 +16,8 @@ from devices.scene.scene_file import Scene
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.domes import Dome, SlowSaturationLoad, compute_saturation_load
 from service.estimation.fitting.least_squares import (
-    compute_curve_student_t_half_width_95_n,
     compute_curve_through_zero_n,
+    compute_mean_curve_half_width_95_n,
 )
 from service.estimation.fitting.rig.indentation import Strokes, average_stroke_blocks, select_loaded
 from service.estimation.fitting.static_fit import fit_static_curve
@@ -134,7 +134,7 @@ def evaluate_dome(dome: Dome, pressed: IndentedTile) -> DomeResult:
         end_kpa=end_kpa,
         full_scale_n=(
             float(compute_curve_through_zero_n(tile, at_kpa)[0]),
-            float(compute_curve_student_t_half_width_95_n(tile, at_kpa)[0]),
+            float(compute_mean_curve_half_width_95_n(tile, at_kpa)[0]),
         ),
         is_full_scale_reached=beyond_kpa <= 0.0,
         repeatability=compute_repeatability(pressed.strokes),

@@ -21,8 +21,8 @@ from devices.emulation.plates import VERTICAL
 from devices.scene.scene_file import Scene
 from service.estimation.calibration import Calibration
 from service.estimation.fitting.least_squares import (
-    compute_curve_student_t_half_width_95_n,
     compute_curve_through_zero_n,
+    compute_mean_curve_half_width_95_n,
     compute_new_loading_half_width_95_n,
 )
 from service.offline.compare.block_covariance import UncertainValue
@@ -321,7 +321,7 @@ def _dome_to_dict(found: DomeResult) -> dict[str, object]:
         "curve": {
             "gauge_kpa": gauge_kpa.tolist(),
             "force_n": compute_curve_through_zero_n(tile, gauge_kpa).tolist(),
-            "half_95_of_mean_n": compute_curve_student_t_half_width_95_n(tile, gauge_kpa).tolist(),
+            "half_95_of_mean_n": compute_mean_curve_half_width_95_n(tile, gauge_kpa).tolist(),
             "half_95_of_loading_n": compute_new_loading_half_width_95_n(tile, gauge_kpa).tolist(),
         },
     }

@@ -68,7 +68,7 @@ class Health(View):
 
     status: str = Field(examples=["ok"])
     problems: list[PublicText] = Field(
-        description="Damage found in the data folder at the start, and the consequence, as text. "
+        description="Damage found in the data folder, and the consequence, as text. "
         "Everything else is served."
     )
 

@@ -247,7 +247,7 @@ async def undo_tare(node: str, tare_id: str, server: ServerState, if_match: InFo
     """
     the_node = server.nodes.get(node)
     _check_tare_in_force(the_node, if_match)
-    the_node.estimator.tare_controller.undo_any_tare_and_pause_automatic(tare_id)
+    the_node.estimator.tare_controller.undo_tare(tare_id)
     server.notify_node_changed(the_node)
 
 

@@ -1,6 +1,7 @@
 """`foottile calibrate`: from recordings, with weights on a running node, and as mounted.
 
-The server guides, records and fits, as for the page `/calibrate`; this module prints its prompts.
+With `--live` the server guides, records and fits, as for the page `/calibrate`, and this module
+prints its prompts.
 """
 
 from __future__ import annotations
@@ -45,6 +46,8 @@ if TYPE_CHECKING:
     from foottile.server import Server
     from service.estimation.calibration import Calibration
 
+DELAY_MAX_MS = 1000.0
+"""Largest delay of a usable reference."""
 _POLL_S = 0.3
 _EXIT_NOT_ACCEPTED = 3
 
@@ -230,10 +233,6 @@ def _assign(source: Server, node: dict[str, Any], calibration: Calibration) -> N
     path = f"/nodes/{quote(node['node'], safe='')}/calibration"
     source.http.send("PUT", path, {"id": calibration.id})
     remark(f"node {node['node']} now uses it")
-
-
-DELAY_MAX_MS = 1000.0
-"""Largest delay of a usable reference."""
 
 
 @require_extra("server", "`foottile calibrate`")

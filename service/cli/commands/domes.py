@@ -15,7 +15,7 @@ from service.estimation.domes import (
     compute_ambient_transmission,
     compute_fast_to_slow_saturation_load_ratio,
     list_saturation_loads,
-    select_likely_covering_dome,
+    select_weakest_covering_dome,
 )
 
 
@@ -33,7 +33,7 @@ def domes_command(
     """
     if load_n is not None and not 0.0 < load_n < float("inf"):
         raise UsageError(f"--load-n {load_n} is not a load", expected="newtons above 0")
-    selected = None if load_n is None else select_likely_covering_dome(load_n)
+    selected = None if load_n is None else select_weakest_covering_dome(load_n)
     if as_json:
         print_json(
             {

@@ -22,10 +22,10 @@ def recover_command(
         bool,
         typer.Option("--streams", help="Also make sessions of frames that belong to none."),
     ] = False,
-    give_up: Annotated[
+    abandon_missing: Annotated[
         bool,
         typer.Option(
-            "--give-up",
+            "--abandon-missing",
             help="On a server: count the missing frames of nodes as lost.",
         ),
     ] = False,
@@ -49,7 +49,7 @@ def recover_command(
     set_umask_and_create_private_folder(folder)
     with lock_folder(folder), show_progress("opening journals") as report_step:
         recovery = recover_locked_folder(
-            folder, make_sessions=streams, abandon_missing=give_up, report_step=report_step
+            folder, make_sessions=streams, abandon_missing=abandon_missing, report_step=report_step
         )
     if as_json:
         print_json(_to_json(recovery))
@@ -100,7 +100,7 @@ def _print_report(recovery: RecoveryReport) -> None:
     if recovery.is_empty_or_all_waiting:
         echo("nothing to recover")
     if any(found.outcome == "waiting" for found in recovery.sessions):
-        remark("the server completes the waiting sessions; --give-up seals them now")
+        remark("the server completes the waiting sessions; --abandon-missing seals them now")
 
 
 def _format_outcome(found: RecoveredSession) -> str:

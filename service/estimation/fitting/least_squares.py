@@ -164,7 +164,7 @@ def compute_curve_through_zero_n(tile: TileCalibration, gauge_kpa: Floats) -> Fl
     return np.asarray(_compute_tile_basis(tile, gauge_kpa) @ coefficients)
 
 
-def compute_curve_student_t_half_width_95_n(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
+def compute_mean_curve_half_width_95_n(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
     """Compute the half width of the mean curve's 95 % band, from the covariance over repeats."""
     return compute_student_t_95(tile.repeats) * np.sqrt(_compute_mean_variance(tile, gauge_kpa))
 

@@ -24,8 +24,8 @@ from service.estimation.calibration import (
 )
 from service.estimation.fitting.least_squares import (
     compute_cubic_basis_through_zero,
-    compute_curve_student_t_half_width_95_n,
     compute_curve_through_zero_n,
+    compute_mean_curve_half_width_95_n,
     compute_new_loading_half_width_95_n,
 )
 from service.estimation.fitting.rig.checks import (
@@ -194,7 +194,7 @@ def _make_band(tile: TileCalibration) -> tuple[BandPoint, ...]:
     columns = (
         gauge_kpa,
         compute_curve_through_zero_n(tile, gauge_kpa),
-        compute_curve_student_t_half_width_95_n(tile, gauge_kpa),
+        compute_mean_curve_half_width_95_n(tile, gauge_kpa),
         compute_new_loading_half_width_95_n(tile, gauge_kpa),
     )
     return tuple(

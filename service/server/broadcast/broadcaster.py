@@ -179,10 +179,10 @@ class RateGroup:
     """Subscribers of the same nodes at the same rate."""
 
     def __init__(
-        self, frames_of_node: str | None, rate_hz: float, nodes: Mapping[str, ServerNode]
+        self, node_filter: str | None, rate_hz: float, nodes: Mapping[str, ServerNode]
     ) -> None:
         self.subscribers: set[Subscriber] = set()
-        self._pending = PendingUpdate(frames_of_node)
+        self._pending = PendingUpdate(node_filter)
         self._has_pending = asyncio.Event()
         self._rate_hz = rate_hz
         self._nodes = nodes
@@ -236,16 +236,16 @@ class Broadcaster:
         return sum(len(feed.subscribers) for feed, _ in self._groups.values())
 
     def subscribe(
-        self, socket: SubscriberSocket, max_rate_hz: float, frames_of_node: str | None = None
+        self, socket: SubscriberSocket, max_rate_hz: float, node_filter: str | None = None
     ) -> Subscriber:
         """Add a subscriber to events from now on, of all nodes or one.
 
         Args:
             socket: websocket of the subscriber.
             max_rate_hz: greatest update rate, 1 to 60.
-            frames_of_node: node of interest; None: all.
+            node_filter: node whose frames and progress are sent; None: all.
         """
-        key = frames_of_node, max(rate for rate in RATES_HZ if rate <= max_rate_hz)
+        key = node_filter, max(rate for rate in RATES_HZ if rate <= max_rate_hz)
         if key not in self._groups:
             feed = RateGroup(*key, self._nodes)
             self._groups[key] = feed, asyncio.create_task(feed.run())

@@ -1,11 +1,11 @@
 """Summaries of frames for live pages, and the history of the last minute's force.
 
-Spans with minimum and maximum, so that no peak hides. The newest ones are kept as they were
-published, so that live messages continue them without a seam; older ones are merged. Memory is
-bounded: 130 kB, and 50 kB for the newest.
-
 Frames between two ticks are merged into one summary per node, so a slow subscriber costs no more
 than a fast one. Minimum and maximum of skipped frames are in every message, so that no peak hides.
+
+The history is of spans with minimum and maximum. Its newest spans are kept as published, so that
+live messages continue them without a seam; older ones are merged. Memory is bounded: 130 kB, and
+50 kB for the newest.
 """
 
 from __future__ import annotations
@@ -253,8 +253,8 @@ class PendingUpdate:
         node_filter: node of interest; None: all.
     """
 
-    def __init__(self, frames_of_node: str | None = None) -> None:
-        self._node_filter = frames_of_node
+    def __init__(self, node_filter: str | None = None) -> None:
+        self._node_filter = node_filter
         self._summaries: dict[str, FrameSummary] = {}
         self._last_seq: dict[str, tuple[str, int]] = {}
         self._dropped: dict[str, Intervals] = {}

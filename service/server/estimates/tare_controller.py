@@ -127,19 +127,19 @@ class TareController:
             TareError: the foot was loaded, or there is nothing to tare.
             StorageError: the tare cannot be stored.
         """
-        recorded = self._history.store_and_apply_tare(
+        recorded = self._history.store_tare_in_force(
             self._live.compute_unloaded_tare(), self._info, reason
         )
         self._put_in_force(recorded)
         return recorded
 
-    def undo_any_tare_and_pause_automatic(self, tare_id: str) -> None:
-        """Undo a tare; the one before is in force again.
+    def undo_tare(self, tare_id: str) -> None:
+        """Undo a tare. If it was in force, the one before it is again, and automatic tares pause.
 
         Raises:
-            UnknownError, StorageError: as for `TareHistory.undo_any_tare_and_pause_automatic`.
+            UnknownError, StorageError: as for `TareHistory.undo_tare`.
         """
-        self._history.undo_any_tare_and_pause_automatic(tare_id)
+        self._history.undo_tare(tare_id)
         self._flight_warning = None
         self._live.set_tare(self._history.tare_in_force_or_lost(self._info))
 
@@ -195,7 +195,7 @@ class TareController:
         # In the history, or lost: the server was restarted, and another tare may have followed.
         is_older = not self._has_seen_lead and self._history.may_have_lost_tare_taken_at(tare.t_ns)
         if ("lead", tare.t_ns) not in keys and not is_older:
-            self._live.set_tare(self._history.store_and_apply_tare(tare, self._info).tare)
+            self._live.set_tare(self._history.store_tare_in_force(tare, self._info).tare)
         self._is_lead_done = True
 
     def _is_flight_check_due(self) -> bool:
@@ -220,7 +220,7 @@ class TareController:
         self._flight_warning = found.rejection
         if found.tare is not None:
             self._put_in_force(
-                self._history.store_and_apply_tare(found.tare, self._info, found.reason)
+                self._history.store_tare_in_force(found.tare, self._info, found.reason)
             )
 
     def _put_in_force(self, recorded: RecordedTare) -> None:

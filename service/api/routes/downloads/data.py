@@ -176,7 +176,7 @@ def _write_export(
         # A whole session is estimated once: no cached preview is needed.
         is_some, so_fars = query.slice.has_time_bounds, server.previews
         so_far = (
-            so_fars.advance_unless_behind_journals(sources)
+            so_fars.advance_unless_catching_up(sources)
             if is_some
             else SessionPreview(sources, server.data)
         )

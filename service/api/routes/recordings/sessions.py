@@ -147,14 +147,14 @@ async def start_session(
     if earlier:
         session = earlier[0]
     else:
-        session = server.recorder.start_another_session(
+        session = server.recorder.start_session(
             body.node,
             body.name,
             pre_roll_s=body.pre_roll_s,
             subject=body.subject or "",
             notes=body.notes,
             tags=body.tags,
-            request_to_store=record,
+            request=record,
         )
         server.notify_node_changed(server.nodes.get(body.node))
     response.headers["Location"] = f"/api/v1/sessions/{session.id}"

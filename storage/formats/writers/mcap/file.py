@@ -156,9 +156,9 @@ def _encode_together(exports: Sequence[Export]) -> Iterator[bytes]:
             remedy="Leave columns out, or ask for messages=foxglove",
         )
     needed = (
-        ros2.list_quantities_to_read_for_ros2
+        ros2.list_columns_to_read_for_ros2
         if is_ros2
-        else foxglove.list_quantities_to_read_for_foxglove
+        else foxglove.list_columns_to_read_for_foxglove
     )
     pieces = [_read_frame_chunks(export, needed(export)) for export in exports]
     firsts = [next(frames) for frames in pieces]  # errors are raised before the first chunk

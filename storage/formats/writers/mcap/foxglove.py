@@ -57,7 +57,7 @@ def list_foxglove_frame_columns(export: Export) -> list[str]:
     ]
 
 
-def list_quantities_to_read_for_foxglove(export: Export) -> list[str]:
+def list_columns_to_read_for_foxglove(export: Export) -> list[str]:
     """Return the flat columns to read for Foxglove messages."""
     drawn = [name for name in _SCENE_COLUMNS if export.has_forces]
     return [*list_foxglove_frame_columns(export), *drawn]

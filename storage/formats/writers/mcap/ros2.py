@@ -42,7 +42,7 @@ _TEMPERATURE_HOLD_NS = _NS
 """Longest age of a chip's last temperature that is used for frames without one."""
 
 
-def list_quantities_to_read_for_ros2(export: Export) -> list[str]:
+def list_columns_to_read_for_ros2(export: Export) -> list[str]:
     """Return the quantities to read for ROS 2 messages."""
     return [*_READINGS, *(_FORCES if export.has_forces else ())]
 
