@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import signal
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -60,7 +60,7 @@ def is_of_this_run(item: pytest.Item) -> bool:
     """
     mark = item.get_closest_marker("in_turn")
     name = item.name if mark is not None and mark.kwargs.get("each") else item.path.name
-    return TURN is None or zlib.crc32(name.encode()) % PARTS == int(TURN) % PARTS
+    return TURN is None or hashlib.sha256(name.encode()).digest()[0] % PARTS == int(TURN) % PARTS
 
 
 def pytest_report_header() -> str | None:

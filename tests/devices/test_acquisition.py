@@ -22,7 +22,7 @@ from devices.scene.hardware_sections import ScheduleName, TileSection
 from tests.builders.arrays import DATA_SHEET_CHIP
 from tests.builders.scenes import make_scene
 from tests.devices.feet import ANCHOR, Foot, array_of, foot
-from tests.devices.rigs import SCHEDULES
+from tests.devices.rigs import SCHEDULES, Adapter
 
 FRAME_NS = 2_532_500  # simultaneous, four tiles, 400 kHz, 1.6 ms: bus_budget.py, strategy b
 LOOK_NS = 165_000, 215_000
@@ -316,7 +316,7 @@ def test_an_unplugged_tile_costs_neither_a_frame_nor_another_tile() -> None:
     assert (batch.frame_flags == 0).all()
 
 
-class FailingAdapter:
+class FailingAdapter(Adapter):
     """An adapter of which every transaction times out while `fails` is set."""
 
     def __init__(self, adapter: I2cAdapter) -> None:
@@ -329,12 +329,6 @@ class FailingAdapter:
             self.clock.sleep_until_ns(self.clock.now_ns() + 30_000_000)
             raise OSError(110, "injected")
         self._adapter.i2c_rdwr(*i2c_msgs)
-
-    def set_timeout(self, units_10ms: int) -> None:
-        self._adapter.set_timeout(units_10ms)
-
-    def close(self) -> None:
-        self._adapter.close()
 
 
 def test_a_bus_that_times_out_is_flagged_in_every_frame() -> None:

@@ -1,4 +1,4 @@
-"""Some rounds of faults in every run of the tests, and kills at every call that matters.
+"""Rounds of faults, a part of them in every run of the tests, and kills at every call that matters.
 
 `python tests/faults/rounds.py --rounds 200` plays many more.
 """
@@ -51,6 +51,7 @@ STORIES = {
     "full node": ("full_disk_of_node",),
     "away": ("black_hole", "stop_while_away_and_kill_node"),
 }
+IN_EVERY_RUN = ("kills", "power")
 STORIES_ALONE = {
     "alone, kills": ("kill_node", "kill_acquisition", "kill_node_parent", "restart_node_twice"),
     "alone, power": ("power_node", "clock_of_node", "slow_fsync"),
@@ -85,8 +86,13 @@ def test_a_seed_is_a_story_and_nobody_is_asked_to_fill_a_disk_who_may_not() -> N
 
 
 @pytest.mark.real_time
-@pytest.mark.in_turn(each=True)
-@pytest.mark.parametrize("name", [*STORIES, *STORIES_ALONE])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in IN_EVERY_RUN else pytest.mark.in_turn(each=True))
+        for name in (*STORIES, *STORIES_ALONE)
+    ],
+)
 def test_a_chosen_round_is_good(name: str, tmp_path: Path, journal: Product) -> None:
     if name.startswith("full") and os.geteuid() != 0:
         pytest.skip("to mount a small disk one has to be root")

@@ -43,7 +43,7 @@ Readings = dict[str, str]
 def make_server(data: Path) -> None:
     """A server's: a sealed session, one in the trash, one that waits, journal, clock, tares."""
     info, node = make_array(stream_id=BOOT), data / "nodes" / "bench"
-    TareHistory(node / "tares.json").store_and_apply_tare(make_tare(t_ns=t_ns(0)), info)
+    TareHistory(node / "tares.json").store_tare_in_force(make_tare(t_ns=t_ns(0)), info)
     hello = Hello(
         protocol=PROTOCOL,
         array_info=info,

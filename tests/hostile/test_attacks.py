@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import PARTS
 from tests.hostile.__main__ import played
 from tests.hostile.attack import ATTACKS, Attack, Outcome, Play
 
@@ -31,7 +32,7 @@ for _path in sorted(Path(__file__).parent.glob("attack_*.py")):
     ],
 )
 def test_an_attack_does_nothing_that_it_must_not(attack: Attack, tmp_path: Path) -> None:
-    outcome = attack.play(seed=SEED, is_soak=False, folder=tmp_path, turn=TURN)
+    outcome = attack.play(seed=SEED, is_soak=False, folder=tmp_path, turn=TURN // PARTS)
     assert outcome.tries >= attack.tries
     assert outcome.failures == []
 

@@ -357,7 +357,11 @@ class FakeNode:
         until(lambda: self.running.node(self.name)["last_seq"] == self.seq - 1)
 
     def finish(self, recording: Recording) -> dict[str, Any]:
-        """Stop a session, send frames of after the stop, and wait until it is sealed."""
+        """Stop a session, send frames of after the stop, and wait until it is sealed.
+
+        Frames sent in a burst are ahead of real time: the stop waits until it lies behind them.
+        """
+        until(lambda: time.monotonic_ns() > self.next_t_mono_ns)
         recording.stop()
         self.send(10, now=True)
         return recording.sealed()

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import httpx
 import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 
 from devices.frames import FrameBatch
@@ -16,6 +19,18 @@ from tests.waiting import PATIENCE_S, until
 
 if TYPE_CHECKING:
     from tests.service.running import Running
+
+
+def read_table(answer: httpx.Response, to: str) -> pa.Table:
+    """Read a download in one of the formats of tables."""
+    assert answer.status_code == 200, answer.text
+    match to:
+        case "parquet":
+            return pq.read_table(io.BytesIO(answer.content))
+        case "arrow":
+            return pa.ipc.open_file(answer.content).read_all()
+        case _:
+            return pacsv.read_csv(io.BytesIO(answer.content))
 
 
 @dataclass(frozen=True)

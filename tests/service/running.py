@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import shutil
 import ssl
 import threading
@@ -42,6 +43,16 @@ def assert_refused(answer: httpx.Response, status: int, *words: str) -> None:
     assert answer.status_code == status, answer.text
     for word in words:
         assert word in answer.json()["detail"]
+
+
+def receive_live(socket: Any, is_wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+    """Return the next live message that is wanted; others come all the time."""
+    end_s = time.monotonic() + PATIENCE_S
+    while True:
+        text = socket.recv(timeout=max(0.0, end_s - time.monotonic()))
+        message: dict[str, Any] = json.loads(text)
+        if is_wanted(message):
+            return message
 
 
 class Running:

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, NOT_READ, FrameBatch
-from storage.frame_rules import describe_first_impossible_value
+from storage.frame_rules import describe_first_broken_rule
 from storage.journal.journal import Journal
 from storage.verify.journal import verify_journal
 from tests.builders.arrays import UTC_NS, make_array
@@ -33,7 +33,7 @@ def test_ordinary_frames_and_the_ends_of_every_range_keep_to_the_rules() -> None
         servo_age_us=[NO_SERVO_AGE, 0, 2**31 - 1, 1],
         reference_force_n=[np.nan, -1e6, 1e6, 0.0],
     )
-    assert describe_first_impossible_value(batch, INFO) == ""
+    assert describe_first_broken_rule(batch, INFO) == ""
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ def test_an_impossible_value_is_named_with_its_frame(column: str, wrong: Any, sa
     batch = make_frames(5)
     values = getattr(batch, column).copy()
     values[3] = wrong
-    found = describe_first_impossible_value(with_columns(batch, **{column: values}), INFO)
+    found = describe_first_broken_rule(with_columns(batch, **{column: values}), INFO)
     assert said in found
     assert "in frame 3" in found
 
@@ -70,7 +70,7 @@ def test_an_offset_that_fits_only_because_it_wraps_is_seen() -> None:
     t_ns = np.full(3, (2**63 - 1 + UTC_NS) % 2**64 - 2**64)
     assert (t_ns - t_mono_ns == UTC_NS).all()
     wrapped = FrameBatch(**{**vars(batch), "t_mono_ns": t_mono_ns, "t_ns": t_ns})
-    assert "36 years" in describe_first_impossible_value(wrapped, INFO)
+    assert "36 years" in describe_first_broken_rule(wrapped, INFO)
 
 
 @settings(deadline=None, max_examples=60)
@@ -89,7 +89,7 @@ def test_messages_taken_in_any_order_are_whole_for_verify(
         for first, rows, late_ns in messages:
             batch = make_frames(np.arange(first, first + rows))
             batch = with_columns(batch, t_mono_ns=batch.t_mono_ns + late_ns)
-            if not describe_first_impossible_value(
+            if not describe_first_broken_rule(
                 batch, INFO
             ) and not journal.describe_reversal_against_stored(batch):
                 taken += journal.append_new_frames(batch).number_count

@@ -147,7 +147,9 @@ def test_the_bus_clock_and_the_overhead_of_a_transaction_are_measured(
     wires.on_transaction = take_time
     found = measure_wire_timing(wires.bus, wires.clock, wires.infos[2])
     assert found.scl_hz == pytest.approx(scl_hz, rel=0.01)
-    assert found.transaction_overhead_s == pytest.approx(overhead_us * 1e-6, abs=5e-6)
+    assert found.transaction_overhead_s == pytest.approx(
+        overhead_us * 1e-6, abs=5e-6 if overhead_us else 1e-6
+    )
 
 
 # Conversion time
@@ -248,7 +250,7 @@ def test_a_machine_that_sleeps_too_long_measures_too_long_and_never_too_short() 
 
 @pytest.mark.parametrize("mode", ["stale", "abort", "torn"])
 def test_a_busy_machine_never_measures_too_short(mode: ReadDuringConversion) -> None:
-    for seed in range(15):
+    for seed in range(30):
         wires = part_with(1_600_000, mode, noisy(f"hesitates {seed}"))
         hesitating(wires, seed, least_ns=100_000)
         found_ns = measure_ns(wires)

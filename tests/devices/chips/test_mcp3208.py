@@ -37,6 +37,7 @@ class Line:
 
 
 @given(st.integers(0, 7), st.integers(0, 4095), st.booleans())
+@example(3, 0, False)  # a line that is stuck low reads a rail
 @example(3, 0, True)
 @example(3, 4095, True)
 def test_every_count_of_every_channel_is_read(channel: int, counts: int, floats_high: bool) -> None:

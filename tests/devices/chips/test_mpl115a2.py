@@ -196,7 +196,9 @@ word = st.integers(0, 0xFFFF)
 def test_coefficients_are_encoded_to_their_registers_without_the_two_bits_below_c12(
     words: Words,
 ) -> None:
-    assert Coefficients.from_words(words).to_words() == (*words[:3], words[3] & 0xFFFC)
+    masked = (*words[:3], words[3] & 0xFFFC)
+    assert Coefficients.from_words(words) == Coefficients.from_words(masked)
+    assert Coefficients.from_words(words).to_words() == masked
 
 
 @given(

@@ -129,6 +129,8 @@ def test_no_device_answers_at_another_address(address: int) -> None:
     reader = alone(part())
     for message in (i2c_msg.write(address, [0x12, 0]), i2c_msg.read(address, 1)):
         assert get_errno(partial(reader.send, message)) == errno.EREMOTEIO
+    reader.clock.sleep_until_ns(reader.clock.now_ns() + TC_NS)
+    assert reader.counts() == (0, 0)
     # The messages before a missing acknowledge take effect.
     assert get_errno(lambda: reader.send(convert(), i2c_msg.write(address, [0]))) == 121
     reader.clock.sleep_until_ns(reader.clock.now_ns() + TC_NS)

@@ -174,7 +174,7 @@ def test_a_step_rings_at_the_plates_own_frequency() -> None:
     assert hz == pytest.approx(plates.NATURAL_HZ, rel=0.03)
 
 
-def test_its_clock_starts_late_and_goes_as_fast_as_it_drifts() -> None:
+def test_the_clock_of_a_plate_starts_late_and_goes_as_fast_as_it_drifts() -> None:
     clock = PlateClock(1000.0, start_s=0.25, drift_ppm=100.0)
     time_s, t_s = clock.compute_sample_times(100.25)
     assert len(time_s) == 100_010

@@ -87,7 +87,7 @@ def test_a_reference_tile_reads_atmosphere_head_and_temperature_and_no_load() ->
     assert wet[:, 1].mean() == pytest.approx(107.3, abs=0.13)
     assert wet[:, 0].mean() - loaded[:, 0].mean() < 2.0
     assert cold[:, 1].std() == pytest.approx(0.165, rel=0.15)
-    assert cold[:, 1].mean() == pytest.approx(107.3, abs=0.13), "no gas that cools"
+    assert cold[:, 1].mean() == pytest.approx(wet[:, 1].mean(), abs=0.05), "no gas that cools"
     # hardware.md 1.3: -5.35 counts per kelvin
     tadc = np.array([scan.temperature_raw[1] for scan in scans])
     assert tadc[t_s > 9].mean() - tadc[t_s < 1.9].mean() == pytest.approx(4 * 5.35, abs=0.5)

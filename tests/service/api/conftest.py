@@ -42,16 +42,24 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
 
 
 @pytest.fixture(scope="module")
-def sealed(shared: Running) -> Iterator[Sealed]:
-    """A sealed session of 300 frames, and one of 50 frames that is still recorded."""
+def shared_tared(shared: Running) -> Iterator[FakeNode]:
+    """A tared node of a module's server."""
     node = FakeNode(shared)
     node.connect()
     node.tared()
     node.acknowledged(69)
+    yield node
+    node.close()
+
+
+@pytest.fixture(scope="module")
+def sealed(shared_tared: FakeNode) -> Sealed:
+    """A sealed session of 300 frames, and one of 50 frames that is still recorded."""
+    node = shared_tared
     session = node.record()
     node.deliver(300, [20.0, 60.0])
     node.finish(session)
     recording = node.record(name="Ünder/..\\ 3rd trial")
     node.deliver(50, [5.0, 0.0])
-    yield Sealed(shared, session, (session.folder / "frames.parquet").read_bytes(), recording)
-    node.close()
+    content = (session.folder / "frames.parquet").read_bytes()
+    return Sealed(node.running, session, content, recording)

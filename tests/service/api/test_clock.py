@@ -10,14 +10,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
 import numpy as np
 import pyarrow as pa
-import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
 
 import foottile
+from service import server_clock
 from service.pull import pull_export, pull_session
 from storage.clock.log import ClockLog
 from storage.formats.load_trace import read_load_to_emulate
@@ -27,7 +26,7 @@ from storage.parquet_hash import write_hashed_table
 from tests.builders.arrays import PERIOD_NS
 from tests.service.command import command
 from tests.service.fake_node import FakeNode
-from tests.service.recording import Recording
+from tests.service.recording import Recording, read_table
 from tests.service.running import Running, assert_refused
 from tests.storage.faulty_disk import refusing
 from tests.waiting import until
@@ -58,16 +57,6 @@ def record(node: FakeNode, offset_ns: int | None, **changes: Any) -> Recording:
             send_sample(node, offset_ns + later_ns)
     node.taken_in()
     return session
-
-
-def read_table(answer: httpx.Response, to: str) -> pa.Table:
-    match to:
-        case "parquet":
-            return pq.read_table(io.BytesIO(answer.content))
-        case "arrow":
-            return pa.ipc.open_file(answer.content).read_all()
-        case _:
-            return pacsv.read_csv(io.BytesIO(answer.content))
 
 
 @pytest.fixture(scope="module")
@@ -203,6 +192,21 @@ def test_a_node_without_samples_has_no_servers_time(
     assert table["t_server_uncertainty_ns"].null_count == 200
 
 
+def test_a_date_set_on_the_server_is_a_step_of_the_session(
+    node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = record(node, 0)
+    node.send(50)
+    node.taken_in()
+    node.leave()
+    monkeypatch.setattr(server_clock, "_OFFSET_NS", server_clock._OFFSET_NS + HOUR_NS)
+    node.greet()
+    send_sample(node, HOUR_NS)
+    (stream,) = session.clock()["streams"]
+    (step,) = stream["steps"]
+    assert abs(step["jump_ns"] - HOUR_NS) <= step["jump_uncertainty_ns"] < 4 * HALF_NS
+
+
 def test_an_impossible_sample_is_dropped(
     running: Running, node: FakeNode, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -317,6 +321,11 @@ def assert_one_axis(session: Recording) -> None:
 
 def test_a_sealed_session_has_one_time_axis(dated: Recording) -> None:
     assert_one_axis(dated)
+    streams = dated.clock()["streams"]
+    assert [stream["stretches"][0]["offset_ns"] for stream in streams] == [WRONG_NS, 0]
+    t_server_ns = np.array(read_rows(dated, clock="server")["t_server_ns"], np.int64)
+    gap_s = np.diff(t_server_ns).max() * 1e-9
+    assert gap_s == pytest.approx((GAP_NS + PERIOD_NS) * 1e-9, abs=SOON_S)
     url = f"{dated.url}/data?format=csv&start_s={END_S + 10}"
     answer = dated.running.http.get(url)
     assert_refused(answer, 422, f"ends at {END_S:.3f}"[:-1])

@@ -11,10 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import httpx
 import numpy as np
-import pyarrow as pa
-import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
 
@@ -22,20 +19,10 @@ from storage.formats.export import Export
 from storage.formats.writers.registry import FORMATS
 from tests.service.api.sealed import Sealed
 from tests.service.fake_node import NodeOf
+from tests.service.recording import read_table
 from tests.service.running import Running, assert_refused
 from tests.storage.formats.writers.readers import said_in
 from tests.waiting import until
-
-
-def read_table(answer: httpx.Response, to: str) -> pa.Table:
-    assert answer.status_code == 200, answer.text
-    match to:
-        case "parquet":
-            return pq.read_table(io.BytesIO(answer.content))
-        case "arrow":
-            return pa.ipc.open_file(answer.content).read_all()
-        case _:
-            return pacsv.read_csv(io.BytesIO(answer.content))
 
 
 def test_a_download_is_the_stored_file(sealed: Sealed) -> None:
@@ -197,12 +184,14 @@ def test_a_session_with_losses_or_without_forces_is_so_in_every_format(
     for to, known in FORMATS.items():
         answer = sessions[lossy].data(format=to, markers=True)
         assert answer.headers["foottile-complete"] == "lossy"
+        assert said_in(to, answer.content)[0]["complete"].lower().startswith("lossy")
         url = f"{sessions[raw].url}/data"
         answer = running.http.get(url, params={"format": to, "markers": "true"})
         if known.needs_forces:
             assert_refused(answer, 422, "this session has none", "ask for its counts")
         else:
             assert answer.headers["foottile-complete"] == "true"
+            assert said_in(to, answer.content)[0]["complete"].lower() == "true"
 
 
 def test_an_aborted_download_ends_its_encoder(

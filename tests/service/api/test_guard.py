@@ -137,7 +137,7 @@ def test_a_change_with_the_token_passes(guarded: Running) -> None:
     for method, path in CHANGES:
         answer = guarded.http.request(method, path, json={}, headers=BEARER)
         assert answer.status_code in (404, 422), path
-    node = FakeNode(guarded, token=TOKEN)
+    node = FakeNode(guarded, "other", token=TOKEN)
     node.connect()
     node.deliver(10)
     node.close()

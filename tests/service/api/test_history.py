@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import numpy as np
@@ -10,8 +9,8 @@ import pytest
 
 from tests.service.api.sealed import Sealed
 from tests.service.fake_node import FakeNode
-from tests.service.running import Running, assert_refused
-from tests.waiting import PATIENCE_S, until
+from tests.service.running import Running, assert_refused, receive_live
+from tests.waiting import until
 
 URL = "/nodes/bench/history"
 
@@ -56,9 +55,7 @@ def test_a_history_ends_where_a_live_message_begins(running: Running, tared: Fak
     tared.send(500)
     with running.socket("/api/v1/live?rate_hz=10") as live:
         tared.send(300)
-        message: dict[str, Any] = {"type": ""}
-        while message["type"] != "frame":
-            message = json.loads(live.recv(timeout=PATIENCE_S))
+        message = receive_live(live, lambda message: message["type"] == "frame")
     first = message["seq_first"]
     assert message["seq"] - first + 1 == message["n"]
     assert get(running, before_seq=first, seconds=60)["seq"][-1] == first - 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from typing import Any
 
@@ -13,7 +12,7 @@ from storage.permissions import SECRETS_NAME, read_secrets_or_empty
 from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import Earlier, FakeNode, NodeOf
 from tests.service.node.publishing import Publishing
-from tests.service.running import Running, assert_refused, closed
+from tests.service.running import Running, assert_refused, closed, receive_live
 from tests.waiting import in_a_loop
 
 
@@ -130,8 +129,7 @@ def test_an_accepted_machine_replaces_the_node(
         assert running.node()["replacement"] is None
         notices: list[Any] = []
         while not notices or notices[-1]["connected"]:
-            message = json.loads(live.recv(timeout=20.0))
-            notices += [message["node"]] if message["type"] == "node" else []
+            notices.append(receive_live(live, lambda each: each["type"] == "node")["node"])
         # Three requests are one notice.
         assert sum(bool(node["connected"] and node["replacement"]) for node in notices) == 1
     stranger.connect()

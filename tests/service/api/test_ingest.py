@@ -54,6 +54,9 @@ def test_a_node_that_returns_continues_where_the_server_is(
     node.send_again(node.sent[1])
     node.deliver(30)
     assert_all_stored(node)
+    node.acked = Intervals()  # a node whose acknowledgement was lost waits for another one
+    node.send_again(node.sent[0].slice_rows(55, 100))
+    node.acknowledged(99, first=55)
     assert running.node()["lost_frames"] == 0
     running.restart()
     assert_all_stored(node)

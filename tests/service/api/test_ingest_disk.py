@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 
 import pytest
@@ -16,7 +15,7 @@ from storage.intervals import Intervals
 from storage.journal.journal import Journal
 from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import FakeNode
-from tests.service.running import Running, closed
+from tests.service.running import Running, closed, receive_live
 from tests.storage.faulty_disk import (
     IO_ERROR,
     NO_SPACE,
@@ -104,10 +103,9 @@ def test_frames_that_a_full_disk_refuses_are_requested_again(
         refused = node.send(30, 20.0)
         until(lambda: running.node()["storage_problem"])
         assert "No space left" in running.node()["storage_problem"]
-        shown = -1
-        while shown < 90:  # all but the look-ahead
-            message = json.loads(live.recv(timeout=PATIENCE_S))
-            shown = message["seq"] if message["type"] == "frame" else shown
+        message = receive_live(  # all but the look-ahead
+            live, lambda message: message["type"] == "frame" and message["seq"] >= 90
+        )
         assert message["force_n"] == pytest.approx([20.0, 20.0], abs=0.5)
         probe(node)
         assert node.acked == Intervals([(0, 69)])

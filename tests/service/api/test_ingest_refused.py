@@ -166,7 +166,9 @@ def test_a_name_has_to_be_that_of_a_folder(odd: FakeNode, name: str) -> None:
     odd.open_with_hello(array_info=odd.info.model_copy(update={"node": name}))
     assert closed(odd.socket)[0] == 4001
     assert_unknown(odd)
+    assert name not in [known["node"] for known in odd.running.http.get("/nodes").json()["items"]]
     assert not (odd.running.data / "outside").exists()
+    assert not (odd.running.data / "hello.json").exists()
 
 
 @pytest.mark.parametrize("fault", ["name", "tiles", "twice", "stored"])

@@ -15,7 +15,7 @@ from service.server.broadcast.views import NodeView
 from service.server.estimates.live_estimator import LiveEstimator
 from service.server.node import ServerNode
 from tests.service.fake_node import FakeNode, NodeOf
-from tests.service.running import Running, closed
+from tests.service.running import Running, closed, receive_live
 from tests.waiting import PATIENCE_S, until
 
 LIVE = "/api/v1/live"
@@ -38,10 +38,7 @@ def live(running: Running, other: FakeNode) -> Iterator[Any]:
 def assert_goes_on(live: Any, other: FakeNode) -> None:
     """The other node's frames are acknowledged and shown."""
     other.deliver(40, now=True)
-    while True:
-        message = json.loads(live.recv(timeout=PATIENCE_S))
-        if message["type"] == "frame" and message["node"] == "other":
-            return
+    receive_live(live, lambda each: each["type"] == "frame" and each["node"] == "other")
 
 
 def count_bugs(caplog: pytest.LogCaptureFixture) -> int:

@@ -11,7 +11,7 @@ import pytest
 
 import service.server.broadcast.broadcaster
 from tests.service.fake_node import FakeNode, NodeOf, Play
-from tests.service.running import Running, closed
+from tests.service.running import Running, closed, receive_live
 from tests.waiting import PATIENCE_S, until
 
 LIVE = "/api/v1/live"
@@ -19,12 +19,7 @@ LIVE = "/api/v1/live"
 
 def receive(socket: Any, kind: str) -> dict[str, Any]:
     """Return the next message of a kind."""
-    end_s = time.monotonic() + PATIENCE_S
-    while True:
-        text = socket.recv(timeout=max(0.0, end_s - time.monotonic()))
-        message: dict[str, Any] = json.loads(text)
-        if message["type"] == kind:
-            return message
+    return receive_live(socket, lambda message: message["type"] == kind)
 
 
 def receive_frame(socket: Any, seq: int) -> dict[str, Any]:

@@ -240,6 +240,7 @@ def list_readable(running: Running) -> list[str]:
 
 
 def test_a_private_server_needs_a_login_for_all_but_its_pages(private: Running) -> None:
+    assert_refused(private.http.get("/openapi.json"), 401, "private", "foottile invite")
     for path in list_readable(private):
         for method in ("GET", "HEAD", "OPTIONS"):
             answer = private.http.request(method, private.url + path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -47,12 +46,9 @@ def read_frames(session: Recording, *names: str) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def hopped(shared: Running) -> Iterator[Recording]:
+def hopped(shared_tared: FakeNode) -> Recording:
     """A sealed session of 1400 frames: up and down, with 80 N and a single peak of 90 N."""
-    node = FakeNode(shared)
-    node.connect()
-    node.tared()
-    node.acknowledged(69)
+    node = shared_tared
     session = node.record()
     for _ in range(6):
         node.send(100, [0.0, 0.0])
@@ -60,8 +56,7 @@ def hopped(shared: Running) -> Iterator[Recording]:
     node.send(1, [20.0, 70.0])
     node.deliver(199, [0.0, 0.0])
     node.finish(session)
-    yield session
-    node.close()
+    return session
 
 
 @pytest.mark.parametrize(("points", "in_bin"), [(1, 64), (20, 64), (100, 4), (1400, 1), (8000, 1)])

@@ -16,7 +16,7 @@ from websockets.sync.client import connect
 import service.api.runner
 from service.estimation.compilation import is_compiling
 from tests.service.fake_node import FakeNode, NodeOf
-from tests.service.running import ServeWith
+from tests.service.running import ServeWith, receive_live
 from tests.waiting import PATIENCE_S, until
 
 
@@ -35,12 +35,8 @@ def compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def receive_frame(node: FakeNode) -> dict[str, object]:
     """Return a live message of frames of now."""
     with node.running.socket("/api/v1/live?rate_hz=60") as live:
-        while True:
-            node.deliver(40, now=True)
-            message = json.loads(live.recv(timeout=PATIENCE_S))
-            while message["type"] != "frame":
-                message = json.loads(live.recv(timeout=PATIENCE_S))
-            return dict(message)
+        node.deliver(40, now=True)
+        return receive_live(live, lambda message: message["type"] == "frame")
 
 
 def test_pages_have_pressures_until_models_are_compiled(

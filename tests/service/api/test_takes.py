@@ -238,6 +238,9 @@ def test_a_file_of_a_take_has_all_sessions_until_a_marker_changes_it(take: Take)
     first, query = take.get("xdf"), {"format": "xdf"}
     tag = {"If-None-Match": first.headers["etag"]}
     assert http.get(take.url, params=query, headers=tag).status_code == 304
+    head = http.head(take.url, params=query)
+    assert (head.status_code, head.content) == (200, b"")
+    assert head.headers["etag"] == first.headers["etag"]
     http.post(f"{take.sessions[1].url}/markers", json={"label": "tap"})
     assert http.get(take.url, params=query, headers=tag).status_code == 200
     part = http.get(take.url, params=query | {"end_s": "0.1"}, headers=tag)

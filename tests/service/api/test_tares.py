@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import time
-
 import numpy as np
 import pytest
 
 from tests.builders.arrays import COUNT_KPA
 from tests.service.fake_node import FakeNode
-from tests.service.running import Running, assert_refused
-from tests.waiting import PATIENCE_S, until
+from tests.service.running import Running, assert_refused, receive_live
 
 URL = "/nodes/bench/tare"
 
@@ -28,11 +24,11 @@ def test_a_tare_is_in_force_until_it_is_undone(running: Running, tared: FakeNode
     def measure_n() -> list[float]:
         with running.socket("/api/v1/live?rate_hz=60") as live:
             tared.send(60, 3.0)
-            while True:
-                message = json.loads(live.recv(timeout=PATIENCE_S))
-                if message["type"] == "frame" and message["seq"] >= tared.seq - 20:
-                    values: list[float] = message["force_n"]
-                    return values
+            message = receive_live(
+                live, lambda each: each["type"] == "frame" and each["seq"] >= tared.seq - 20
+            )
+            values: list[float] = message["force_n"]
+            return values
 
     by_lead = running.node()["tare"]
     tared.next_t_mono_ns += 11_000_000_000
@@ -68,8 +64,6 @@ def test_a_tare_in_a_recording_counts_from_then_on(running: Running, tared: Fake
     answer = running.http.post(URL, json={})
     assert answer.status_code == 201, answer.text
     tared.deliver(100, 2.0)
-    # The stop has to lie behind these frames on the node's clock, too.
-    until(lambda: time.monotonic_ns() > tared.next_t_mono_ns)
     tared.finish(session)
     force_n = session.column("force_n_0")
     assert len(force_n) == 400

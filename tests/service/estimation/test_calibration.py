@@ -24,7 +24,7 @@ from tests.builders.calibrations import make_calibration, newton_tile
 NUMBERS = st.floats(-100, 100)
 
 
-def make_one_pass_source() -> dict[str, Any]:
+def make_one_tile_content() -> dict[str, Any]:
     content: dict[str, Any] = json.loads(make_calibration(newton_tile("T01")).to_json())
     return content
 
@@ -126,12 +126,12 @@ def test_a_text_that_is_no_calibration_is_refused_by_name(text: str) -> None:
 
 
 def test_an_unknown_a_missing_and_a_later_field_are_refused_by_name() -> None:
-    missing = make_one_pass_source()
+    missing = make_one_tile_content()
     del missing["tiles"][0]["p_scale_kpa"]
     for content, match in (
-        (make_one_pass_source() | {"colour": "red"}, "colour"),
+        (make_one_tile_content() | {"colour": "red"}, "colour"),
         (missing, r"tiles\.0\.p_scale_kpa"),
-        (make_one_pass_source() | {"version": 2}, "version"),
+        (make_one_tile_content() | {"version": 2}, "version"),
     ):
         with pytest.raises(CalibrationError, match=match):
             Calibration.from_json_verifying_id(json.dumps(content), where="x")
@@ -140,7 +140,7 @@ def test_an_unknown_a_missing_and_a_later_field_are_refused_by_name() -> None:
 @pytest.mark.parametrize("value", ["NaN", "Infinity", "-Infinity"])
 @pytest.mark.parametrize("field", ["p_scale_kpa", "f_offset_n", "relative_misfit"])
 def test_nan_and_infinity_in_a_file_are_refused(field: str, value: str) -> None:
-    content = make_one_pass_source()
+    content = make_one_tile_content()
     content["tiles"][0][field] = float(value)
     with pytest.raises(CalibrationError, match=field):
         Calibration.from_json_verifying_id(json.dumps(content), where="x")

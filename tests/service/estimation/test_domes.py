@@ -18,7 +18,7 @@ from service.estimation.domes import (
     compute_volume_ratio,
     compute_wall_compliance_per_kpa,
     list_saturation_loads,
-    select_likely_covering_dome,
+    select_weakest_covering_dome,
 )
 
 
@@ -71,22 +71,22 @@ def test_the_weakest_dome_that_covers_a_load_is_named() -> None:
     names = {
         load_n: found.dome.name
         for load_n in (5, 12, 24, 28)
-        if (found := select_likely_covering_dome(load_n))
+        if (found := select_weakest_covering_dome(load_n))
     }
     assert names == {5: "v40-10", 12: "v60-10", 24: "v60-11", 28: "v60-12"}
 
 
 def test_a_load_within_the_papers_spread_is_perhaps_covered() -> None:
-    found = select_likely_covering_dome(32.0)
+    found = select_weakest_covering_dome(32.0)
     assert found is not None
     assert (found.dome.name, found.judge_slow_load(32.0)) == ("v60-11", "perhaps")
 
 
 def test_a_load_beyond_every_dome_has_none() -> None:
-    assert select_likely_covering_dome(50.0) is None
+    assert select_weakest_covering_dome(50.0) is None
     assert all(found.judge_slow_load(50.0) == "saturates" for found in list_saturation_loads())
 
 
 def test_no_load_is_refused() -> None:
     with pytest.raises(ValueError, match="no load"):
-        select_likely_covering_dome(0.0)
+        select_weakest_covering_dome(0.0)

@@ -16,7 +16,7 @@ from devices.flags import EstimateFlag
 from service.sessions.tares import TareHistory
 from storage.checksummed_json import read_checksummed_json, write_checksummed_json
 from tests.service.fake_node import FakeNode
-from tests.service.running import Running
+from tests.service.running import Running, receive_live
 from tests.waiting import PATIENCE_S
 
 LOST = int(EstimateFlag.TARE_LOST)
@@ -38,10 +38,9 @@ def receive_frame(running: Running, node: FakeNode) -> dict[str, Any]:
     with running.socket("/api/v1/live?rate_hz=60") as live:
         assert json.loads(live.recv(timeout=PATIENCE_S))["type"] == "hello"
         node.deliver(60, 3.0)
-        while True:
-            message: dict[str, Any] = json.loads(live.recv(timeout=PATIENCE_S))
-            if message["type"] == "frame" and message["seq"] >= node.seq - 20:
-                return message
+        return receive_live(
+            live, lambda each: each["type"] == "frame" and each["seq"] >= node.seq - 20
+        )
 
 
 @pytest.fixture
@@ -113,7 +112,7 @@ def test_a_session_has_forces_if_a_later_tare_precedes_the_lost_one(
     info, by_lead = tared.info, TareHistory(path).all_tares_with_undone[0].tare
     for later_s in (100, 200) if is_one_between else (200,):
         t_ns = by_lead.t_ns + later_s * 10**9
-        TareHistory(path).store_and_apply_tare(replace(by_lead, t_ns=t_ns, source="unloaded"), info)
+        TareHistory(path).store_tare_in_force(replace(by_lead, t_ns=t_ns, source="unloaded"), info)
     flip(path, b'"undone": false', b'"undone": true ')
     running.start()
     assert "1 tare is lost" in list_problems(running)

@@ -341,7 +341,7 @@ def test_an_automatic_tare_that_is_undone_does_not_come_back_until_somebody_tare
     foot.live(70.0, 0.9)
     assert foot.history == [("lead", False), ("flight", False)]
     assert foot.auto_tare == "on"
-    foot.node.estimator.tare_controller.undo_any_tare_and_pause_automatic(
+    foot.node.estimator.tare_controller.undo_tare(
         foot.node.estimator.tare_history.all_tares_with_undone[-1].id
     )
     assert foot.offset_counts == pytest.approx([0.0, 0.0], abs=0.4)

@@ -60,7 +60,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def _tares(folder: Path) -> None:
-    TareHistory(folder / "tares.json").store_and_apply_tare(make_tare(2), INFO)
+    TareHistory(folder / "tares.json").store_tare_in_force(make_tare(2), INFO)
 
 
 def _wanted(folder: Path) -> None:

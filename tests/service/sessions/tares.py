@@ -52,7 +52,7 @@ def same(one: RecordedTare, other: RecordedTare) -> None:
 def history(tmp_path: Path, *t_ns: int) -> TareHistory:
     made = TareHistory(tmp_path / "node" / "tares.json")
     for t in t_ns:
-        made.store_and_apply_tare(tare(t), INFO)
+        made.store_tare_in_force(tare(t), INFO)
     return made
 
 

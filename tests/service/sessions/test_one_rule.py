@@ -204,7 +204,7 @@ def test_a_server_and_recovery_in_its_folder_come_to_the_same_session(
         stream.write(data)
         if tared is not None:
             history = TareHistory(data / "nodes" / "bench" / "tares.json")
-            history.store_and_apply_tare(make_tare(t_ns=t_ns(tared)), INFO)
+            history.store_tare_in_force(make_tare(t_ns=t_ns(tared)), INFO)
         recorder, node = server_on(data, begun)
         made = recorder.collect_inputs_from_journals(ID)
         waiting = recorder.get_ledger(ID)

@@ -171,7 +171,7 @@ def test_what_a_node_may_still_bring_is_waited_for(tmp_path: Path) -> None:
     assert recover_locked_folder(tmp_path).is_empty_or_all_waiting
 
 
-def test_what_is_given_up_is_lost_and_says_so(tmp_path: Path) -> None:
+def test_abandoned_frames_are_lost_with_this_reason(tmp_path: Path) -> None:
     stream(servers(tmp_path), info_of(), (0, 99), (120, 199))
     session(tmp_path)
     _, ledger = recovered(tmp_path, abandon_missing=True)
@@ -180,7 +180,7 @@ def test_what_is_given_up_is_lost_and_says_so(tmp_path: Path) -> None:
     assert loaded(tmp_path).frames == 180
 
 
-def test_a_stop_that_was_never_reached_bounds_what_is_given_up(tmp_path: Path) -> None:
+def test_an_unreached_stop_bounds_the_abandoned_tail(tmp_path: Path) -> None:
     stream(servers(tmp_path), info_of(), (0, 99))
     clock = ClockOffset(stream_id=BOOT, t_mono_ns=0, server_minus_node_ns=10**9, uncertainty_ns=1)
     stopped_t_ns = t_ns(99) + 10**9 + 4 * 10**9
@@ -198,7 +198,7 @@ def test_a_session_that_was_stopped_is_ended_by_its_clock(tmp_path: Path) -> Non
     assert (one.outcome, one.session.parts[0].seq_last) == ("sealed", 50)
 
 
-def test_what_was_given_up_before_the_crash_is_not_waited_for(tmp_path: Path) -> None:
+def test_frames_abandoned_before_the_crash_are_not_waited_for(tmp_path: Path) -> None:
     stream(servers(tmp_path), info_of(), (0, 99), (120, 199))
     parts = (Part(stream_id=BOOT, seq_first=0, seq_last=150),)
     session(tmp_path, state="pending", stopped_t_ns=t_ns(150), parts=parts, is_abandoned=True)

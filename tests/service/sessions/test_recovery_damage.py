@@ -45,7 +45,7 @@ def test_frames_that_are_damaged_are_lost_and_the_others_kept(tmp_path: Path) ->
     assert find_verdict(verify_path(tmp_path / "sessions" / ID)) == "lossy"
 
 
-def test_what_is_damaged_on_a_server_may_come_again_until_it_is_given_up(
+def test_damaged_frames_of_a_server_are_waited_for_until_abandoned(
     tmp_path: Path,
 ) -> None:
     data, again = tmp_path / "data", tmp_path / "again"

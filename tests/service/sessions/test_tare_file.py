@@ -45,9 +45,9 @@ def written(folder: Path, count: int = len(TAKEN)) -> Path:
     tares = TareHistory(path)
     for t_ns, info, source, undone in TAKEN[:count]:
         tare = make_tare(2, baseline_kpa=100.0 + t_ns / 7, t_ns=t_ns, source=source)
-        recorded = tares.store_and_apply_tare(tare, info)
+        recorded = tares.store_tare_in_force(tare, info)
         if undone:
-            tares.undo_any_tare_and_pause_automatic(recorded.id)
+            tares.undo_tare(recorded.id)
     return path
 
 
@@ -175,7 +175,7 @@ def test_a_tare_after_the_lost_one_puts_all_right_again_and_so_it_stays(tmp_path
     assert found.is_tare_lost(OTHER), "it is not known whose it was"
     assert found.last_not_in_flight_or_oldest(INFO) is None
     assert not found.is_empty(INFO)
-    mine = found.store_and_apply_tare(make_tare(2, t_ns=90, source="flight"), INFO)
+    mine = found.store_tare_in_force(make_tare(2, t_ns=90, source="flight"), INFO)
     for tares in (found, TareHistory(path)):
         assert tares.problem is None or tares is found
         in_force = tares.tare_in_force_unless_lost(INFO)
@@ -189,7 +189,7 @@ def test_a_tare_after_the_lost_one_puts_all_right_again_and_so_it_stays(tmp_path
             (75, True),
             (90, False),
         ]
-    found.undo_any_tare_and_pause_automatic(mine.id)
+    found.undo_tare(mine.id)
     assert found.is_tare_lost(INFO), "none that is older takes its place"
 
 

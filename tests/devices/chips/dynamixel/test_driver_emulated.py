@@ -117,12 +117,14 @@ def test_a_silent_servo_times_out_and_is_read_once_it_answers() -> None:
         ({"servo_id": 2}, "servo 2 at 1000000 baud"),
         ({"baudrate": 57_600}, "baud rate"),
         ({"protocol": 1}, "servo 1 at 1000000 baud"),
+        ({"protocol": 2}, "servo 1 at 1000000 baud"),
     ],
 )
 def test_a_servo_of_another_id_baud_rate_or_protocol_is_silent(
     asked: dict[str, int], reason: str
 ) -> None:
-    with emulated(timeout_s=SHORT_S, asked=asked) as (_, driver, _):
+    protocol = 3 - asked["protocol"] if "protocol" in asked else 2
+    with emulated(protocol=protocol, timeout_s=SHORT_S, asked=asked) as (_, driver, _):
         (warning,) = driver.opening_warnings
         assert "no answer" in warning
         assert f"that its firmware speaks Protocol {asked.get('protocol', 2)}.0" in warning

@@ -189,6 +189,7 @@ def test_the_turn_is_unknown_after_a_restart_unless_the_joint_has_one_turn(
         assert {seen[tenth] for tenth in range(11, 15)} == {None}
         assert {seen[tenth] for tenth in range(20, 40)} == {None if is_multi_turn else counts}
         if is_multi_turn:
+            assert {seen[tenth] for tenth in range(11, 40)} == {None}
             position = source.find_latest_position(5_000 * MS)
             assert position is not None
             assert position[0] == 9000 % 4096, "counts are stored as read"

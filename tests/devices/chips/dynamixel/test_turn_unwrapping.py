@@ -111,7 +111,7 @@ MANY, ONE = CountRange.MANY_TURNS, CountRange.ONE_TURN
         "torque may have been switched on in a silence",
     ],
 )
-def test_a_turn_is_known_or_unknown_after(
+def test_a_turn_is_known_only_where_it_is_certain(
     count_range: CountRange,
     first: int,
     later: list[tuple[int, int, bool]],

@@ -71,6 +71,8 @@ def test_a_reference_tile_bears_nothing(kind: str) -> None:
     forces_n = made.forces_n(np.linspace(1, 60, 5_000))
     assert (forces_n[:, 1] == 0).all()
     assert (forces_n[:, [0, 2]].max(axis=0) > 10).all()
+    if kind == "plate":
+        np.testing.assert_allclose(forces_n.sum(axis=1), 30.0)
 
 
 # Standing

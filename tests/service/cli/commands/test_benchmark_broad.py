@@ -42,7 +42,7 @@ def test_seeds_of_judgement_have_to_be_asked_for(run: Run, tmp_path: Path, quick
     assert "seeds of judgement" in (tmp_path / "o" / "broad.md").read_text()
 
 
-def test_what_gave_no_result_is_named_and_code_3(
+def test_a_draw_without_a_result_is_named_with_exit_code_3(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from studies.broad import arrays as broad_run

@@ -109,7 +109,7 @@ def test_a_limit_that_is_missed_is_named_and_code_3_and_all_is_written(
     assert len(json.loads((tmp_path / "o" / "compare.json").read_text())["missed"]) == 2
 
 
-def test_what_the_reference_has_not_is_a_missed_limit_too(
+def test_a_limit_without_its_reference_column_is_missed(
     run: Run, session: Path, plate: Path
 ) -> None:
     force = ("--map", "time_s=Time,grf_n=Fz", "--units", "grf=N", "--sign", "-")
@@ -134,7 +134,7 @@ def test_what_the_reference_has_not_is_a_missed_limit_too(
         ((*LAB, "--sign", "-", "--sole-m", "0.2,x"), 2, "is not a size of an insole"),
     ],
 )
-def test_what_cannot_be_compared_is_named_and_leaves_nothing_behind(
+def test_an_impossible_comparison_is_named_and_leaves_no_file(
     run: Run,
     session: Path,
     plate: Path,

@@ -44,7 +44,7 @@ def test_no_server_or_node_begins_to_write_in_such_a_folder(tmp_path: Path) -> N
     assert os.umask(umask) == umask
 
 
-def test_of_many_sessions_the_one_in_such_a_folder_is_named(run: Run, tmp_path: Path) -> None:
+def test_a_session_in_such_a_folder_is_named_among_many(run: Run, tmp_path: Path) -> None:
     for name in ("one", ODD):
         (tmp_path / "all" / name).mkdir(parents=True)
         (tmp_path / "all" / name / "session.json").write_text("{}")

@@ -50,7 +50,7 @@ def test_no_text_of_a_csv_is_a_formula(run: Run, data: Path) -> None:
     assert done.out.splitlines() == ['"label"', '"\'=off"']
 
 
-def test_what_is_left_out_is_named_and_the_exit_code_is_3(run: Run, tmp_path: Path) -> None:
+def test_omitted_sessions_are_named_with_exit_code_3(run: Run, tmp_path: Path) -> None:
     sealed(tmp_path, 0, 20.0)
     recording(tmp_path, 1)
     done = run("query", "SELECT count(*) AS n FROM sessions", tmp_path)
@@ -72,7 +72,7 @@ def test_what_is_left_out_is_named_and_the_exit_code_is_3(run: Run, tmp_path: Pa
         ("SELECT 1 AS a", ".", "--data", "."),
     ],
 )
-def test_what_cannot_be_asked_is_wrong_usage(run: Run, data: Path, words: tuple[str, ...]) -> None:
+def test_an_impossible_query_is_wrong_usage(run: Run, data: Path, words: tuple[str, ...]) -> None:
     done = run("query", words[0], *([data] if len(words) == 1 else words[1:]))
     done.fails(2)
     assert len(done.err.splitlines()) == 1

@@ -47,7 +47,7 @@ NAMES = ["walk 3", f"{ID} (copy)", ID.lower(), f"{ID}.bak", "x\x1b[2Jy", OTHER_I
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_renamed_folder_is_named_with_its_id_by_everybody(
+def test_a_renamed_folder_is_named_with_its_id_by_every_command(
     run: Run, tmp_path: Path, name: str
 ) -> None:
     data = tmp_path / "data"

@@ -51,6 +51,7 @@ def test_frames_come_at_the_limit_of_the_bus(run: Run, schedule: str, limit_hz: 
     assert 0.98 * limit_hz < printed["rate_hz"] <= limit_hz
     assert (printed["flags"], printed["unmeasured"]) == ({}, [])
     t_ns = pq.read_table("s.parquet")["t_ns"].to_numpy()
+    assert printed["frames"] == len(t_ns)
     assert np.median(np.diff(t_ns)) == pytest.approx(1e9 / limit_hz, rel=0.01)
 
 
@@ -212,6 +213,6 @@ def test_faults_of_tiles_are_counted_and_named_on_the_terminal(run: Run) -> None
     assert "tile T03: conversion time not measurable; 3 ms assumed" in text
     printed = run(*arguments, "--json").printed()
     assert printed["unmeasured"] == ["T03"]
-    assert "T01" not in printed["flags"]
+    assert {"T02"} <= set(printed["flags"]) <= {"T02", "T03"}
     # Half a second, and until it is found again.
     assert 0.45 < printed["flags"]["T02"]["no_answer"] / printed["rate_hz"] < 0.9

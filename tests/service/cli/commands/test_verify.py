@@ -159,15 +159,15 @@ def test_a_folder_that_is_used_is_not_recovered_but_verified(run: Run, data: Pat
     assert "a foottile server or node uses this folder" in refused.err
 
 
-def test_recover_waits_for_the_frames_of_a_node_unless_they_are_given_up(
+def test_recover_waits_for_the_frames_of_a_node_unless_they_are_abandoned(
     run: Run, data: Path
 ) -> None:
     (data / "nodes").mkdir()
     waiting = run("recover", data)
     assert waiting.code == 3
     assert "waits for its node" in waiting.out
-    assert "--give-up" in waiting.err
-    assert "sealed and verified" in run("recover", data, "--give-up").out
+    assert "--abandon-missing" in waiting.err
+    assert "sealed and verified" in run("recover", data, "--abandon-missing").out
 
 
 def test_frames_of_no_session_are_recovered_if_asked(run: Run, data: Path) -> None:

@@ -160,7 +160,7 @@ def test_any_counts_are_exact(chips: str, seed: int) -> None:
         for _ in range(2)
     )
     pressure_raw[rng.random(shape) < 0.02] = NOT_READ
-    flags = rng.choice([0] * 20 + [1, 2, 4, 8, 16], shape)
+    flags = rng.choice([0] * 20 + [1, 2, 4, 8, 16, 32], shape)
     assert_exact(plan_with(*CHIPS[chips]), frames_of(pressure_raw, temperature_raw, flags))
 
 

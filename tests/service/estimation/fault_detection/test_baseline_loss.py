@@ -52,11 +52,11 @@ def make_walk(steps: int, leak_s: float = np.inf) -> Floats:
 
 
 def test_noise_loses_no_baseline() -> None:
-    assert not bound_error(draw_noise(200_000)).any()
+    assert not bound_error(draw_noise(447_000)).any()
 
 
-def test_twenty_minutes_of_walking_lose_no_baseline() -> None:
-    gauge_kpa = make_walk(1000)
+def test_an_hour_of_walking_loses_no_baseline() -> None:
+    gauge_kpa = make_walk(3000)
     assert not bound_error(gauge_kpa + draw_noise(len(gauge_kpa))).any()
 
 

@@ -20,8 +20,8 @@ from service.estimation.fitting.effects_fit import (
     collect_loadings_at_common_baseline,
 )
 from service.estimation.fitting.least_squares import (
-    compute_curve_student_t_half_width_95_n,
     compute_curve_through_zero_n,
+    compute_mean_curve_half_width_95_n,
     compute_new_loading_half_width_95_n,
     compute_student_t_95,
     minimize_squares,
@@ -72,7 +72,7 @@ def test_a_bounded_problem_is_solved_as_by_scipy(seed: int) -> None:
     assert (found.x <= high).all()
 
 
-def test_a_bent_valley_is_left() -> None:
+def test_a_bent_valley_is_followed_to_its_minimum() -> None:
     found = minimize_squares(
         lambda x: np.array([100.0 * (x[1] - x[0] ** 2), 10.0 * (1.0 - x[0])]),
         np.array([-1.2, 1.0]), -WIDE[:2], WIDE[:2], np.ones(2),
@@ -153,7 +153,7 @@ def test_the_band_of_the_mean_is_t_times_the_standard_error() -> None:
     tile = newton_tile("T01", covariance=((0.02**2, 0.0, 0.0), (0.0,) * 3, (0.0,) * 3), repeats=4)
     gauge_kpa = np.linspace(0.0, tile.range_kpa[1], 7)
     expected_n = 3.182446 * 0.02 * compute_curve_through_zero_n(tile, gauge_kpa)
-    assert compute_curve_student_t_half_width_95_n(tile, gauge_kpa) == pytest.approx(
+    assert compute_mean_curve_half_width_95_n(tile, gauge_kpa) == pytest.approx(
         expected_n, rel=1e-6
     )
 

@@ -120,7 +120,7 @@ AROUND_A_MINUTE_MS = [0, 2, 4, 6, 8, 10, 60_000, 60_002, 60_004, 60_006, 60_008]
         "no force", "a begin under load, then no force",
     ],
 )  # fmt: skip
-def test_contact_is_worked_out_by_hand(
+def test_contact_is_as_worked_out_by_hand(
     grf_n: list[float], options: dict[str, Any], contact: list[int]
 ) -> None:
     assert detect_contact(grf_n, **{"lag_ms": 100} | options) == contact

@@ -64,7 +64,7 @@ SQUARE = [(0.0, 0.0), (0.1, 0.0), (0.0, 0.1), (0.1, 0.1), (0.05, 0.05)]
         (SQUARE[:1], (5.0, 5.0), -math.inf),
     ],
 )
-def test_a_hull_is_worked_out_by_hand(
+def test_the_distance_from_a_hull_is_as_worked_out_by_hand(
     positions: list[tuple[float, float]], point: tuple[float, float], outside_m: float
 ) -> None:
     assert compute_outside_m(positions, point) == pytest.approx(outside_m)
@@ -173,7 +173,7 @@ def test_the_ground_frame_is_the_papers_equation_3(angle: float, x_m: float, z_m
         (math.nan, 0.1, 0.15, math.nan),
     ],
 )
-def test_a_ground_position_is_worked_out_by_hand(
+def test_a_ground_position_is_as_worked_out_by_hand(
     x_m: float, angle_rad: float, travel_m_per_rad: float, ground_x_m: float
 ) -> None:
     found_m = transform_to_ground_x_m(x_m, -0.15, angle_rad, travel_m_per_rad)

@@ -109,13 +109,14 @@ def test_the_stated_sigma_holds_for_white_and_for_lasting_noise(
         out, left, *_ = average(30.0 + noise_n, look_ms=look_ms, inflation=inflation)
         return float(np.mean((out[20:] - 30.0) ** 2) / np.mean(SIGMA_N**2 * left[20:]))
 
-    # Without look-ahead sigma is up to 7 % too small.
-    assert 0.55 < compare_variance(lasting) < 1.15
+    # Without look-ahead sigma is a few percent too small.
+    assert 0.55 < compare_variance(lasting) < (1.15 if look_ms == 0 else 1.1)
     if part:
         assert compare_variance(None) > 1.05  # taken for white
     else:
+        assert 0.6 < compare_variance(None) < 1.0
         out, left, *_ = average(30.0 + noise_n, look_ms=look_ms)
-        assert np.mean((out[20:] - 30.0) ** 2) < min(0.25 * SIGMA_N**2, SIGMA_N**2 * left.mean())
+        assert np.mean((out[20:] - 30.0) ** 2) < 0.25 * SIGMA_N**2
         assert (left > 0.0).all()
 
 

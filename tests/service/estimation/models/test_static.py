@@ -76,7 +76,7 @@ def test_zero_pressure_is_exactly_zero_force(
     ],
     ids=["tangent below", "end above", "no number", "zero less offset", "zero as fitted"],
 )
-def test_a_force_outside_the_range_follows_the_entry(
+def test_a_force_at_zero_and_outside_the_range_follows_the_entry(
     changes: dict[str, Any], force_n_at_kpa: dict[float, float]
 ) -> None:
     found = compute(*force_n_at_kpa, **changes, relative_misfit=0.01, loop_misfit_n=0.1)

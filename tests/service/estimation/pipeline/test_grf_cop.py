@@ -70,7 +70,7 @@ def test_zero_load_has_no_centre_and_no_warning() -> None:
     ],
     ids=["grid", "line", "no grid", "a punctured tile"],
 )
-def test_sum_and_centre_are_worked_out_by_hand(
+def test_sum_and_centre_are_as_worked_out_by_hand(
     positions: list[tuple[float, float, float]],
     forces_n: list[float],
     cop_x_m: float,
@@ -159,6 +159,11 @@ def test_an_uncertain_centre_or_one_outside_the_tiles_is_masked(
 ) -> None:
     e = estimate_load(forces_n, newton_plan(array_at(positions)))
     assert find_masked(e, measured)[-1] == is_masked
+
+
+def test_a_centre_outside_the_tiles_by_chance_is_not_clamped() -> None:
+    e = estimate_load([40, -1], newton_plan(array_at(NEAR)))
+    assert e.cop_x_m[-1] == pytest.approx(-0.014 / 39)
 
 
 def test_a_load_below_five_sigma_has_no_centre() -> None:

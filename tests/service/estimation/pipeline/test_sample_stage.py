@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from devices.arrays import Floats
@@ -34,6 +34,8 @@ def unwrap(pressure_raw: int, temperature_raw: int, c: Coefficients) -> float:
     temperature_raw=st.integers(440, 560),
     c=st.sampled_from([DATA_SHEET_PART, FORUM_PART]),
 )
+@example(counts=-1, temperature_raw=500, c=DATA_SHEET_PART)
+@example(counts=0, temperature_raw=500, c=DATA_SHEET_PART)
 def test_a_count_that_fell_through_zero_is_a_negative_one(
     counts: int, temperature_raw: int, c: Coefficients
 ) -> None:

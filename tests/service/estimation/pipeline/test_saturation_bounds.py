@@ -134,7 +134,7 @@ def run_domes(kind: str, lag_ms: float) -> list[Run]:
     return runs
 
 
-@pytest.mark.parametrize("lag_ms", [10.0, 100.0])
+@pytest.mark.parametrize("lag_ms", [0.0, 10.0, 100.0])
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_interval_after_an_unseen_load_covers_the_truth(kind: str, lag_ms: float) -> None:
     for begin_s, end_s in pairwise([0.0, 0.02, 0.05, *np.arange(1, 11) / 10]):

@@ -16,7 +16,7 @@ def draw_noise(n: int, tiles: int = 2, seed: int = 0) -> np.ndarray:
 
 
 def draw_stretches(kinds: Sequence[str], seed: int = 0) -> np.ndarray:
-    """Draw a second of forces on two tiles for each of these `KINDS`, or "sucked at"."""
+    """Draw a second of forces on two tiles for each of these `KINDS`, "sucked at" or "swinging"."""
     forces_n = draw_noise(RATE_HZ * len(kinds), seed=seed).reshape(len(kinds), RATE_HZ, 2)
     for second_n, kind in zip(forces_n, kinds, strict=True):
         if kind == "loaded":
@@ -25,9 +25,10 @@ def draw_stretches(kinds: Sequence[str], seed: int = 0) -> np.ndarray:
             second_n[:, 1] += 25.0  # 3.2 kPa
         elif kind == "sucked at":
             second_n[:] -= 15.0
-        elif kind == "moving":
-            t_s = np.arange(RATE_HZ) / RATE_HZ
-            second_n[:, 0] += 15.0 * np.abs(np.sin(2 * np.pi * 3.0 * t_s)) + 3.0
+        elif kind in ("moving", "swinging"):
+            swing = np.sin(2 * np.pi * 3.0 * np.arange(RATE_HZ) / RATE_HZ)
+            # Around the baseline only its motion shows.
+            second_n[:, 0] += 15.0 * np.abs(swing) + 3.0 if kind == "moving" else 6.0 * swing
         elif kind == "silent":
             second_n[::20, 1] = np.nan
     return forces_n.reshape(-1, 2)

@@ -234,7 +234,7 @@ def test_the_first_unloaded_half_second_is_recognised() -> None:
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.lists(st.sampled_from([*KINDS, "sucked at"]), min_size=1, max_size=6))
+@given(st.lists(st.sampled_from([*KINDS, "sucked at", "swinging"]), min_size=1, max_size=6))
 def test_only_an_unloaded_stretch_is_recognised(kinds: list[str]) -> None:
     forces_n = draw_stretches(kinds, seed=len(kinds))
     if "unloaded" not in kinds:

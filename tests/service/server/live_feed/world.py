@@ -182,7 +182,7 @@ class World:
     def tare(self, t_ns: int, counts: int = 0) -> None:
         """A tare is taken at this instant of the node's UTC, of a foot that bears so much."""
         tare = make_tare(t_ns=t_ns, baseline_kpa=UNLOADED_KPA + counts * COUNT_KPA)
-        self.node.estimator.tare_history.store_and_apply_tare(tare, self.present.info)
+        self.node.estimator.tare_history.store_tare_in_force(tare, self.present.info)
         self.node.estimator.live.set_tare(tare)
 
     def connect(self) -> None:

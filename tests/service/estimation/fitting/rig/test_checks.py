@@ -165,6 +165,6 @@ def test_a_chip_at_its_end_ends_the_range(
     tile = fit_static_curve(replace(recording, kpa=change(recording.kpa)))
     assert tile.rig is not None
     assert tile.rig.ended_by == "chip"
-    assert tile.range_kpa[1] == pytest.approx(end_kpa, abs=0.15)
+    assert end_kpa - 0.15 <= tile.range_kpa[1] <= end_kpa + 0.1
     assert tile.rig.spare_kpa == pytest.approx(spare_kpa, abs=0.15)
     assert tile.rig.end_n == pytest.approx(compute_force_n(np.array(end_kpa)), abs=0.5)
