@@ -43,7 +43,8 @@ from service.api.settings import Settings
 from service.cli.main import SUMMARIES, load_command
 from service.estimation.calibration import TileCalibration
 from service.protocol import LinkCloseCode
-from service.server.broadcast.summary import PendingUpdate, summarize_force, summarize_frames
+from service.server.broadcast.history import reduce_tiles, summarize_force
+from service.server.broadcast.summary import PendingUpdate, summarize_frames
 from service.server.server import Server
 from storage.schema import COLUMNS_BY_NAME
 from tests.builders.frames import make_frames
@@ -213,9 +214,9 @@ def test_every_route_is_documented() -> None:
 def test_every_live_message_field_is_documented() -> None:
     summary = PendingUpdate()
     frames = make_frames(1, 1)
-    summary.join_summary_or_drop_older(
-        "node", summarize_frames("0" * 32, summarize_force(frames, {}), frames, {})
-    )
+    span, tiles = summarize_force(frames, {}), reduce_tiles({}, 1)
+    piece = summarize_frames("0" * 32, span, tiles, frames, {})
+    summary.join_summary_or_drop_older("node", piece)
     (text,) = summary.pop_update().encode_messages({"node": 1.0})
     frame = json.loads(text)
     for name in frame:

@@ -27,7 +27,10 @@ from storage.sessions.pyramid import (
     Bins,
     MergedBins,
     build_levels,
+    choose_frames_in_bin,
+    count_bins,
     merge_bins_within_parts,
+    select_bins,
 )
 
 GAP_STEPS = 3.5
@@ -79,16 +82,14 @@ class ComparisonSeries:
             StorageError: it cannot be read now.
         """
         for above in reversed(range(len(self._levels))):
-            found = _slice_bins(self._levels[above], begin_ns, end_ns)
+            found = select_bins(self._levels[above], begin_ns, end_ns)
             if len(found["frames"]) >= min_bins:
                 return MergedBins(found, FRAMES_PER_FINEST_BIN * BINS_PER_COARSER_BIN**above)
         bins = _make_bins(
             read_comparison_series_range(self._folder, self._footer, begin_ns, end_ns), self._gap_ns
         )
-        size = 1
-        while len(bins["frames"]) // (size * BINS_PER_COARSER_BIN) >= min_bins:
-            size *= BINS_PER_COARSER_BIN
-        return MergedBins(bins if size == 1 else merge_bins_within_parts(bins, size), size)
+        size = choose_frames_in_bin(count_bins(bins), min_bins)
+        return MergedBins(merge_bins_within_parts(bins, size), size)
 
 
 class ComparisonSeriesCache:
@@ -137,10 +138,3 @@ def _make_bins(table: pa.Table, gap_ns: float) -> Bins:
     for name, column in values.items():
         bins |= {f"{name}_min": column, f"{name}_max": column}
     return bins
-
-
-def _slice_bins(bins: Bins, begin_ns: int | None, end_ns: int | None) -> Bins:
-    """Return the bins with frames in an interval; they are in its order."""
-    first = 0 if begin_ns is None else int(np.searchsorted(bins["t_last_ns"], begin_ns))
-    end = None if end_ns is None else int(np.searchsorted(bins["t_first_ns"], end_ns))
-    return {name: values[first:end] for name, values in bins.items()}

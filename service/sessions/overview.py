@@ -28,13 +28,11 @@ from storage.sessions.overview import (
 from storage.sessions.pyramid import (
     BINS_PER_COARSER_BIN,
     FRAMES_PER_FINEST_BIN,
+    BinBuilder,
     Bins,
-    PyramidBuilder,
     bin_column_types,
     bin_source_columns,
-    concatenate_bins,
-    make_single_frame_bins,
-    merge_bins_within_parts,
+    choose_frames_in_bin,
     shift_bins_to_axis,
 )
 from storage.sessions.reader import SealedFileReader
@@ -60,7 +58,7 @@ class OverviewWriter:
     def __init__(self, tiles: int) -> None:
         self.problem: str | None = None
         self._tiles = tiles
-        self._pyramid = PyramidBuilder()
+        self._pyramid = BinBuilder(FRAMES_PER_FINEST_BIN)
 
     def try_add_frames(self, frames: FrameBatch, columns: Mapping[str, Array]) -> None:
         """Add the next frames with their columns."""
@@ -82,7 +80,7 @@ class OverviewWriter:
         if self.problem is not None:
             return
         try:
-            levels = self._pyramid.finish()
+            levels = self._pyramid.pop_levels()
             path = folder / OVERVIEW_NAME
             write_overview(path, levels, tile_count=self._tiles, frames_sha256=frames_sha256)
         except Exception as error:
@@ -171,48 +169,31 @@ def _bins_from_frames(
     session: SealedFileReader, part: Slice, begin_ns: int, points: int, rows: int
 ) -> tuple[Bins, int]:
     """Return bins of 16, 4 or 1 frames, and the frames per bin."""
-    size = 1
-    while rows // (size * BINS_PER_COARSER_BIN) >= points:
-        size *= BINS_PER_COARSER_BIN
-    estimated = session.has_columns("grf_n")
-    names = bin_source_columns(has_estimates=estimated)
-    if session.has_columns("part"):
-        names += ("part",)
-    types = bin_column_types(len(session.info.tiles), has_estimates=estimated)
-    found: list[Bins] = [{name: np.empty(0, type_) for name, type_ in types.items()}]
-    last: tuple[int, int] | None = None
+    builder = BinBuilder(choose_frames_in_bin(rows, points))
+    names = _list_source_columns(session)
     groups = session.find_overlapping_row_groups(*part.compute_bounds_ns(begin_ns))
     for piece in session.read_quantities(*names, row_groups=groups, max_values=_VALUES_MAX):
         inside = part.compute_row_mask(
             session.time_axis.shift_to_axis(piece["t_ns"], piece.get("part")), begin_ns
         )
-        frames = {name: values[inside] for name, values in piece.items()}
-        if not len(frames["seq"]):
-            continue
-        first_part = int(frames["part"][0]) if "part" in frames else 0
-        before = last[1] if last is not None and last[0] == first_part else None
-        found.append(make_single_frame_bins(frames, before))
-        last = int(frames["part"][-1]) if "part" in frames else 0, int(frames["seq"][-1])
-    bins = shift_bins_to_axis(
-        concatenate_bins([{name: piece[name] for name in types} for piece in found]),
-        session.time_axis,
-    )
-    return (bins if size == 1 else merge_bins_within_parts(bins, size)), size
+        builder.add_frames({name: values[inside] for name, values in piece.items()})
+    types = bin_column_types(len(session.info.tiles), has_estimates="grf_n" in names)
+    bins = builder.get_bins() or {name: np.empty(0, type_) for name, type_ in types.items()}
+    bins = shift_bins_to_axis({name: bins[name] for name in types}, session.time_axis)
+    return bins, builder.frames_in_bin
 
 
-def _build_pyramid(session: SealedFileReader) -> PyramidBuilder:
-    pyramid = PyramidBuilder()
-    names = bin_source_columns(has_estimates=session.has_columns("grf_n"))
-    for piece in session.read_quantities(
-        *names, *(("part",) if session.has_columns("part") else ())
-    ):
-        pyramid.add_frames(piece)
-    return pyramid
+def _list_source_columns(session: SealedFileReader) -> tuple[str, ...]:
+    part = ("part",) if session.has_columns("part") else ()
+    return *bin_source_columns(has_estimates=session.has_columns("grf_n")), *part
 
 
 def _rebuild(path: Path, session: SealedFileReader, frames_sha256: str) -> OverviewReader:
     """Rebuild the overview, and store it if the folder is writable."""
-    levels, tiles = _build_pyramid(session).finish(), len(session.info.tiles)
+    pyramid, tiles = BinBuilder(FRAMES_PER_FINEST_BIN), len(session.info.tiles)
+    for piece in session.read_quantities(*_list_source_columns(session)):
+        pyramid.add_frames(piece)
+    levels = pyramid.pop_levels()
     try:
         write_overview(path, levels, tile_count=tiles, frames_sha256=frames_sha256)
         return open_overview(path)

@@ -35,7 +35,8 @@ from storage.durable_files import ScratchBlock, ScratchFile
 from storage.formats.slice import Slice
 from storage.schema import Array
 from storage.sessions.pyramid import (
-    PreviewBins,
+    MAX_PREVIEW_BINS,
+    BinBuilder,
     bin_source_columns,
     select_and_downsample_bins,
     shift_bins_to_axis,
@@ -192,7 +193,7 @@ class SessionPreview:
     def __init__(self, inputs: SessionInputs, folder: Path) -> None:
         self.checkpoints = Checkpoints(folder)
         self._inputs = inputs
-        self._bins = PreviewBins()
+        self._bins = BinBuilder(max_bins=MAX_PREVIEW_BINS)
         self._stream = make_preview_stream(inputs)
         self._position = Checkpoint()
         self._repeated_frames = 0

@@ -32,6 +32,7 @@ from storage.sessions.pyramid import (
     Bins,
     bin_column_types,
     concatenate_bins,
+    select_bins,
     shift_bins_to_axis,
 )
 from storage.sessions.time_axis import NODE_AXIS, TimeAxis
@@ -289,12 +290,7 @@ class OverviewReader:
         found = [{name: np.empty(0, type_) for name, type_ in types.items()}]
         for i in self._find_pieces(level, begin_ns, end_ns, axis):
             piece = shift_bins_to_axis(self._read_piece(i, list(types)), axis)
-            rows = np.ones(len(piece["part"]), dtype=np.bool_)
-            if begin_ns is not None:
-                rows &= piece["t_last_ns"] >= begin_ns
-            if end_ns is not None:
-                rows &= piece["t_first_ns"] < end_ns
-            found.append({name: values[rows] for name, values in piece.items()})
+            found.append(select_bins(piece, begin_ns, end_ns))
         return concatenate_bins(found)
 
     def _find_pieces(

@@ -178,7 +178,7 @@ class MergedBins(NamedTuple):
 
 def merge_bins_within_parts(bins: Bins, group_size: int) -> Bins:
     """Merge `group_size` bins at a time, or fewer at the end of a part."""
-    if not len(bins["part"]):
+    if not count_bins(bins) or group_size == 1:
         return bins
     return _merge_groups(bins, _find_group_starts(bins["part"], group_size))
 
@@ -231,68 +231,6 @@ def shift_bins_to_axis(bins: Bins, axis: TimeAxis) -> Bins:
     return bins | {name: axis.shift_to_axis(bins[name], bins["part"]) for name in names}
 
 
-class PyramidBuilder:
-    """Builder of a pyramid of bins from consecutive frames.
-
-    The bins do not depend on how frames are cut into pieces.
-    """
-
-    def __init__(self) -> None:
-        self._full_bins: list[Bins] = []
-        self._open_frames: list[Bins] = []
-        """Single frames of a bin that is not full yet."""
-        self._last_frame: tuple[int, int] | None = None
-        """Part and number of the last frame."""
-
-    def add_frames(self, frames: Mapping[str, Array]) -> None:
-        """Add the next frames: `bin_source_columns`, and `part` if there are several."""
-        if not len(frames["seq"]):
-            return
-        part = int(frames["part"][0]) if "part" in frames else 0
-        follows = self._last_frame is not None and self._last_frame[0] == part
-        before = self._last_frame[1] if follows and self._last_frame is not None else None
-        last = int(frames["part"][-1]) if "part" in frames else 0
-        self._last_frame = last, int(frames["seq"][-1])
-        self._open_frames.append(make_single_frame_bins(frames, before))
-        if sum(len(piece["part"]) for piece in self._open_frames) >= FRAMES_PER_FINEST_BIN:
-            self._merge_full_bins()
-
-    def get_finest_level(self) -> Bins | None:
-        """Return all bins until now, the last one perhaps not full; None before the first frame."""
-        rest = (
-            [merge_bins_within_parts(concatenate_bins(self._open_frames), FRAMES_PER_FINEST_BIN)]
-            if self._open_frames
-            else []
-        )
-        pieces = [*self._full_bins, *rest]
-        return concatenate_bins(pieces) if pieces else None
-
-    def finish(self) -> list[Bins]:
-        """End the pyramid and return its levels, the finest first; the builder is empty then."""
-        if self._open_frames:
-            self._full_bins.append(
-                merge_bins_within_parts(concatenate_bins(self._open_frames), FRAMES_PER_FINEST_BIN)
-            )
-        pieces, self._full_bins, self._open_frames = self._full_bins, [], []
-        return build_levels(_concatenate_and_release(pieces)) if pieces else []
-
-    def _merge_full_bins(self) -> None:
-        frames = concatenate_bins(self._open_frames)
-        starts, n = _find_group_starts(frames["part"], FRAMES_PER_FINEST_BIN), len(frames["part"])
-        self._open_frames = []
-        if n - starts[-1] < FRAMES_PER_FINEST_BIN:
-            last, starts = int(starts[-1]), starts[:-1]
-            self._open_frames = [{name: values[last:].copy() for name, values in frames.items()}]
-            frames = {name: values[:last] for name, values in frames.items()}
-        if len(starts):
-            self._full_bins.append(_merge_groups(frames, starts))
-
-
-def _concatenate_and_release(pieces: list[Bins]) -> Bins:
-    """Concatenate bins; their columns are released one by one, to save memory."""
-    return {name: np.concatenate([piece.pop(name) for piece in pieces]) for name in list(pieces[0])}
-
-
 def build_levels(finest: Bins) -> list[Bins]:
     """Return a level and its coarser ones, until one has at most `MAX_COARSEST_BINS` bins."""
     levels = [finest]
@@ -305,28 +243,32 @@ def build_levels(finest: Bins) -> list[Bins]:
 
 
 MAX_PREVIEW_BINS = 16_384
-"""Most stored bins: with eight tiles 178 bytes each, with 64 tiles 682."""
+"""Most bins of a preview: with eight tiles 178 bytes each, with 64 tiles 682."""
 _MIN_MERGED_FRAMES = 1024
 """Frames that are merged at a time."""
 
 
-_NONE = np.empty(0, np.int64)
+class BinBuilder:
+    """Builder of bins from consecutive frames.
 
+    The bins do not depend on how frames are cut into pieces, unless there are too many.
 
-class PreviewBins:
-    """Bins of consecutive frames, at most `max_bins`; each covers more frames as the session grows.
+    Args:
+        frames_in_bin: frames per bin; 1: the bins are single frames.
+        max_bins: beyond it, bins are merged to coarser ones; None: no limit.
 
     Attributes:
-        frames_in_bin: frames per bin; 1: the bins are single frames.
+        frames_in_bin: frames per bin by now.
         frame_count: number of added frames.
     """
 
-    def __init__(self, max_bins: int = MAX_PREVIEW_BINS) -> None:
-        self.frames_in_bin = 1
+    def __init__(self, frames_in_bin: int = 1, max_bins: int | None = None) -> None:
+        self.frames_in_bin = frames_in_bin
         self.frame_count = 0
-        self._most = max_bins
+        self._max_bins = max_bins
         self._bins: list[Bins] = []
         self._pending: list[Bins] = []
+        """Single frames that are not merged yet."""
         self._last_frame: tuple[int, int] | None = None
         """Part and number of the last frame."""
 
@@ -334,29 +276,22 @@ class PreviewBins:
         """Add the next frames, apart from leading ones that were added before.
 
         Args:
-            frames: `storage.sessions.pyramid.bin_source_columns`, and `part`.
+            frames: `bin_source_columns`, and `part` if there are several.
             already_added: number of leading frames that were added before, at most all.
         """
         if already_added:
-            self._last_frame = (
-                int(frames["part"][already_added - 1]),
-                int(frames["seq"][already_added - 1]),
-            )
+            self._last_frame = _frame_at(frames, already_added - 1)
             frames = {name: values[already_added:] for name, values in frames.items()}
         if not len(frames["seq"]):
             return
-        part = int(frames["part"][0])
-        before = (
-            self._last_frame[1]
-            if self._last_frame is not None and self._last_frame[0] == part
-            else None
+        part, _ = _frame_at(frames, 0)
+        last_part, last_seq = self._last_frame or (None, None)
+        self._pending.append(
+            make_single_frame_bins(frames, last_seq if last_part == part else None)
         )
-        self._last_frame = int(frames["part"][-1]), int(frames["seq"][-1])
-        self._pending.append(make_single_frame_bins(frames, before))
+        self._last_frame = _frame_at(frames, -1)
         self.frame_count += len(frames["seq"])
-        if sum(_count_bins(piece) for piece in self._pending) >= max(
-            _MIN_MERGED_FRAMES, self.frames_in_bin
-        ):
+        if sum(map(count_bins, self._pending)) >= max(_MIN_MERGED_FRAMES, self.frames_in_bin):
             self._merge_full_bins()
 
     def truncate_to_full_bins_and_forget_seq(self, max_frames: int) -> int:
@@ -366,7 +301,7 @@ class PreviewBins:
             The number of frames left. The last of them has to be added again before the next one.
         """
         bins = concatenate_bins(self._bins) if self._bins else None
-        ends = np.cumsum(bins["frames"], dtype=np.int64) if bins is not None else _NONE
+        ends = np.cumsum(bins["frames"] if bins is not None else [], dtype=np.int64)
         count = int(np.searchsorted(ends, max_frames, side="right"))
         self._bins = [_copy_rows(bins, 0, count)] if bins is not None and count else []
         self._pending, self._last_frame = [], None
@@ -375,49 +310,76 @@ class PreviewBins:
 
     def get_bins(self) -> Bins | None:
         """Return all bins until now, the last one perhaps not full; None before the first frame."""
-        rest = [self._merge_to_bins(concatenate_bins(self._pending))] if self._pending else []
-        pieces = [*self._bins, *rest]
+        pieces = self._get_pieces()
         return concatenate_bins(pieces) if pieces else None
 
-    def _merge_to_bins(self, frames: Bins) -> Bins:
-        return (
-            frames
-            if self.frames_in_bin == 1
-            else merge_bins_within_parts(frames, self.frames_in_bin)
+    def pop_levels(self) -> list[Bins]:
+        """Return the levels of all bins, the finest first; the builder is empty then."""
+        pieces = self._get_pieces()
+        self._bins, self._pending = [], []
+        if not pieces:
+            return []
+        # Columns are released one by one, to save memory.
+        names = list(pieces[0])
+        return build_levels(
+            {name: np.concatenate([piece.pop(name) for piece in pieces]) for name in names}
         )
+
+    def _get_pieces(self) -> list[Bins]:
+        if not self._pending:
+            return [*self._bins]
+        rest = merge_bins_within_parts(concatenate_bins(self._pending), self.frames_in_bin)
+        return [*self._bins, rest]
 
     def _merge_full_bins(self) -> None:
         """Merge pending frames, except those of a bin that is not full yet."""
         frames = concatenate_bins(self._pending)
-        last = int(_find_group_starts(frames["part"], self.frames_in_bin)[-1])
-        end = len(frames["part"])
-        full = end if end - last == self.frames_in_bin else last
+        starts, end = _find_group_starts(frames["part"], self.frames_in_bin), count_bins(frames)
+        full = end if end - starts[-1] == self.frames_in_bin else int(starts[-1])
         self._pending = [_copy_rows(frames, full, end)] if full < end else []
         if full:
-            self._bins.append(self._merge_to_bins(_copy_rows(frames, 0, full)))
-        if sum(map(_count_bins, self._bins)) > self._most:
+            whole = {name: values[:full] for name, values in frames.items()}
+            is_single = self.frames_in_bin == 1
+            self._bins.append(whole if is_single else _merge_groups(whole, starts[starts < full]))
+        if self._max_bins is not None and sum(map(count_bins, self._bins)) > self._max_bins:
             self._bins = [
                 merge_bins_within_parts(concatenate_bins(self._bins), BINS_PER_COARSER_BIN)
             ]
             self.frames_in_bin *= BINS_PER_COARSER_BIN
 
 
-def select_and_downsample_bins(
-    bins: Bins, begin_ns: int | None, end_ns: int | None, max_bins: int
-) -> MergedBins:
-    """Return a time range's bins, merged to about `max_bins`."""
-    rows = np.ones(_count_bins(bins), dtype=np.bool_)
+def _frame_at(frames: Mapping[str, Array], row: int) -> tuple[int, int]:
+    """Return part and number of a frame."""
+    return int(frames["part"][row]) if "part" in frames else 0, int(frames["seq"][row])
+
+
+def choose_frames_in_bin(frame_count: int, min_bins: int) -> int:
+    """Return the most frames per bin, 1 or a power of 4, with which there are enough bins."""
+    size = 1
+    while frame_count // (size * BINS_PER_COARSER_BIN) >= min_bins:
+        size *= BINS_PER_COARSER_BIN
+    return size
+
+
+def select_bins(bins: Bins, begin_ns: int | None, end_ns: int | None) -> Bins:
+    """Return the bins with frames in a time range; None: no bound."""
+    rows = np.ones(count_bins(bins), dtype=np.bool_)
     if begin_ns is not None:
         rows &= bins["t_last_ns"] >= begin_ns
     if end_ns is not None:
         rows &= bins["t_first_ns"] < end_ns
-    found, count = {name: values[rows] for name, values in bins.items()}, 1
-    while _count_bins(found) > max_bins:
-        found, count = (
-            merge_bins_within_parts(found, BINS_PER_COARSER_BIN),
-            count * BINS_PER_COARSER_BIN,
-        )
-        if count > len(rows):  # parts of a bin each
+    return {name: values[rows] for name, values in bins.items()}
+
+
+def select_and_downsample_bins(
+    bins: Bins, begin_ns: int | None, end_ns: int | None, max_bins: int
+) -> MergedBins:
+    """Return a time range's bins, merged to about `max_bins`."""
+    found, count = select_bins(bins, begin_ns, end_ns), 1
+    while count_bins(found) > max_bins:
+        found = merge_bins_within_parts(found, BINS_PER_COARSER_BIN)
+        count *= BINS_PER_COARSER_BIN
+        if count > count_bins(bins):  # parts of a bin each
             break
     return MergedBins(found, count)
 
@@ -426,5 +388,6 @@ def _copy_rows(bins: Bins, begin: int, end: int) -> Bins:
     return {name: values[begin:end].copy() for name, values in bins.items()}
 
 
-def _count_bins(bins: Bins) -> int:
+def count_bins(bins: Bins) -> int:
+    """Count bins."""
     return len(bins["part"])

@@ -11,7 +11,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from devices.types import check_user_name
 from service.api.routes.common import ServerState, parse_if_match, problem_responses
-from service.server.broadcast.summary import SECONDS_MAX, ForceSpan, round_values
+from service.server.broadcast.history import SECONDS_MAX, TILE_QUANTITIES, ForceSpan
+from service.server.broadcast.summary import round_values
 from service.server.broadcast.views import DriftView, NodeView, Page, TaresPage, TareView, View
 from service.server.node import ServerNode
 from service.server.server import Server
@@ -147,7 +148,7 @@ async def get_history(
     came since the server was started; where frames are missing, numbers are missing.
     """
     the_node = server.nodes.get(node)
-    rows = server.broadcaster.get_present_stream_force_history(the_node).get_newest_spans(
+    rows = server.broadcaster.get_present_stream_history(the_node).get_force_spans(
         query.seconds, query.before_seq
     )
     age_ms = server.broadcaster.newest_frame_age_ms(the_node)
@@ -169,13 +170,11 @@ async def get_history(
 def _make_tiles_view(
     node: ServerNode, query: RecentQuery, unit: str, server: Server
 ) -> RecentTilesView:
-    recent = server.broadcaster.get_present_stream_tile_history(node)
-    spans = recent.get_newest_spans(query.seconds, unit, query.before_seq)
-    least, greatest = (
-        [_round_four_digits(row) for row in values.tolist()]
-        for values in (spans.minimum, spans.maximum)
-    )
-    numbers = {name: spans.rows[name].tolist() for name in ("seq_first", "seq", "n", "t_ns")}
+    history = server.broadcaster.get_present_stream_history(node)
+    spans = history.get_tile_spans(query.seconds, query.before_seq)
+    extremes = spans["extremes"][:, :, TILE_QUANTITIES.index(unit)].swapaxes(0, 1)
+    least, greatest = ([_round_four_digits(row) for row in rows] for rows in extremes.tolist())
+    numbers = {name: spans[name].tolist() for name in ("seq_first", "seq", "n", "t_ns")}
     return RecentTilesView(min=least, max=greatest, **numbers)
 
 

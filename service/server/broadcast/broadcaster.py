@@ -4,114 +4,22 @@ Subscribers of the same nodes at the same rate share a rate group: its update is
 and framed once per tick, and written to each without waiting. A subscriber that has not read the
 last update gets nothing more: its updates are merged until it reads, or until it is disconnected.
 Others are not affected.
-
-The history of a tile has minimum and maximum, so that no peak hides; in half precision, to 0.05 %
-of the value, which no plot shows. Memory: 5 kB per tile and 20 kB for the frames' numbers.
 """
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
-import numpy as np
-import numpy.typing as npt
 from websockets.frames import Frame, Opcode
 
 from service.protocol import CloseConnection, LinkCloseCode
-from service.server.broadcast.summary import (
-    SECONDS_MAX,
-    ForceHistory,
-    ForceSpan,
-    PendingUpdate,
-    encode_json,
-    select_newest_spans,
-    summarize_force,
-    summarize_frames,
-)
+from service.server.broadcast.history import StreamHistory, reduce_tiles, summarize_force
+from service.server.broadcast.summary import PendingUpdate, encode_json, summarize_frames
 from service.server.estimates.node_estimator import EstimatedBatch
 from service.server.node import ServerNode
 from service.server_clock import server_utc_ns
-
-TILE_QUANTITIES = ("force_n", "gauge_kpa")
-TILE_SPAN_PERIOD_NS = 100_000_000
-_TILE_SPANS_MAX = int(SECONDS_MAX * 1e9) // TILE_SPAN_PERIOD_NS + 2
-_TILE_SPAN_ROW = np.dtype([(name, np.int64) for name in ("seq_first", "seq", "n", "t_ns")])
-_HALF_MAX = float(np.finfo(np.float16).max)
-Halves = npt.NDArray[np.float16]
-
-
-class TileSpans(NamedTuple):
-    """Merged spans: `seq_first`, `seq`, `n` and `t_ns` as of `ForceSpan`, (n,), and extremes.
-
-    Extremes are (n, tiles), in N or kPa by the quantity; NaN where unknown.
-    """
-
-    rows: npt.NDArray[np.void]
-    minimum: Halves
-    maximum: Halves
-
-
-class TileHistory:
-    """Tile extremes over the last minute of a node.
-
-    Args:
-        stream_id: stream of the frames.
-        tile_count: number of tiles.
-    """
-
-    def __init__(self, stream_id: str, tile_count: int) -> None:
-        self.stream_id = stream_id
-        self.tile_count = tile_count
-        self._rows = np.zeros(_TILE_SPANS_MAX, _TILE_SPAN_ROW)
-        self._extremes: Halves = np.zeros(
-            (_TILE_SPANS_MAX, 2, len(TILE_QUANTITIES), tile_count), np.float16
-        )
-        self._count = 0
-        """Number of spans ever started in the two rings."""
-        self._span_begin_ns = 0
-
-    def add_frames(self, span: ForceSpan, columns: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Merge published frames into each tile's minimum and maximum."""
-        unknown = np.full((1, self.tile_count), np.nan)
-        quantities = [
-            columns.get(name, unknown).clip(-_HALF_MAX, _HALF_MAX) for name in TILE_QUANTITIES
-        ]
-        least, greatest = (
-            np.array([pick.reduce(values, axis=0) for values in quantities], np.float16)
-            for pick in (np.fmin, np.fmax)
-        )
-        if self._count and span.t_ns_first - self._span_begin_ns < TILE_SPAN_PERIOD_NS:
-            index = (self._count - 1) % _TILE_SPANS_MAX
-            row, extremes = self._rows[index], self._extremes[index]
-            row["seq"], row["n"], row["t_ns"] = span.seq, row["n"] + span.n, span.t_ns
-            np.fmin(extremes[0], least, out=extremes[0])
-            np.fmax(extremes[1], greatest, out=extremes[1])
-            return
-        index, self._span_begin_ns = self._count % _TILE_SPANS_MAX, span.t_ns_first
-        self._rows[index] = span.seq_first, span.seq, span.n, span.t_ns
-        self._extremes[index] = least, greatest
-        self._count += 1
-
-    def get_newest_spans(
-        self, seconds: float, quantity: str, before_seq: int | None = None
-    ) -> TileSpans:
-        """Return the newest seconds, oldest first.
-
-        Args:
-            seconds: counted back from the newest frame.
-            quantity: one of `TILE_QUANTITIES`.
-            before_seq: only spans that begin before this number.
-        """
-        indices = np.arange(max(0, self._count - _TILE_SPANS_MAX), self._count) % _TILE_SPANS_MAX
-        rows = self._rows[indices]
-        keep = select_newest_spans(rows, seconds, before_seq)
-        least, greatest = self._extremes[
-            indices[keep], :, TILE_QUANTITIES.index(quantity)
-        ].swapaxes(0, 1)
-        return TileSpans(rows[keep], least, greatest)
-
 
 RATES_HZ = (1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 60.0)
 """Update rates; a requested rate is rounded down."""
@@ -227,8 +135,7 @@ class Broadcaster:
         self._groups: dict[tuple[str | None, float], tuple[RateGroup, asyncio.Task[None]]] = {}
         self._nodes: dict[str, ServerNode] = {}
         """Nodes that have sent frames."""
-        self._force_histories: dict[str, ForceHistory] = {}
-        self._tile_histories: dict[str, TileHistory] = {}
+        self._histories: dict[str, StreamHistory] = {}
 
     @property
     def subscriber_count(self) -> int:
@@ -276,33 +183,28 @@ class Broadcaster:
             summary.add_progress(node, progress_by_session)
 
     def add_to_history_and_updates(self, node: ServerNode, batches: list[EstimatedBatch]) -> None:
-        """Add estimated frames of a node to its histories and to the next updates."""
+        """Add estimated frames of a node to its history and to the next updates."""
         self._nodes[node.name] = node
         for frames, columns in batches:
             node.published_t_ns = int(frames.t_ns[-1])
-            span = summarize_force(frames, columns)
-            self.get_present_stream_force_history(node).add_span(span)
-            self._get_tile_history(node, frames.tile_count).add_frames(span, columns)
+            span, tiles = (
+                summarize_force(frames, columns),
+                reduce_tiles(columns, frames.tile_count),
+            )
+            self._get_history(node, frames.tile_count).add_span(span, tiles)
             if self._groups:
-                piece = summarize_frames(node.stream_id, span, frames, columns)
+                piece = summarize_frames(node.stream_id, span, tiles, frames, columns)
                 for summary in self._pending_updates():
                     summary.join_summary_or_drop_older(node.name, piece)
 
-    def get_present_stream_force_history(self, node: ServerNode) -> ForceHistory:
-        """Return the force history of a node's present stream, in place of another stream's."""
-        recent = self._force_histories.get(node.name)
+    def get_present_stream_history(self, node: ServerNode) -> StreamHistory:
+        """Return the history of a node's present stream, in place of another stream's."""
+        return self._get_history(node, len(node.last_info.tiles))
+
+    def _get_history(self, node: ServerNode, tile_count: int) -> StreamHistory:
+        recent = self._histories.get(node.name)
         if recent is None or recent.stream_id != node.stream_id:
-            recent = self._force_histories[node.name] = ForceHistory(node.stream_id)
-        return recent
-
-    def get_present_stream_tile_history(self, node: ServerNode) -> TileHistory:
-        """Return the tile history of a node's present stream, in place of another stream's."""
-        return self._get_tile_history(node, len(node.last_info.tiles))
-
-    def _get_tile_history(self, node: ServerNode, tiles: int) -> TileHistory:
-        recent = self._tile_histories.get(node.name)
-        if recent is None or (recent.stream_id, recent.tile_count) != (node.stream_id, tiles):
-            recent = self._tile_histories[node.name] = TileHistory(node.stream_id, tiles)
+            recent = self._histories[node.name] = StreamHistory(node.stream_id, tile_count)
         return recent
 
     def newest_frame_age_ms(self, node: ServerNode) -> float | None:

@@ -29,7 +29,12 @@ from storage.formats.slice import Slice
 from storage.formats.writers.registry import FORMATS
 from storage.journal.journal import Journal
 from storage.sessions.folder import Part, Session
-from storage.sessions.pyramid import PreviewBins, bin_source_columns, shift_bins_to_axis
+from storage.sessions.pyramid import (
+    MAX_PREVIEW_BINS,
+    BinBuilder,
+    bin_source_columns,
+    shift_bins_to_axis,
+)
 from tests.builders.arrays import PERIOD_NS
 from tests.builders.frames import make_frames
 from tests.service.sessions.pieces import array, calibration, hopping
@@ -193,7 +198,7 @@ def test_any_slice_at_any_moment_is_that_of_the_whole_in_one_go(
 def assert_the_overview_is_as_in_one_go(so_far: SessionPreview, sources: SessionInputs) -> None:
     stream = make_preview_stream(sources)
     raw = iterate_raw_frames_with_part(sources)
-    wanted = PreviewBins()
+    wanted = BinBuilder(max_bins=MAX_PREVIEW_BINS)
     for frames, columns in raw if stream is None else stream.estimate_batches(raw, is_final=False):
         names = bin_source_columns(has_estimates=stream is not None)
         own = {name: getattr(frames, name) for name in names if name not in columns}

@@ -20,9 +20,8 @@ from storage.sessions.pyramid import (
     CONTACT_UNCERTAIN,
     FRAMES_PER_FINEST_BIN,
     MAX_COARSEST_BINS,
+    BinBuilder,
     Bins,
-    PreviewBins,
-    PyramidBuilder,
     bin_column_types,
     bin_source_columns,
     build_levels,
@@ -64,8 +63,8 @@ def rows(columns: Mapping[str, Any], begin: int, end: int) -> dict[str, Any]:
     return {name: values[begin:end] for name, values in columns.items()}
 
 
-def gathered(columns: Mapping[str, Any], cuts: Sequence[int] = ()) -> PyramidBuilder:
-    pyramid = PyramidBuilder()
+def gathered(columns: Mapping[str, Any], cuts: Sequence[int] = ()) -> BinBuilder:
+    pyramid = BinBuilder(FRAMES_PER_FINEST_BIN)
     edges = [0, *sorted(cuts), len(columns["seq"])]
     for begin, end in itertools.pairwise(edges):
         pyramid.add_frames(rows(columns, begin, end))
@@ -89,7 +88,7 @@ def test_bins_of_any_pieces_are_those_computed_one_by_one(
 ) -> None:
     n = sum(parts)
     columns = frames(n, seed, parts)
-    found = gathered(columns, [cut for cut in cuts if cut < n]).get_finest_level()
+    found = gathered(columns, [cut for cut in cuts if cut < n]).get_bins()
     assert found is not None
     assert set(found) == set(bin_column_types(TILES, has_estimates=True))
     at = 0
@@ -151,7 +150,7 @@ def test_each_level_has_the_extremes_of_the_frames() -> None:
             FRAMES_PER_FINEST_BIN * MAX_COARSEST_BINS - 7,
         ),
     )
-    finest = gathered(columns).get_finest_level()
+    finest = gathered(columns).get_bins()
     assert finest is not None
     levels = build_levels(finest)
     assert [len(level["part"]) for level in levels[1:]] == [
@@ -167,7 +166,7 @@ def test_each_level_has_the_extremes_of_the_frames() -> None:
 
 def test_levels_end_where_parts_have_one_bin_each() -> None:
     columns = frames(MAX_COARSEST_BINS + 10, parts=(1,) * (MAX_COARSEST_BINS + 10))
-    finest = gathered(columns).get_finest_level()
+    finest = gathered(columns).get_bins()
     assert finest is not None
     assert [len(level["part"]) for level in build_levels(finest)] == [MAX_COARSEST_BINS + 10]
 
@@ -182,7 +181,7 @@ def test_unread_counts_are_no_extremes() -> None:
     columns["pressure_raw"] = np.tile(np.array([500, 400], dtype=np.uint16), (n, 1))
     columns["pressure_raw"][3:5, 0] = NOT_READ, 510
     columns["pressure_raw"][FRAMES_PER_FINEST_BIN:, 1] = NOT_READ
-    found = gathered(columns).get_finest_level()
+    found = gathered(columns).get_bins()
     assert found is not None
     assert set(found) == set(bin_column_types(TILES, has_estimates=False))
     assert found["pressure_raw_0_min"].tolist() == [500, 500]
@@ -192,10 +191,10 @@ def test_unread_counts_are_no_extremes() -> None:
 
 
 def test_without_a_frame_there_is_nothing() -> None:
-    pyramid = PyramidBuilder()
+    pyramid = BinBuilder(FRAMES_PER_FINEST_BIN)
     pyramid.add_frames(rows(frames(10), 0, 0))
-    assert pyramid.get_finest_level() is None
-    assert pyramid.finish() == []
+    assert pyramid.get_bins() is None
+    assert pyramid.pop_levels() == []
 
 
 @pytest.mark.parametrize("estimated", [True, False])
@@ -204,7 +203,7 @@ def test_every_column_of_a_bin_has_its_type(estimated: bool) -> None:
     if not estimated:
         columns = {n: columns[n] for n in bin_source_columns(has_estimates=False) if n in columns}
         columns["pressure_raw"] = np.full((200, TILES), 500, dtype=np.uint16)
-    found = gathered(columns).get_finest_level()
+    found = gathered(columns).get_bins()
     assert found is not None
     for name, type_ in bin_column_types(TILES, has_estimates=estimated).items():
         assert np.can_cast(found[name].dtype, type_, casting="same_kind"), name
@@ -229,7 +228,7 @@ def raw_frames(first: int, n: int, part: int = 0) -> dict[str, Array]:
 
 @pytest.mark.parametrize("pieces", [(1500,), (64, 3, 7)])
 def test_a_longer_preview_is_coarser_and_keeps_extremes(pieces: tuple[int, ...]) -> None:
-    so_far = PreviewBins(max_bins=500)
+    so_far = BinBuilder(max_bins=500)
     at, i, sizes = 0, 0, set()
     while at < 12_000:
         n = pieces[i % len(pieces)]
@@ -257,7 +256,7 @@ def test_a_longer_preview_is_coarser_and_keeps_extremes(pieces: tuple[int, ...])
 
 
 def test_preview_bins_end_with_their_part_and_count_lost_frames() -> None:
-    so_far = PreviewBins(max_bins=100)
+    so_far = BinBuilder(max_bins=100)
     so_far.add_frames(raw_frames(0, 1030))
     so_far.add_frames(raw_frames(1040, 1030))
     so_far.add_frames(raw_frames(0, 2000, part=1))

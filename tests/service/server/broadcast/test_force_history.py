@@ -12,13 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.server.broadcast.summary import (
+from service.server.broadcast.history import (
     FORCE_SPAN_PERIOD_NS,
     SECONDS_MAX,
-    ForceHistory,
     ForceSpan,
+    StreamHistory,
     nan_max,
     nan_min,
+    reduce_tiles,
     summarize_force,
 )
 from tests.builders.arrays import PERIOD_NS
@@ -26,6 +27,7 @@ from tests.builders.frames import make_frames
 
 ONE = "1" * 32
 NAN = float("nan")
+UNKNOWN = reduce_tiles({}, 2)
 
 
 FORCES_N = np.random.default_rng(0).normal(50.0, 20.0, 50_000)
@@ -44,12 +46,12 @@ def span(first: int, n: int, *, period_ns: int = PERIOD_NS) -> ForceSpan:
     )
 
 
-def filled(runs: Sequence[tuple[int, int]], period_ns: int = PERIOD_NS) -> ForceHistory:
+def filled(runs: Sequence[tuple[int, int]], period_ns: int = PERIOD_NS) -> StreamHistory:
     """Runs of missing frames and frames."""
-    recent, seq = ForceHistory(ONE), 0
+    recent, seq = StreamHistory(ONE, 2), 0
     for gap, n in runs:
         seq += gap
-        recent.add_span(span(seq, n, period_ns=period_ns))
+        recent.add_span(span(seq, n, period_ns=period_ns), UNKNOWN)
         seq += n
     return recent
 
@@ -88,7 +90,7 @@ def test_not_a_number_is_neither_smaller_nor_greater(a: float, b: float) -> None
 def test_every_frame_is_in_one_span_with_its_force_between_least_and_greatest(
     runs: list[tuple[int, int]],
 ) -> None:
-    rows = filled(runs).get_newest_spans(SECONDS_MAX)
+    rows = filled(runs).get_force_spans(SECONDS_MAX)
     sent = np.concatenate(
         [
             np.arange(at, at + n)
@@ -118,7 +120,7 @@ def test_what_is_told_next_goes_on_where_it_ends(sizes: list[int], data: st.Data
     recent = filled([(0, n) for n in sizes])
     ends = np.cumsum([0, *sizes])
     told = data.draw(st.integers(max(0, len(sizes) - 30), len(sizes) - 1))  # of the last second
-    rows = recent.get_newest_spans(SECONDS_MAX, before_seq=int(ends[told]))
+    rows = recent.get_force_spans(SECONDS_MAX, before_seq=int(ends[told]))
     if told:
         assert rows["seq"][-1] == ends[told] - 1
         assert rows["seq_first"][0] == 0
@@ -127,7 +129,7 @@ def test_what_is_told_next_goes_on_where_it_ends(sizes: list[int], data: st.Data
 
 def test_older_spans_are_joined_and_the_newest_are_as_they_were_told() -> None:
     recent = filled([(0, 1)] * 5000)
-    rows = recent.get_newest_spans(SECONDS_MAX)
+    rows = recent.get_force_spans(SECONDS_MAX)
     apart_ns = np.diff(rows["t_ns_first"])
     assert (rows["n"][-100:] == 1).all()
     assert (apart_ns[:-130] >= FORCE_SPAN_PERIOD_NS).all()
@@ -137,23 +139,23 @@ def test_older_spans_are_joined_and_the_newest_are_as_they_were_told() -> None:
 @pytest.mark.parametrize("seconds", [0.5, 5.0, 10.0, 60.0])
 def test_so_many_seconds_are_given_as_were_asked_for(seconds: float) -> None:
     recent = filled([(0, 10)] * int(70e9 / (10 * PERIOD_NS)))
-    rows = recent.get_newest_spans(seconds)
+    rows = recent.get_force_spans(seconds)
     covered_s = (rows["t_ns"][-1] - rows["t_ns_first"][0]) * 1e-9
     assert seconds - 0.1 < covered_s < seconds + 0.1
 
 
 def test_before_a_number_of_long_ago_no_frame_lacks() -> None:
     recent = filled([(0, 1)] * 5000)
-    spans = recent.get_newest_spans(SECONDS_MAX)
+    spans = recent.get_force_spans(SECONDS_MAX)
     joined = spans[spans["n"] > 1][-1]
-    older = recent.get_newest_spans(SECONDS_MAX, before_seq=int(joined["seq"]))
+    older = recent.get_force_spans(SECONDS_MAX, before_seq=int(joined["seq"]))
     assert older["seq"][-1] == joined["seq"]
 
 
 def test_nothing_was_told_yet() -> None:
     assert (
-        len(ForceHistory(ONE).get_newest_spans(SECONDS_MAX))
-        == len(ForceHistory(ONE).get_newest_spans(1.0, before_seq=5))
+        len(StreamHistory(ONE, 2).get_force_spans(SECONDS_MAX))
+        == len(StreamHistory(ONE, 2).get_force_spans(1.0, before_seq=5))
         == 0
     )
 
@@ -161,12 +163,14 @@ def test_nothing_was_told_yet() -> None:
 @pytest.mark.parametrize(("frames", "gap"), [(10, 0), (1, 0), (1, 30)])
 def test_a_node_costs_180_kb_however_long_it_streams(frames: int, gap: int) -> None:
     base = span(0, frames)
-    recent, step = ForceHistory(ONE), frames + gap
+    recent, step = StreamHistory(ONE, 2), frames + gap
     for at in range(0, 32_000, step):
         t_ns = base.t_ns_first + at * PERIOD_NS
         times: dict[str, Any] = {"t_ns_first": t_ns, "t_ns": t_ns + (frames - 1) * PERIOD_NS}
         forces = dict.fromkeys(ForceSpan._fields[5:], float(at))
-        recent.add_span(base._replace(seq_first=at, seq=at + frames - 1, **(times | forces)))
-    kept = [recent._merged, *recent._as_published, *chain(*recent._as_published)]
-    assert len(recent.get_newest_spans(SECONDS_MAX)) > 900
+        recent.add_span(
+            base._replace(seq_first=at, seq=at + frames - 1, **(times | forces)), UNKNOWN
+        )
+    kept = [recent._forces.rows, *recent._as_published, *chain(*recent._as_published)]
+    assert len(recent.get_force_spans(SECONDS_MAX)) > 900
     assert 120_000 < sum(map(sys.getsizeof, kept)) < 180_000
