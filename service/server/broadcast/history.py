@@ -5,7 +5,7 @@ by minimum and maximum, and NaN counts as missing.
 
 The newest GRF spans are kept as published, so that live messages continue them without a seam;
 older ones are merged. Spans of tiles are in half precision, to 0.05 % of the value, which no plot
-shows. Memory of a stream is bounded: 180 kB, and 7 kB per tile.
+shows. Memory of a stream is bounded: 200 kB, and 5 kB per tile.
 """
 
 from __future__ import annotations
