@@ -17,7 +17,7 @@ import time
 from bisect import bisect_left
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -275,14 +275,7 @@ class SessionPreview:
         self.checkpoints.truncate(index + 1)
         place = all_[index]
         self.reset_repeated_work_timer(self)
-        self._position = Checkpoint(
-            place.part,
-            place.seq,
-            place.fed_frames,
-            place.estimated_frames,
-            place.newest_ns,
-            place.last_estimated,
-        )
+        self._position = replace(place, state=None, begin_ns=_EVER_NS, end_ns=-_EVER_NS)
         self._repeated_frames = kept_frames - place.estimated_frames
         self._inputs = inputs
 
@@ -335,16 +328,8 @@ class SessionPreview:
             position.fed_frames - self.checkpoints.checkpoints[-1].fed_frames
             >= self.checkpoints.distance_frames
         ):
-            place = Checkpoint(
-                position.part,
-                position.seq,
-                position.fed_frames,
-                position.estimated_frames,
-                position.newest_ns,
-                position.last_estimated,
-            )
             self.checkpoints.try_add_checkpoint(
-                place, None if self._stream is None else self._stream.state_dict()
+                replace(position), None if self._stream is None else self._stream.state_dict()
             )
 
     def _is_valid(self, checkpoint: Checkpoint, inputs: SessionInputs) -> bool:
