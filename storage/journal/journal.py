@@ -27,7 +27,6 @@ from storage.journal.segment import (
     SUFFIX,
     Segment,
     make_free_unread_path,
-    may_have_indexed_batches,
     read_schema_and_first_offset,
     recover_or_delete_segment,
     set_aside_irregular_or_forbidden_files,
@@ -77,13 +76,11 @@ class Journal:
             make_synced_folder(folder)
             self.problems += set_aside_irregular_or_forbidden_files(folder)
             for path in sorted(folder.glob("*" + SUFFIX)):
-                index = path.with_suffix(INDEX_SUFFIX)
-                is_indexed = index.exists() and may_have_indexed_batches(path, self._schema)
-                segment, damaged = recover_or_delete_segment(path, self._schema)
+                segment, damaged, had_batches = recover_or_delete_segment(path, self._schema)
                 self.lost.add_if_new(damaged, CORRUPT)
                 if segment is not None:
                     self._add_segment(segment)
-                elif is_indexed:  # else its process was killed just after creating it
+                elif had_batches:
                     self.problems.append(
                         escape_control_chars(f"{path}: no frame in it is proven by its index")
                     )

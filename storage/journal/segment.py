@@ -221,19 +221,19 @@ class Segment:
         self.stored.add_ranges(records["seq_first"], records["count"])
         if len(records):
             begin, end = int(records["t_ns_first"].min()), int(records["t_ns_last"].max())
-            fresh = not self.size_bytes
-            self.t_ns_first = begin if fresh else min(self.t_ns_first, begin)
-            self.t_ns_last = end if fresh else max(self.t_ns_last, end)
-            self.size_bytes += int(records["length"].sum()) + records.nbytes
+            self._extend(begin, end, int(records["length"].sum()) + records.nbytes)
 
     def register_message(self, message: EncodedBatch) -> None:
         """Add the numbers, times and size of one written batch; faster than `register_records`."""
         self.stored.add(message.seq_first, message.seq_last)
+        size_bytes = len(message.payload) + RECORD_DTYPE.itemsize
+        self._extend(message.t_ns_first, message.t_ns_last, size_bytes)
+
+    def _extend(self, t_ns_first: int, t_ns_last: int, size_bytes: int) -> None:
         fresh = not self.size_bytes
-        begin, end = message.t_ns_first, message.t_ns_last
-        self.t_ns_first = begin if fresh else min(self.t_ns_first, begin)
-        self.t_ns_last = end if fresh else max(self.t_ns_last, end)
-        self.size_bytes += len(message.payload) + RECORD_DTYPE.itemsize
+        self.t_ns_first = t_ns_first if fresh else min(self.t_ns_first, t_ns_first)
+        self.t_ns_last = t_ns_last if fresh else max(self.t_ns_last, t_ns_last)
+        self.size_bytes += size_bytes
 
     def read_stored_batch_records(self) -> Records:
         """Read the valid index records of the stored batches, in order of their frames.
@@ -306,18 +306,6 @@ def make_free_unread_path(path: Path) -> Path:
     return path.with_name(next(name for name in names if name not in existing))
 
 
-def may_have_indexed_batches(path: Path, schema: pa.Schema) -> bool:
-    """Return whether the index is not empty, or the segment has two batches or more.
-
-    Raises:
-        OSError: one of the two files cannot be read.
-    """
-    if path.with_suffix(INDEX_SUFFIX).stat().st_size > 0:
-        return True
-    _, begin = read_schema_and_first_offset(path)
-    return len(list(islice(read_messages_until_damage(path, begin, schema), 2))) > 1
-
-
 class RecoveredSegment(NamedTuple):
     """Segment of a journal after a restart."""
 
@@ -325,15 +313,16 @@ class RecoveredSegment(NamedTuple):
     """None: no batch in it was complete, and it is deleted."""
     damaged: Intervals
     """Numbers of its damaged frames."""
+    had_batches: bool
+    """False: it is deleted, and its process was killed just after creating it."""
 
 
 def recover_or_delete_segment(path: Path, schema: pa.Schema) -> RecoveredSegment:
     """Open an existing segment; delete it if no batch in it is complete.
 
-    Bytes without an index record
-    are moved to a file beside it, not discarded: most often they are a message that was cut. A
-    segment that was closed in order is not read through: its batches are checked when they are
-    read.
+    Bytes without an index record are moved to a file beside it, not discarded: most often they are
+    a message that was cut. A segment that was closed in order is not read through: its batches are
+    checked when they are read.
 
     Raises:
         OSError: it cannot be read or truncated.
@@ -351,7 +340,7 @@ def recover_or_delete_segment(path: Path, schema: pa.Schema) -> RecoveredSegment
         if was_closed and len(batches) and find_end_offset(batches) == size:
             segment = Segment(path)
             segment.register_records(batches)
-            return RecoveredSegment(segment, damaged)
+            return RecoveredSegment(segment, damaged, had_batches=True)
     good = []
     read: dict[int, EncodedBatch | None] = {}
     with path.open("rb") as file:
@@ -370,11 +359,17 @@ def recover_or_delete_segment(path: Path, schema: pa.Schema) -> RecoveredSegment
                     end = max(end, int(found["offset"]) + int(found["length"]))
         if end < size:
             file.seek(end)
-            _write_all_or_none(make_free_unread_path(path), file.read())
+            # All or no file: on a full disk recovery is retried again and again.
+            write_atomically(make_free_unread_path(path), file.read())
     segment = Segment(path)
     if not good:
+        index_path = path.with_suffix(INDEX_SUFFIX)
+        had_batches = index_path.exists() and (
+            index_path.stat().st_size > 0
+            or len(list(islice(read_messages_until_damage(path, end, schema), 2))) > 1
+        )
         segment.delete_files()
-        return RecoveredSegment(None, damaged)
+        return RecoveredSegment(None, damaged, had_batches)
     records = np.array(good, RECORD_DTYPE)
     segment.register_records(records)
     os.truncate(path, end)
@@ -382,16 +377,7 @@ def recover_or_delete_segment(path: Path, schema: pa.Schema) -> RecoveredSegment
     with path.open("rb") as file:
         os.fsync(file.fileno())
     _write_index(path, records)
-    return RecoveredSegment(segment, damaged)
-
-
-def _write_all_or_none(path: Path, content: bytes) -> None:
-    """Write all bytes or no file: on a full disk recovery is retried again and again."""
-    try:
-        path.write_bytes(content)
-    except OSError:
-        path.unlink(missing_ok=True)
-        raise
+    return RecoveredSegment(segment, damaged, had_batches=True)
 
 
 def _write_index(path: Path, records: Records) -> None:
