@@ -1,4 +1,4 @@
-"""Spans of consecutive frames with minimum and maximum, and the last minute of them.
+"""Spans of consecutive frames with minimum and maximum, and their last minute.
 
 A batch is reduced once, for the live page and for both histories. No peak hides: spans are merged
 by minimum and maximum, and NaN counts as missing.

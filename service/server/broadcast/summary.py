@@ -50,7 +50,7 @@ class FrameSummary:
     Attributes:
         stream_id: stream of the frames.
         span: their GRF.
-        tiles: minimum and maximum of each tile, as of `reduce_tiles`.
+        tiles: minimum and maximum of each tile, from `reduce_tiles`.
         newest: estimates of the newest frame, for the message.
     """
 
@@ -202,7 +202,7 @@ def summarize_frames(
     Args:
         stream_id: stream of the frames.
         span: GRF over the same frames.
-        tiles: `reduce_tiles` of them.
+        tiles: minimum and maximum of each tile, from `reduce_tiles`.
         frames: n frames.
         columns: their estimates by name.
     """
