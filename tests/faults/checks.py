@@ -17,7 +17,6 @@ import pyarrow.parquet as pq
 from tests.faults.draws import Remains, Tree
 from tests.faults.facts import Facts
 from tests.faults.link_witness import Columns
-from tests.faults.product import Product
 
 _SYNC_S, _BATCH_S = 0.5, 0.05
 _STOP_S = 0.03
@@ -28,7 +27,7 @@ _NOT_READ_COUNTS = 65535
 Seqs = npt.NDArray[np.uint64]
 
 
-def findings(facts: Facts, product: Product) -> list[str]:
+def findings(facts: Facts) -> list[str]:
     """Everything that is wrong."""
     if facts.session.get("state") != "sealed":
         return [f"the session is {facts.session.get('state')}: {facts.session.get('problem')}"]
@@ -38,14 +37,14 @@ def findings(facts: Facts, product: Product) -> list[str]:
     except (pa.ArrowException, OSError) as error:
         return [*found, f"the sealed file is damaged: {error}"]
     rows = _rows_by_part(facts, table)
-    found += _file_is_the_one_it_says(facts)
-    found += _rows_are_the_ledgers(facts, rows)
-    found += _nothing_promised_is_missing(facts, rows)
-    found += _content_is_what_was_taken(facts, rows)
-    found += _losses_are_allowed(facts, product)
-    found += _streams_are_all_there(facts, product)
-    found += _begins_with_the_start(facts)
-    found += _verified(facts, product)
+    for compare in (
+        _rows_are_the_ledgers,
+        _nothing_promised_is_missing,
+        _content_is_what_was_taken,
+    ):
+        found += compare(facts, rows)
+    for check in _CHECKS:
+        found += check(facts)
     return found
 
 
@@ -236,9 +235,7 @@ def _content_is_what_was_taken(facts: Facts, rows: list[Columns]) -> Iterator[st
                     yield f"part {number}: {name} of {count} frames is not that of {whose}"
 
 
-def _losses_are_allowed(facts: Facts, product: Product) -> Iterator[str]:
-    if not product.node_journal:
-        return
+def _losses_are_allowed(facts: Facts) -> Iterator[str]:
     full = facts.story.small_disk_of == "node"
     for number, part in enumerate(facts.ledger["parts"]):
         stream_id, lost = part["stream_id"], dict(part["lost"])
@@ -266,10 +263,8 @@ def _taken_by_node(facts: Facts, stream_id: str) -> int | None:
     return end.last_seq if end is not None and end.at_s < facts.stopped_s else None
 
 
-def _streams_are_all_there(facts: Facts, product: Product) -> Iterator[str]:
+def _streams_are_all_there(facts: Facts) -> Iterator[str]:
     """Each stream of which frames were taken while it was recorded is a part."""
-    if not product.node_journal:
-        return
     named = {part["stream_id"] for part in facts.ledger["parts"]} | facts.elsewhere
     first = facts.ledger["parts"][0]["stream_id"] if facts.ledger["parts"] else None
     order = [*facts.witness.infos]
@@ -302,13 +297,17 @@ def _begins_with_the_start(facts: Facts) -> Iterator[str]:
         yield f"the node records from its start on, and the session begins with {parts[0]}"
 
 
-def _verified(facts: Facts, product: Product) -> Iterator[str]:
-    if not product.verify:
-        return
+def _verified(facts: Facts) -> Iterator[str]:
     is_lossy = facts.ledger["lossy"] or facts.lossy_elsewhere
     expected = _LOSSY if is_lossy else _GOOD
     if facts.verify_code != expected:
         yield f"foottile verify ended with {facts.verify_code}: {facts.verify_said[-500:]}"
+
+
+_CHECKS = (
+    *(_file_is_the_one_it_says, _losses_are_allowed, _streams_are_all_there),
+    *(_begins_with_the_start, _verified),
+)
 
 
 def summary_of(ledger: dict[str, Any]) -> str:

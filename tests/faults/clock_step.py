@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from tests.faults.product import hand_over
+
 HOUR_NS = 3_600_000_000_000
 
 
@@ -20,9 +22,7 @@ class WallClock:
 
     def step_to(self, offset_ns: int) -> None:
         """From some 20 ms on the processes see the machine's time plus this offset."""
-        temporary = self._file.with_name(self._file.name + ".new")
-        temporary.write_text(str(offset_ns))
-        temporary.replace(self._file)
+        hand_over(self._file, str(offset_ns))
 
     def environment(self) -> dict[str, str]:
         """What a process needs in its environment to see it."""

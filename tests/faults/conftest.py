@@ -30,7 +30,7 @@ Run = Callable[..., Ended]
 @pytest.fixture
 def disk(tmp_path: Path) -> Disk:
     """A watched folder with nothing in it."""
-    return Disk(tmp_path / "root", tmp_path / "beside")
+    return Disk(tmp_path / "root", tmp_path / "beside", tmp_path / "synced")
 
 
 @pytest.fixture

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.faults.product import hand_over
+
 _FILLER = ".filler"
 
 
@@ -78,9 +80,7 @@ class SlowSync:
 
     def set_s(self, seconds: float) -> None:
         """From the next fsync on each takes so much longer."""
-        temporary = self._file.with_name(self._file.name + ".new")
-        temporary.write_text(str(seconds) if seconds else "")
-        temporary.replace(self._file)
+        hand_over(self._file, str(seconds) if seconds else "")
 
     def environment(self) -> dict[str, str]:
         """What a process needs in its environment, beside what makes it watched."""

@@ -67,6 +67,8 @@ class _Durable:
 
     names: dict[_Name, Inode | None] = field(default_factory=dict)
     lengths: dict[int, int] = field(default_factory=dict)
+    copies: dict[int, str] = field(default_factory=dict)
+    """What each file held when it was synced."""
     cuts: dict[int, list[tuple[int, str]]] = field(default_factory=lambda: defaultdict(list))
     steps: list[_Step] = field(default_factory=list)
 
@@ -77,7 +79,8 @@ class _Durable:
             for folder, names in event["folders"].items():
                 for name, inode in names.items():
                     self.names[int(folder), name] = _inode(inode)
-            self.lengths = {int(number): length for number, length in event["files"].items()}
+            for number, (length, copy) in event["files"].items():
+                self.lengths[int(number)], self.copies[int(number)] = length, copy
         elif kind == "names":
             changes = {(f, n): (_inode(b), _inode(a)) for f, n, b, a in event["set"]}
             self.steps.append(_Step(changes))
@@ -86,7 +89,7 @@ class _Durable:
         elif kind == "folder":
             self._folder_synced(event["ino"], event["names"])
         elif kind == "file":
-            self.lengths[event["ino"]] = event["len"]
+            self.lengths[event["ino"]], self.copies[event["ino"]] = event["len"], event["copy"]
             self.cuts.pop(event["ino"], None)
         elif kind == "cut":
             number = event["ino"]
@@ -96,6 +99,7 @@ class _Durable:
                 self.cuts[number].append((event["len"], event["tail"]))
         elif kind == "let_go":
             self.lengths.pop(event["ino"], None)
+            self.copies.pop(event["ino"], None)
             self.cuts.pop(event["ino"], None)
 
     def _forget_folder(self, number: int) -> None:
@@ -209,7 +213,23 @@ class History:
             if not draws.choose(2):  # the cut has not reached the disk, nor has what came after it
                 return Remains(now[:length] + Path(tail).read_bytes(), mode)
         synced = min(self._durable.lengths.get(number, 0), len(now))
-        return Remains(now[:synced] + _behind(now, synced, draws), mode)
+        old = Path(self._durable.copies[number]).read_bytes()[:synced] if synced else b""
+        return Remains(_overwritten(old, now[:synced], draws) + _behind(now, synced, draws), mode)
+
+
+def _overwritten(old: bytes, new: bytes, draws: Draws) -> bytes:
+    """What is there of bytes that were written over synced ones, if any were."""
+    if old == new:
+        return new
+    match draws.choose(3):
+        case 0:
+            return old
+        case 1:
+            rng = random.Random(draws.between(0, 1 << 30))
+            sectors = [slice(at, at + _SECTOR) for at in range(0, len(new), _SECTOR)]
+            return b"".join(rng.choice((old, new))[sector] for sector in sectors)
+        case _:
+            return new
 
 
 def _behind(now: bytes, synced: int, draws: Draws) -> bytes:

@@ -18,7 +18,7 @@ import httpx
 from tests.faults.clock_step import WallClock
 from tests.faults.disk import SlowSync
 from tests.faults.power import Disk
-from tests.faults.product import NODE, REPOSITORY, clean_environment, command, product
+from tests.faults.product import NODE, REPOSITORY, clean_environment, command, hand_over
 from tests.tokens import SHARED_BEARER, SHARED_TOKEN
 from tests.waiting import PATIENCE_S
 
@@ -55,13 +55,16 @@ class Machine:
     def __init__(self, name: str, folder: Path, small: Path | None = None) -> None:
         self.name = name
         folder.mkdir(parents=True)
-        self.disk = Disk((small or folder) / "root", (small or folder) / "beside")
+        self.disk = Disk(
+            (small or folder) / "root", (small or folder) / "beside", folder / "synced"
+        )
         self.clock = WallClock(folder / "clock")
         self.slow = SlowSync(folder / "slow")
         self.arm = folder / "kill"
         """What is written here is the call at which the next kill comes (`fault_recorder`)."""
         self.said = folder / "said.txt"
         self._process: subprocess.Popen[bytes] | None = None
+        self._arguments: tuple[object, ...] = ()
 
     @property
     def root(self) -> Path:
@@ -73,11 +76,10 @@ class Machine:
         """Does its first process run?"""
         return self._process is not None and self._process.poll() is None
 
-    def run(self, *arguments: object, kill_at: str = "") -> None:
-        """Start a command of the product; what was running has to be dead.
+    def start(self, kill_at: str = "") -> None:
+        """Start its command of the product; what was running has to be dead.
 
         Args:
-            arguments: of `foottile`.
             kill_at: a call at which it is killed (`bootstrap/fault_recorder.py`).
         """
         self.arm.unlink(missing_ok=True)
@@ -94,7 +96,7 @@ class Machine:
         }
         with self.said.open("ab") as said:
             self._process = subprocess.Popen(
-                command(*arguments),
+                command(*self._arguments),
                 cwd=REPOSITORY,
                 env=environment,
                 stdin=subprocess.DEVNULL,
@@ -105,9 +107,7 @@ class Machine:
 
     def kill_at(self, spec: str) -> None:
         """Have it killed at a call to come."""
-        temporary = self.arm.with_name("kill.new")
-        temporary.write_text(spec + "\n")
-        temporary.replace(self.arm)
+        hand_over(self.arm, spec + "\n")
 
     def children(self) -> list[int]:
         """Processes that its first process has started, oldest first."""
@@ -162,16 +162,13 @@ class ServerMachine(Machine):
     def __init__(self, folder: Path, small: Path | None = None) -> None:
         super().__init__("server", folder, small)
         self.port = free_port()
+        self._arguments = ("serve", "--port", self.port, "--data", self.root)
         self._http = httpx.Client(
             base_url=f"http://127.0.0.1:{self.port}/api/v1",
             headers=SHARED_BEARER,
             timeout=PATIENCE_S,
             trust_env=False,
         )
-
-    def start(self, kill_at: str = "") -> None:
-        """Start it, to be killed at a call if one is given."""
-        self.run("serve", "--port", self.port, "--data", self.root, kill_at=kill_at)
 
     def wait_ready(self, timeout_s: float = PATIENCE_S) -> None:
         """Until it answers.
@@ -243,12 +240,7 @@ class NodeMachine(Machine):
     ) -> None:
         super().__init__("node", folder, small)
         link = ("--record", "round") if port is None else ("--server", f"http://127.0.0.1:{port}")
-        journal = ("--journal", self.root) if product().node_journal else ()
-        self._arguments = ("--scene", scene, "--name", NODE, *link, *journal)
-
-    def start(self, kill_at: str = "") -> None:
-        """Start it, to be killed at a call if one is given."""
-        self.run("node", *self._arguments, kill_at=kill_at)
+        self._arguments = ("node", "--scene", scene, "--name", NODE, *link, "--journal", self.root)
 
 
 def free_port() -> int:

@@ -18,7 +18,7 @@ from tests.faults.disk import SmallDisk, small_disk
 from tests.faults.facts import End, Facts
 from tests.faults.link_witness import Witness
 from tests.faults.machines import Machine, NodeMachine, RoundError, ServerMachine, wait_for
-from tests.faults.product import NODE, product, run_command
+from tests.faults.product import NODE, run_command
 from tests.faults.proxy import Proxy
 from tests.faults.stories import SMALL_DISK_BYTES, Story
 
@@ -134,8 +134,7 @@ class Players:
         stream_id = self._end_node(how, dies)
         if how == "power":
             self.note(f"power of the node: {self.node.cut_power(rng)}")
-        self.node.start()
-        self.wait_back(stream_id)
+        self._start_again(stream_id, self.node)
 
     def _start_session(self) -> None:
         def begun() -> dict[str, Any] | None:
@@ -189,10 +188,9 @@ class Players:
         self._verify(self.server.root)
 
     def _verify(self, root: Path) -> None:
-        if product().verify:
-            verified = run_command("verify", root, "--json")
-            self.facts.verify_code = verified.returncode
-            self.facts.verify_said = verified.stdout + verified.stderr
+        verified = run_command("verify", root, "--json")
+        self.facts.verify_code = verified.returncode
+        self.facts.verify_said = verified.stdout + verified.stderr
 
     def _machines(self) -> tuple[Machine, ...]:
         return self.node, self.server
@@ -202,12 +200,7 @@ class Players:
         return list(self.witness.infos)[-1] if self.witness.infos else None
 
     def _end_node(
-        self,
-        how: str,
-        end: Callable[[], None],
-        *,
-        only: str | None = None,
-        slow_s: float = 0.0,
+        self, how: str, end: Callable[[], None], *, only: str | None = None, slow_s: float = 0.0
     ) -> str | None:
         """End the node and note what its streams had then; the newest stream's name."""
         newest = self._stream_id()
@@ -225,19 +218,12 @@ class Players:
     def _cut(self, machine: Machine) -> None:
         self.note(f"power of the {machine.name}: {machine.cut_power(self._rng)}")
 
-    def _node_again(self, stream_id: str | None) -> None:
-        self.node.start()
-        self.wait_back(stream_id)
-
-    def _server_again(self) -> None:
-        self.server.start()
-        self.server.wait_ready()
-        self.wait_back()
-
-    def _both_again(self, stream_id: str | None) -> None:
-        self.server.start()
-        self.node.start()
-        self.server.wait_ready()
+    def _start_again(self, stream_id: str | None, *machines: Machine) -> None:
+        for machine in machines:
+            machine.slow.set_s(0.0)
+            machine.start()
+        if any(isinstance(machine, ServerMachine) for machine in machines):
+            self.server.wait_ready()
         self.wait_back(stream_id)
 
     @contextmanager

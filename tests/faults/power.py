@@ -6,6 +6,7 @@ folder is made what a disk may hold that was cut off at that instant:
 
 - A file keeps what it had when its last fsync began. Of what was written behind that, nothing,
   some, or all is there, or zeros or other people's bytes stand in its place.
+- Bytes that were written over synced ones since are there or not, sector by sector.
 - A name that was given or taken since its folder was last synced is there or not. Changes of one
   name, or of names tied by renames, come undone from the newest back; a rename is one step, as it
   is on every journalling file system. Changes that have nothing to do with one another come in
@@ -15,8 +16,7 @@ folder is made what a disk may hold that was cut off at that instant:
 
 That is what POSIX lets a disk do. ext4, XFS and btrfs are kinder: they keep the order of names, and
 an fsync there makes more durable than it has to. A disk that lies about its cache is worse, and so
-is one that damages its neighbours' sectors. Not modelled: bytes written over others below the
-synced length, which no file here is meant to have but the mapped ones; O_SYNC, msync, sync(2).
+is one that damages its neighbours' sectors. Not modelled: O_SYNC, msync, sync(2).
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ import json
 import os
 import random
 import shutil
+import stat
 import uuid
 from pathlib import Path
 from typing import Any
@@ -42,15 +43,16 @@ class Disk:
     Args:
         root: the folder; made, and taken to be durable as it is now.
         beside: a folder on the same file system, outside of `root`, for the harness's own files.
+        synced: for copies of what was synced, where there is room for them; made.
     """
 
-    def __init__(self, root: Path, beside: Path) -> None:
+    def __init__(self, root: Path, beside: Path, synced: Path) -> None:
         self.root = root
+        self.synced = synced
         self.log = beside / "calls.jsonl"
         self.graveyard = beside / "graveyard"
         self._stream_id = beside / "stream_id"
         root.mkdir(parents=True, exist_ok=True)
-        self.graveyard.mkdir(parents=True, exist_ok=True)
         self.begin()
 
     def environment(self) -> dict[str, str]:
@@ -62,6 +64,7 @@ class Disk:
             "FAULTS_ROOT": str(self.root),
             "FAULTS_LOG": str(self.log),
             "FAULTS_GRAVEYARD": str(self.graveyard),
+            "FAULTS_SYNCED": str(self.synced),
             "FAULTS_BOOT_ID": str(self._stream_id),
         }
 
@@ -102,15 +105,19 @@ class Disk:
 
     def begin(self) -> None:
         """All that is there is durable, and another boot of the kernel begins."""
-        shutil.rmtree(self.graveyard)
-        self.graveyard.mkdir()
+        for folder in (self.graveyard, self.synced):
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
         folders: dict[int, dict[str, Inode]] = {}
-        files: dict[int, int] = {}
+        files: dict[int, tuple[int, str]] = {}
         for path, _, names in os.walk(self.root):
             folders[os.stat(path).st_ino] = scan(path)
             for name in names:
                 found = os.stat(os.path.join(path, name), follow_symlinks=False)
-                files[found.st_ino] = found.st_size
+                copy = str(self.synced / f"base-{found.st_ino}")
+                if stat.S_ISREG(found.st_mode):
+                    shutil.copyfile(os.path.join(path, name), copy)
+                files[found.st_ino] = (found.st_size, copy)
         self.log.write_text(json.dumps({"e": "base", "folders": folders, "files": files}) + "\n")
         self._stream_id.write_text(f"{uuid.uuid4()}\n")
 

@@ -1,16 +1,10 @@
-"""What the commands under test can do by now, asked of themselves.
-
-The one place to look at when commands or options change: what is not there yet is not asked for,
-and what it promises is not expected.
-"""
+"""The commands under test: how they are started, and in which environment."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
-from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 from tests.waiting import PATIENCE_S
@@ -20,24 +14,6 @@ NODE = "foot"
 """What the node is called."""
 
 _START = "from service.cli.main import main; main()"
-
-
-@dataclass(frozen=True)
-class Product:
-    """What there is.
-
-    Attributes:
-        node_journal: `foottile node --journal DIR`: the node keeps its frames on disk, so that a
-            kill loses nothing and a power cut not more than it says.
-        node_record: `foottile node --record NAME`: it records without a server.
-        verify: `foottile verify DIR`.
-        recover: `foottile recover DIR`.
-    """
-
-    node_journal: bool
-    node_record: bool
-    verify: bool
-    recover: bool
 
 
 def command(*arguments: object) -> list[str]:
@@ -55,18 +31,6 @@ def clean_environment() -> dict[str, str]:
     }
 
 
-@cache
-def product() -> Product:
-    """Ask it once."""
-    commands, node = _help(), _help("node")
-    return Product(
-        node_journal="--journal" in node,
-        node_record="--record" in node,
-        verify=" verify " in commands,
-        recover=" recover " in commands,
-    )
-
-
 def run_command(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run it to its end; what it says is kept."""
     return subprocess.run(
@@ -79,7 +43,8 @@ def run_command(*arguments: object, **environment: str) -> subprocess.CompletedP
     )
 
 
-def _help(*arguments: str) -> str:
-    asked = run_command(*arguments, "--help", COLUMNS="200")
-    asked.check_returncode()
-    return asked.stdout
+def hand_over(file: Path, text: str) -> None:
+    """Have a running process see this text in a file, whole."""
+    temporary = file.with_name(file.name + ".new")
+    temporary.write_text(text)
+    temporary.replace(file)

@@ -40,7 +40,6 @@ if str(ROOT) not in sys.path:  # run as a script
 from tests.faults.alone import Alone
 from tests.faults.checks import findings, summary_of
 from tests.faults.machines import RoundError
-from tests.faults.product import Product, product
 from tests.faults.stage import Stage
 from tests.faults.stories import Story, draw_story
 
@@ -98,7 +97,7 @@ def play(story: Story, folder: Path) -> Result:
     with (Alone if story.alone else Stage)(story, folder) as stage:
         try:
             for facts in stage.play():
-                result.findings += findings(facts, product())
+                result.findings += findings(facts)
                 result.add(facts.ledger)
         except (RoundError, httpx.HTTPError) as error:
             result.findings = [f"{type(error).__name__}: {error}"]
@@ -137,7 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 print(f"        kept in {result.folder}; again: {_again(result.seed)}", flush=True)
     with suppress(OSError):
         work.rmdir()
-    lines = list(_summary(results, product(), time.monotonic() - begin_s))
+    lines = list(_summary(results, time.monotonic() - begin_s))
     print("", *lines, sep="\n")
     if options.out is not None:
         options.out.write_text("\n".join(_report(results, lines, options)) + "\n")
@@ -159,7 +158,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _play_one(options: argparse.Namespace) -> int:
     may_mount = os.geteuid() == 0 and not options.no_mount
-    story = draw_story(options.only, product(), may_mount=may_mount)
+    story = draw_story(options.only, may_mount=may_mount)
     folder = options.folder or Path(tempfile.mkdtemp(prefix="foottile-round-")) / "round"
     result = play(story, folder)
     if options.json:
@@ -224,7 +223,7 @@ def _again(seed: int) -> str:
 # --- what is said of all --------------------------------------------------------------------------
 
 
-def _summary(results: list[Result], what: Product, seconds: float) -> Iterator[str]:
+def _summary(results: list[Result], seconds: float) -> Iterator[str]:
     bad = [result for result in results if result.findings]
     parts = [part for result in results for part in result.ledger.get("parts", ())]
     lossy = sum(bool(result.ledger.get("lossy")) for result in results)
@@ -243,9 +242,6 @@ def _summary(results: list[Result], what: Product, seconds: float) -> Iterator[s
     )
     yield f"sessions: {len(results) - lossy} complete, {lossy} lossy"
     yield "faults: " + ", ".join(f"{kind} {number}" for kind, number in sorted(kinds.items()))
-    absent = [name for name, there in asdict(what).items() if not there]
-    if absent:
-        yield "not there yet, so neither asked for nor expected: " + ", ".join(absent)
 
 
 def _report(results: list[Result], lines: list[str], options: argparse.Namespace) -> Iterator[str]:

@@ -69,18 +69,44 @@ class Stage(Players):
             self._fetch()
         return [self.facts]
 
-    # --- kills ------------------------------------------------------------------------------------
+    # --- kills and power ----------------------------------------------------------------------
 
     def _kill_node(self, fault: Fault) -> None:
-        self._kill_node_by(self.node.kill, fault)
+        self._go_down(fault.length_s, self.node)
 
     def _kill_node_parent(self, fault: Fault) -> None:
-        self._kill_node_by(self.node.kill_first, fault)
-
-    def _kill_node_by(self, kill: Callable[[], None], fault: Fault) -> None:
-        stream_id = self._end_node("killed", kill)
+        stream_id = self._end_node("killed", self.node.kill_first)
         time.sleep(fault.length_s)
-        self._node_again(stream_id)
+        self._start_again(stream_id, self.node)
+
+    def _kill_server(self, fault: Fault) -> None:
+        self._go_down(fault.length_s, self.server)
+
+    def _kill_both(self, fault: Fault) -> None:
+        self._go_down(fault.length_s, self.node, self.server)
+
+    def _power_node(self, fault: Fault) -> None:
+        self._go_down(fault.length_s, self.node, how="power")
+
+    def _power_server(self, fault: Fault) -> None:
+        self._go_down(fault.length_s, self.server, how="power")
+
+    def _power_both(self, fault: Fault) -> None:
+        self._go_down(fault.length_s, self.node, self.server, how="power")
+
+    def _go_down(
+        self, length_s: float, *machines: Machine, how: str = "killed", slow_s: float = 0.0
+    ) -> None:
+        """Kill machines, or cut their power, and start them again after a while."""
+        stream_id = None
+        if self.node in machines:
+            stream_id = self._end_node(how, self.node.kill, slow_s=slow_s)
+        for machine in machines:
+            machine.kill()
+            if how == "power":
+                self._cut(machine)
+        time.sleep(length_s)
+        self._start_again(stream_id, *machines)
 
     def _kill_acquisition(self, fault: Fault) -> None:
         children = self.node.children()
@@ -100,42 +126,11 @@ class Stage(Players):
             self.node.start()
         self.wait_back(stream_id)
 
-    def _kill_server(self, fault: Fault) -> None:
-        self.server.kill()
-        time.sleep(fault.length_s)
-        self._server_again()
-
-    def _kill_both(self, fault: Fault) -> None:
-        stream_id = self._end_node("killed", self.node.kill)
-        self.server.kill()
-        time.sleep(fault.length_s)
-        self._both_again(stream_id)
-
     def _restart_node_twice(self, fault: Fault) -> None:
         stream_id = self._end_node("killed", self.node.kill)
         self.node.start()
         time.sleep(0.3 + 2.5 * fault.amount)
-        self._node_again(self._end_node("killed", self.node.kill) or stream_id)
-
-    # --- power ------------------------------------------------------------------------------------
-
-    def _power_node(self, fault: Fault) -> None:
-        stream_id = self._end_node("power", self.node.kill)
-        self._cut(self.node)
-        time.sleep(fault.length_s)
-        self._node_again(stream_id)
-
-    def _power_server(self, fault: Fault) -> None:
-        self._cut(self.server)
-        time.sleep(fault.length_s)
-        self._server_again()
-
-    def _power_both(self, fault: Fault) -> None:
-        stream_id = self._end_node("power", self.node.kill)
-        self._cut(self.server)
-        self._cut(self.node)
-        time.sleep(fault.length_s)
-        self._both_again(stream_id)
+        self._start_again(self._end_node("killed", self.node.kill) or stream_id, self.node)
 
     # --- the link ---------------------------------------------------------------------------------
 
@@ -179,15 +174,7 @@ class Stage(Players):
         machine.slow.set_s(slow_s)
         time.sleep(1.0 + fault.length_s)
         if self._rng.random() < 0.5:
-            if machine is self.node:
-                stream_id = self._end_node("power", self.node.kill, slow_s=slow_s)
-                self._cut(self.node)
-                machine.slow.set_s(0.0)
-                self._node_again(stream_id)
-            else:
-                self._cut(self.server)
-                machine.slow.set_s(0.0)
-                self._server_again()
+            self._go_down(0.0, machine, how="power", slow_s=slow_s)
         machine.slow.set_s(0.0)
 
     def _clock_of_node(self, fault: Fault) -> None:
@@ -231,7 +218,7 @@ class Stage(Players):
         time.sleep(0.2)
         stream_id = self._end_node("killed", self.node.kill)
         self.proxy.mend()
-        self._node_again(stream_id)
+        self._start_again(stream_id, self.node)
 
     def _kill_while_sealing(self, fault: Fault) -> None:
         self._die_while_sealing(fault, self.server.kill)
@@ -248,7 +235,7 @@ class Stage(Players):
         with suppress(RoundError):  # sealing may make fewer calls than that
             wait_for("the server kills itself", lambda: not self.server.is_alive, 2.0)
         die()
-        self._server_again()
+        self._start_again(None, self.server)
         if self.server.get(f"/sessions/{self.session_id}")["state"] == "recording":
             self.note("the stop was not kept: stopped again")
             self.stop()

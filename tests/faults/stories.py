@@ -7,8 +7,6 @@ from __future__ import annotations
 import random
 from dataclasses import dataclass
 
-from tests.faults.product import Product
-
 MIB = 1 << 20
 SMALL_DISK_BYTES = 48 * MIB
 
@@ -60,7 +58,6 @@ FULL = {"full_disk_of_server": 1, "full_disk_of_node": 1}
 
 _END_SHARE = 0.35
 _ALONE_SHARE = 0.15
-_NEEDS_NODE_JOURNAL = {"full_disk_of_node", "stop_while_away_and_kill_node"}
 
 
 @dataclass(frozen=True)
@@ -105,27 +102,26 @@ class Story:
         return kinds[0].rsplit("_", 1)[1] if kinds else ""
 
 
-def draw_story(seed: int, product: Product, *, may_mount: bool) -> Story:
+def draw_story(seed: int, *, may_mount: bool) -> Story:
     """The story of a seed: one to three faults.
 
     Args:
         seed: of everything that is drawn in the round.
-        product: what is not there cannot fail.
         may_mount: may disks be filled?
     """
     rng = random.Random(seed)
     number = rng.choices((1, 2, 3), (5, 4, 1))[0]
-    alone = product.node_record and rng.random() < _ALONE_SHARE
+    alone = rng.random() < _ALONE_SHARE
     kinds = dict(ALONE if alone else ANYTIME)
     if may_mount:
         kinds |= {"full_disk_of_node": 1} if alone else FULL
     chosen: list[str] = []
     for _ in range(number):
-        chosen.append(_drawn(rng, kinds, product))
+        chosen.append(_drawn(rng, kinds))
         if chosen[-1] in FULL:
             kinds = {kind: weight for kind, weight in kinds.items() if kind not in FULL}
-    if rng.random() < _END_SHARE and (product.recover or not alone):
-        chosen[-1] = _drawn(rng, AT_THE_END_ALONE if alone else AT_THE_END, product)
+    if rng.random() < _END_SHARE:
+        chosen[-1] = _drawn(rng, AT_THE_END_ALONE if alone else AT_THE_END)
     return Story(
         seed=seed,
         alone=alone,
@@ -144,13 +140,8 @@ def draw_story(seed: int, product: Product, *, may_mount: bool) -> Story:
     )
 
 
-def _drawn(rng: random.Random, kinds: dict[str, int], product: Product) -> str:
-    possible = {
-        kind: weight
-        for kind, weight in kinds.items()
-        if product.node_journal or kind not in _NEEDS_NODE_JOURNAL
-    }
-    return rng.choices(list(possible), list(possible.values()))[0]
+def _drawn(rng: random.Random, kinds: dict[str, int]) -> str:
+    return rng.choices(list(kinds), list(kinds.values()))[0]
 
 
 def _length_s(rng: random.Random, kind: str) -> float:

@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +24,11 @@ from tests.faults.checks import findings, sessions_are_whole
 from tests.faults.draws import Remains, Tree
 from tests.faults.facts import End, Facts
 from tests.faults.link_witness import Ack, Sent, Witness
-from tests.faults.product import Product
 from tests.faults.stories import Story
 
-EVERYTHING = Product(node_journal=True, node_record=True, verify=True, recover=True)
 ID = "20260101T000000Z-000000"
 STREAMS = ("a" * 32, "b" * 32)
 FRAMES = 200
-Change = Callable[[Facts, dict[str, Any]], None]
 
 
 def parquet(parts: list[np.ndarray[Any, Any]], *, padc_off: int = 0) -> bytes:
@@ -156,148 +154,109 @@ def lossy(facts: Facts) -> None:
     facts.verify_code = 3
 
 
-def power(facts: Facts) -> None:
+def cut_off(facts: Facts, by: int, tail: int) -> None:
+    """The node's power failed: the first part ends earlier, and its tail is open."""
     facts.ends[STREAMS[0]] = End("power", FRAMES - 1, 5.0)
+    shorter(facts, by, tail)
 
 
 def test_a_good_round_has_no_findings(facts: Facts) -> None:
-    assert findings(facts, EVERYTHING) == []
+    assert findings(facts) == []
 
 
-def test_what_a_power_cut_may_cost_is_no_finding_if_it_is_stated(facts: Facts) -> None:
-    power(facts)
-    shorter(facts, by=30, tail=50)
-    assert findings(facts, EVERYTHING) == []
+def test_a_stated_loss_of_a_power_cut_is_no_finding(facts: Facts) -> None:
+    cut_off(facts, by=30, tail=50)
+    assert findings(facts) == []
 
 
-def only(facts: Facts, *words: str) -> None:
-    """There are findings, and they are about this."""
-    found = findings(facts, EVERYTHING)
-    assert found
-    for word in words:
-        assert any(word in finding for finding in found), found
-
-
-def test_acknowledged_frames_that_are_missing_are_found_though_the_ledger_owns_up(
-    facts: Facts,
-) -> None:
-    without(facts, range(100, 103))
-    only(facts, "3 acknowledged frames are lost, 100 to 102", "lost {'corrupt': 3}, where 0 may be")
-
-
-def test_an_acknowledged_stream_that_is_no_part_is_found(facts: Facts) -> None:
+def _without_the_second_stream(facts: Facts) -> None:
     del facts.ledger["parts"][1], facts.session["parts"][1]
     seal(facts, parquet([np.arange(50, FRAMES)]))
-    only(facts, "200 acknowledged frames are lost", "is no part of it")
 
 
-def test_a_tail_that_is_shorter_than_what_is_missing_is_found(facts: Facts) -> None:
-    power(facts)
-    shorter(facts, by=30, tail=20)
-    only(facts, "ends with 169 and at most 20 more, but 199 was taken")
-
-
-def test_a_tail_that_is_longer_than_half_a_second_is_found(facts: Facts) -> None:
-    power(facts)
-    shorter(facts, by=30, tail=80)
-    only(facts, "max_lost_tail_frames 80 is more than 5")
-
-
-def test_a_process_that_was_killed_may_neither_lose_nor_state_a_tail(facts: Facts) -> None:
-    shorter(facts, by=0, tail=1)
-    only(facts, "max_lost_tail_frames 1 is more than 0")
-
-
-def test_what_a_killed_process_had_sent_is_missed(facts: Facts) -> None:
-    shorter(facts, by=1, tail=0)
-    only(facts, "ends with 198 and at most 0 more, but 199 was taken")
-
-
-def test_another_content_than_was_taken_is_found(facts: Facts) -> None:
+def _with_other_counts(facts: Facts) -> None:
     seal(facts, parquet([np.arange(50, FRAMES), np.arange(FRAMES)], padc_off=1))
-    only(facts, "pressure_raw of 150 frames is not that of what went over the link")
 
 
-def test_a_frame_that_is_there_twice_is_found(facts: Facts) -> None:
+def _with_a_frame_twice(facts: Facts) -> None:
     twice = np.sort(np.append(np.arange(50, FRAMES - 1), 60))
     seal(facts, parquet([twice, np.arange(FRAMES)]))
-    only(facts, "seq does not rise")
 
 
-def test_a_session_that_begins_too_late_is_found(facts: Facts) -> None:
-    facts.started_s = 0.3
-    only(facts, "it begins with 50")
+def _with_a_flipped_bit(facts: Facts) -> None:
+    assert facts.file is not None
+    seal(facts, facts.file[:200] + bytes([facts.file[200] ^ 1]) + facts.file[201:])
+
+
+def _with_another_file(facts: Facts) -> None:
+    content = facts.file
+    _with_other_counts(facts)
+    facts.file = content
+
+
+def _with_a_ledger(facts: Facts, **change: Any) -> None:
+    facts.ledger["parts"][0] |= change
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("spoil", "words"),
     [
-        ({"recorded": 149}, "does not sum up"),
-        ({"recorded": 140, "pending": 10}, "10 frames pending"),
-        ({"lost": {"corrupt": 1}}, "does not sum up"),
-        ({"max_lost_tail_frames": 5}, "lossy=False is not so"),
-        ({"seq_first": 49}, "are not the session's"),
+        (
+            partial(without, gone=range(100, 103)),  # though the ledger owns up
+            ["3 acknowledged frames are lost, 100 to 102", "lost {'corrupt': 3}, where 0 may be"],
+        ),
+        (_without_the_second_stream, ["200 acknowledged frames are lost", "is no part of it"]),
+        (
+            partial(cut_off, by=30, tail=20),
+            ["ends with 169 and at most 20 more, but 199 was taken"],
+        ),
+        (partial(cut_off, by=30, tail=80), ["max_lost_tail_frames 80 is more than 5"]),
+        # A process that was killed may neither lose nor state a tail.
+        (partial(shorter, by=0, tail=1), ["max_lost_tail_frames 1 is more than 0"]),
+        (partial(shorter, by=1, tail=0), ["ends with 198 and at most 0 more, but 199 was taken"]),
+        (_with_other_counts, ["pressure_raw of 150 frames is not that of what went over the link"]),
+        (_with_a_frame_twice, ["seq does not rise"]),
+        (lambda facts: setattr(facts, "started_s", 0.3), ["it begins with 50"]),
+        (partial(_with_a_ledger, recorded=149), ["does not sum up"]),
+        (partial(_with_a_ledger, recorded=140, pending=10), ["10 frames pending"]),
+        (partial(_with_a_ledger, lost={"corrupt": 1}), ["does not sum up"]),
+        (partial(_with_a_ledger, max_lost_tail_frames=5), ["lossy=False is not so"]),
+        (partial(_with_a_ledger, seq_first=49), ["are not the session's"]),
+        (_with_a_flipped_bit, ["damaged"]),
+        (_with_another_file, ["SHA-256", "not what is on the disk"]),
+        (lambda facts: facts.session.update(state="pending"), ["the session is pending"]),
+        (lambda facts: setattr(facts, "verify_code", 1), ["foottile verify ended with 1"]),
     ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
 )
-def test_a_ledger_that_does_not_add_up_is_found(
-    facts: Facts, change: dict[str, Any], words: str
+def test_each_fault_of_a_round_is_found(
+    facts: Facts, spoil: Callable[[Facts], None], words: list[str]
 ) -> None:
-    facts.ledger["parts"][0] |= change
-    only(facts, words)
-
-
-def test_a_damaged_file_is_found(facts: Facts) -> None:
-    assert facts.file is not None
-    damaged = bytearray(facts.file)
-    damaged[200] ^= 1
-    seal(facts, bytes(damaged))
-    only(facts, "damaged")
-
-
-def test_another_file_than_was_sealed_is_found(facts: Facts) -> None:
-    content = facts.file
-    seal(facts, parquet([np.arange(50, FRAMES), np.arange(FRAMES)], padc_off=1))
-    facts.file = content
-    only(facts, "SHA-256", "not what is on the disk")
-
-
-def test_a_session_that_is_not_sealed_is_found(facts: Facts) -> None:
-    facts.session["state"] = "pending"
-    only(facts, "the session is pending")
-
-
-def test_a_verify_that_says_otherwise_is_found(facts: Facts) -> None:
-    facts.verify_code = 1
-    only(facts, "foottile verify ended with 1")
+    spoil(facts)
+    found = findings(facts)
+    for word in words:
+        assert any(word in finding for finding in found), found
 
 
 # --- session folders wherever they were left ------------------------------------------------------
 
 
-def tree_of(**files: bytes) -> Tree:
-    folder: Tree = {name: Remains(content, 0o644) for name, content in files.items()}
-    return {"sessions": {ID: folder}}
-
-
 def test_session_folders_are_whole_or_it_is_said_what_is_not() -> None:
     sealed = parquet([np.arange(10)])
-    sha256 = hashlib.sha256(sealed).hexdigest()
     recording = b'{"state": "recording"}'
+    sha256 = hashlib.sha256(sealed).hexdigest()
     done = json.dumps({"state": "sealed", "sha256": sha256}).encode()
-    good = [
-        tree_of(**{"session.json": recording}),
-        tree_of(**{"session.json": recording, "frames.parquet": sealed}),
-        tree_of(**{"session.json": done, "frames.parquet": sealed, ".frames.parquet.tmp": b"?"}),
-    ]
-    for tree in good:
-        assert sessions_are_whole(tree, ID) == []
-    bad = [
-        {},
-        tree_of(),
-        tree_of(**{"session.json": b""}),
-        tree_of(**{"session.json": recording, "frames.parquet": sealed[:-9]}),
-        tree_of(**{"session.json": done}),
-        tree_of(**{"session.json": done, "frames.parquet": parquet([np.arange(9)])}),
-    ]
-    for tree in bad:
-        assert sessions_are_whole(tree, ID)
+
+    def found(*contents: bytes) -> list[str]:
+        names = ["session.json", "frames.parquet", ".frames.parquet.tmp"]
+        folder: Tree = {n: Remains(c, 0o644) for n, c in zip(names, contents, strict=False)}
+        return sessions_are_whole({"sessions": {ID: folder}}, ID)
+
+    for good in ([recording], [recording, sealed], [done, sealed, b"?"]):
+        assert found(*good) == []
+    assert sessions_are_whole({}, ID) == found() == [f"session {ID} is gone"]
+    assert found(b"") == [f"session.json of {ID} is damaged"]
+    (said,) = found(recording, sealed[:-9])
+    assert said.startswith(f"frames.parquet of {ID} is damaged")
+    for bad in ([done], [done, parquet([np.arange(9)])]):
+        assert found(*bad) == [f"the sealed file of {ID} is not the one in session.json"]

@@ -49,7 +49,7 @@ def test_a_read_only_disk_gives_but_does_not_take(small: SmallDisk) -> None:
 def test_a_watched_folder_on_a_full_disk_gets_its_room_back_by_deleting(
     small: SmallDisk, tmp_path: Path, run_on: Run
 ) -> None:
-    watched = Disk(small.folder / "data", small.folder / "beside")
+    watched = Disk(small.folder / "data", small.folder / "beside", tmp_path / "synced")
     code = """
 import os
 open("a", "wb").write(bytes(1 << 20))

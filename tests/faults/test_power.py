@@ -5,28 +5,47 @@
 from __future__ import annotations
 
 import random
+import re
 import signal
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.faults.checks import sessions_are_whole
 from tests.faults.conftest import ROOT
 from tests.faults.draws import RandomDraws, Remains, Tree, every_outcome
-from tests.faults.power import Disk, write_tree
+from tests.faults.power import Disk, read_tree, write_tree
+from tests.service.process import has_ended
+from tests.service.sessions.crashed import ID, info_of, loaded, session, stream
+from tests.waiting import until
 
 Run = Callable[..., Any]
 
-BEGIN = f"import os, shutil, sys\nfrom pathlib import Path\nsys.path.append({str(ROOT)!r})\n"
-SYNC_FOLDER = """
+BEGIN = f"""
+import os, shutil, sys
+from pathlib import Path
+sys.path.append({str(ROOT)!r})
+
 def sync(path):
     fd = os.open(path, os.O_RDONLY)
     os.fsync(fd)
     os.close(fd)
+
+def write(path, content):
+    with open(path, "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
 """
-KILLED = "import signal; os.kill(os.getpid(), signal.SIGKILL)\n"
+
+
+@pytest.fixture
+def play(run: Run) -> Run:
+    """Run code in the watched folder; `write` of it writes and syncs, `sync` syncs a folder."""
+    return lambda code, **environment: run(BEGIN + code, **environment)
 
 
 def outcomes(disk: Disk) -> list[dict[str, Any]]:
@@ -46,90 +65,104 @@ def contents(disk: Disk, name: str) -> set[bytes | None]:
     return {tree.get(name) for tree in outcomes(disk)}
 
 
-def test_what_was_written_but_not_synced_may_be_lost_torn_or_somebody_elses(
-    disk: Disk, run: Run
-) -> None:
-    run(BEGIN + "Path('a').write_bytes(b'new' * 100)")
+def before(disk: Disk, **files: bytes) -> None:
+    """Have these files on the disk, durable, and nothing else."""
+    for path in disk.root.iterdir():
+        path.unlink()
+    write_tree({name: Remains(content, 0o644) for name, content in files.items()}, disk.root)
+    disk.begin()
+
+
+def test_unsynced_bytes_may_be_lost_torn_or_somebody_elses(disk: Disk, play: Run) -> None:
+    play("Path('a').write_bytes(b'new' * 100)")
     found = contents(disk, "a")
     assert {None, b"", b"new" * 100, b"new" * 50, bytes(300)} <= found
     assert any(c is not None and c.strip(b"\0") not in b"new" * 100 for c in found)
 
 
 def test_a_synced_file_keeps_its_bytes_but_its_name_only_when_the_folder_is_synced(
-    disk: Disk, run: Run
+    disk: Disk, play: Run
 ) -> None:
-    write = "f = open('a', 'wb'); f.write(b'new'); f.flush(); os.fsync(f.fileno())\n"
-    run(BEGIN + write)
+    play("write('a', b'new')")
     assert contents(disk, "a") == {None, b"new"}
-    run(BEGIN + SYNC_FOLDER + "sync('.')")
+    play("sync('.')")
     assert contents(disk, "a") == {b"new"}
 
 
-def test_what_was_appended_since_the_last_sync_is_anything_and_what_was_before_it_stays(
-    disk: Disk, run: Run
+def test_bytes_appended_since_the_last_sync_are_anything_and_those_before_stay(
+    disk: Disk, play: Run
 ) -> None:
-    run(
-        BEGIN
-        + SYNC_FOLDER
-        + "f = open('a', 'wb', buffering=0); f.write(b'old'); os.fdatasync(f); sync('.')\n"
-        + "f.write(b'new' * 2000)"
+    play(
+        "f = open('a', 'wb', buffering=0); f.write(b'old'); os.fdatasync(f); sync('.')\n"
+        "f.write(b'new' * 2000)"
     )
     found = contents(disk, "a")
     assert all(content is not None and content.startswith(b"old") for content in found)
     assert {b"old", b"old" + b"new" * 2000, b"old" + b"new" * 1000} <= found
 
 
-def test_a_rename_is_undone_as_a_whole_until_its_folder_is_synced(disk: Disk, run: Run) -> None:
-    (disk.root / "final").write_bytes(b"old")
-    disk.begin()
-    write = "f = open('tmp', 'wb'); f.write(b'new'); f.flush(); os.fsync(f.fileno())\n"
-    run(BEGIN + SYNC_FOLDER + write + "sync('.'); os.replace('tmp', 'final')")
+def test_bytes_written_over_synced_ones_are_old_or_new_by_sector_until_they_are_synced(
+    disk: Disk, play: Run
+) -> None:
+    before(disk, a=b"old" * 4096)
+    over = "f = open('a', 'r+b', buffering=0); f.seek(3000); f.write(b'new' * 1000)\n"
+    play(over)
+    old = b"old" * 4096
+    new = old[:3000] + b"new" * 1000 + old[6000:]
+    torn = contents(disk, "a") - {old, new}
+    assert contents(disk, "a") >= {old, new}
+    (found,) = torn
+    assert found is not None
+    for at in range(0, len(old), 512):
+        assert found[at : at + 512] in (old[at : at + 512], new[at : at + 512])
+    play("f = open('a', 'r+b'); os.fsync(f)")
+    assert contents(disk, "a") == {new}
+    play("f = open('a', 'r+b', buffering=0); f.write(b'x'); os.fsync(f); f.write(b'yz')")
+    assert contents(disk, "a") == {b"x" + new[1:], b"xyz" + new[3:]}
+
+
+def test_a_rename_is_undone_as_a_whole_until_its_folder_is_synced(disk: Disk, play: Run) -> None:
+    before(disk, final=b"old")
+    play("write('tmp', b'new'); sync('.'); os.replace('tmp', 'final')")
     assert (disk.root / "final").read_bytes() == b"new"
     assert outcomes(disk) == [{"final": b"old", "tmp": b"new"}, {"final": b"new"}]
 
 
 @pytest.mark.parametrize("remove", ["os.unlink('a')", "os.remove('a')", "Path('a').unlink()"])
-def test_an_unlinked_file_may_be_back_until_its_folder_is_synced(
-    disk: Disk, run: Run, remove: str
+def test_an_unlinked_file_may_be_back_until_its_folder_is_synced_and_is_let_go_then(
+    disk: Disk, play: Run, remove: str
 ) -> None:
-    (disk.root / "a").write_bytes(b"old")
-    disk.begin()
-    run(BEGIN + remove)
+    before(disk, a=b"old")
+    play(remove)
     assert not (disk.root / "a").exists()
     assert contents(disk, "a") == {None, b"old"}
-    run(BEGIN + SYNC_FOLDER + "Path('b').touch(); sync('.')")
+    play("Path('b').touch(); sync('.')")
     assert contents(disk, "a") == {None}
 
 
-def test_a_file_is_let_go_when_its_end_is_durable_so_that_a_full_disk_gets_its_room_back(
-    disk: Disk, run: Run
+def test_a_full_disk_gets_the_room_of_a_file_back_when_its_end_is_durable(
+    disk: Disk, play: Run
 ) -> None:
-    (disk.root / "a").write_bytes(b"old")
-    disk.begin()
-    run(BEGIN + SYNC_FOLDER + "os.unlink('a'); sync('.')")
+    before(disk, a=b"old")
+    play("os.unlink('a'); sync('.')")
     assert not list(disk.graveyard.iterdir())
 
 
 def test_a_folder_that_was_made_is_nothing_before_its_parent_is_synced(
-    disk: Disk, run: Run
+    disk: Disk, play: Run
 ) -> None:
-    run(
-        BEGIN
-        + SYNC_FOLDER
-        + "os.makedirs('d/e'); f = open('d/e/a', 'wb'); f.write(b'new'); f.flush()\n"
-        + "os.fsync(f.fileno()); sync('d/e'); sync('d')"
-    )
+    play("os.makedirs('d/e'); write('d/e/a', b'new'); sync('d/e'); sync('d')")
     whole = {"d": {"e": {"a": b"new"}}}
     assert outcomes(disk) == [{}, whole]
-    run(BEGIN + SYNC_FOLDER + "sync('.')")
+    play("sync('.')")
     assert outcomes(disk) == [whole]
 
 
-def test_a_removed_tree_may_be_back_with_all_that_was_in_it(disk: Disk, run: Run) -> None:
+def test_a_removed_tree_may_be_back_with_all_that_was_in_it(disk: Disk, play: Run) -> None:
     (disk.root / "d" / "e").mkdir(parents=True)
     (disk.root / "d" / "e" / "a").write_bytes(b"old")
     disk.begin()
-    run(BEGIN + "shutil.rmtree('d')")
+    play("shutil.rmtree('d')")
     assert not list(disk.root.iterdir())
     found = outcomes(disk)
     assert {} in found
@@ -137,67 +170,54 @@ def test_a_removed_tree_may_be_back_with_all_that_was_in_it(disk: Disk, run: Run
 
 
 @pytest.mark.parametrize("cut", ["os.truncate('a', 1)", "f = open('a', 'wb')"])
-def test_what_was_cut_off_a_file_may_be_back_until_it_is_synced(
-    disk: Disk, run: Run, cut: str
+def test_bytes_cut_off_a_file_may_be_back_until_it_is_synced(
+    disk: Disk, play: Run, cut: str
 ) -> None:
-    (disk.root / "a").write_bytes(b"old")
-    disk.begin()
-    run(BEGIN + cut)
+    before(disk, a=b"old")
+    play(cut)
     now = (disk.root / "a").read_bytes()
     assert len(now) < 3
     assert contents(disk, "a") == {b"old", now}
-    run(BEGIN + "f = open('a', 'ab'); os.fsync(f)")
+    play("f = open('a', 'ab'); os.fsync(f)")
     assert contents(disk, "a") == {now}
 
 
-def test_a_mapped_file_may_hold_anything(disk: Disk, run: Run) -> None:
-    run(
-        BEGIN
-        + SYNC_FOLDER
-        + "f = open('in_flight.bin', 'wb'); f.write(b'x' * 4096); f.flush(); os.fsync(f); sync('.')"
-    )
+def test_a_mapped_file_may_hold_anything(disk: Disk, play: Run) -> None:
+    play("write('in_flight.bin', b'x' * 4096); sync('.')")
     found = contents(disk, "in_flight.bin")
     assert {bytes(4096), b"x" * 4096} <= found
     assert len(found) == 4
 
 
 def test_an_inode_number_that_is_used_again_takes_nothing_of_its_past_with_it(
-    disk: Disk, run: Run
+    disk: Disk, play: Run
 ) -> None:
-    run(
-        BEGIN
-        + SYNC_FOLDER
-        + "for n in range(50):\n"
-        + "    f = open('a', 'wb'); f.write(b'x' * 100); f.flush(); os.fsync(f); sync('.')\n"
-        + "    f.close(); os.unlink('a'); sync('.')\n"
-        + "open('a', 'wb').write(b'y' * 100); sync('.')"
+    play(
+        "for n in range(50):\n"
+        "    write('a', b'x' * 100); sync('.'); os.unlink('a'); sync('.')\n"
+        "open('a', 'wb').write(b'y' * 100); sync('.')"
     )
     assert b"" in contents(disk, "a")
 
 
-def test_what_two_processes_have_synced_counts_together(disk: Disk, run: Run) -> None:
-    child = "import os; f = open('a', 'wb'); f.write(b'new'); f.flush(); os.fsync(f)"
-    run(
-        BEGIN
-        + SYNC_FOLDER
-        + f"import subprocess; subprocess.run([sys.executable, '-c', {child!r}]); sync('.')"
-    )
+def test_syncs_of_two_processes_count_together(disk: Disk, play: Run) -> None:
+    child = BEGIN + "write('a', b'new')"
+    play(f"import subprocess; subprocess.run([sys.executable, '-c', {child!r}]); sync('.')")
     assert contents(disk, "a") == {b"new"}
 
 
 def test_a_spawned_child_is_watched_too(disk: Disk, run: Run) -> None:
-    code = f"""{BEGIN}
+    script = disk.root.parent / "spawn.py"
+    script.write_text(f"""{BEGIN}
 def work():
-    f = open('a', 'wb'); f.write(b'new'); f.flush(); os.fsync(f)
-    fd = os.open('.', os.O_RDONLY); os.fsync(fd)
+    write('a', b'new')
+    sync('.')
 
 if __name__ == '__main__':
     import multiprocessing
     child = multiprocessing.get_context('spawn').Process(target=work)
     child.start(); child.join()
-"""
-    script = disk.root.parent / "spawn.py"
-    script.write_text(code)
+""")
     run(
         f"import runpy, sys; sys.argv = [{str(script)!r}]; runpy.run_path({str(script)!r}, "
         "run_name='__main__')"
@@ -206,53 +226,51 @@ if __name__ == '__main__':
 
 
 def test_each_power_cut_is_another_boot_of_the_kernel_to_the_processes(
-    disk: Disk, run: Run
+    disk: Disk, play: Run
 ) -> None:
-    ask = "print(Path('/proc/sys/kernel/random/boot_id').read_text().strip(), end='')"
-    real = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-    first = run(BEGIN + ask).out
-    assert run(BEGIN + ask).out == first
+    boot_id = Path("/proc/sys/kernel/random/boot_id")
+    ask = f"print(Path({str(boot_id)!r}).read_text().strip(), end='')"
+    first = play(ask).out
+    assert play(ask).out == first
     disk.cut_power(random.Random(1))
-    assert len({real, first, run(BEGIN + ask).out}) == 3
+    assert len({boot_id.read_text().strip(), first, play(ask).out}) == 3
 
 
 def test_a_cut_is_the_same_for_the_same_seed_and_leaves_nothing_pending(
-    disk: Disk, run: Run
+    disk: Disk, play: Run
 ) -> None:
-    run(BEGIN + SYNC_FOLDER + "[Path(f'{n}').write_bytes(b'x' * n) for n in range(40)]; sync('.')")
+    play("[Path(f'{n}').write_bytes(b'x' * n) for n in range(40)]; sync('.')")
     expected = plain(disk.possible(RandomDraws(random.Random(7))))
     disk.cut_power(random.Random(7))
-    assert {path.name: path.read_bytes() for path in disk.root.iterdir()} == expected
+    assert plain(read_tree(disk.root)) == expected
     assert len(outcomes(disk)) == 1
 
 
 # --- a kill at a chosen point ---------------------------------------------------------------------
 
 
-def test_a_process_kills_itself_at_the_chosen_call(disk: Disk, run: Run) -> None:
-    code = BEGIN + "[Path(f'{n}').mkdir() for n in range(5)]"
-    assert run(code, FAULTS_KILL="mkdir:3:before").code == -signal.SIGKILL
-    assert sorted(path.name for path in disk.root.iterdir()) == ["0", "1"]
-    assert run(BEGIN + "os.rename('0', '7')", FAULTS_KILL="rename@/7:1:after").code < 0
-    assert sorted(path.name for path in disk.root.iterdir()) == ["1", "7"]
-    code = BEGIN + "os.rename('1', '8'); os.rmdir('8')"
-    assert run(code, FAULTS_KILL="rename@/7:1:after").code == 0
-    code = BEGIN + "[(os.mkdir(n), os.rmdir(n)) for n in 'ab']"
-    assert run(code, FAULTS_KILL="mkdir+rmdir:3").code == -signal.SIGKILL
-    assert sorted(path.name for path in disk.root.iterdir()) == ["7"]
+def test_a_process_kills_itself_at_the_chosen_call(disk: Disk, play: Run) -> None:
+    made = "[Path(f'{n}').mkdir() for n in range(5)]"
+    twice = "[(os.mkdir(n), os.rmdir(n)) for n in 'ab']"
+    for code, kill, ends_with, left in (
+        (made, "mkdir:3:before", -signal.SIGKILL, ["0", "1"]),
+        ("os.rename('0', '7')", "rename@/7:1:after", -signal.SIGKILL, ["1", "7"]),
+        ("os.rename('1', '8'); os.rmdir('8')", "rename@/7:1:after", 0, ["7"]),
+        (twice, "mkdir+rmdir:3", -signal.SIGKILL, ["7"]),
+    ):
+        assert play(code, FAULTS_KILL=kill).code == ends_with
+        assert sorted(path.name for path in disk.root.iterdir()) == left
 
 
-def test_a_kill_can_be_armed_while_the_process_runs(disk: Disk, run: Run, tmp_path: Path) -> None:
+def test_a_kill_can_be_armed_while_the_process_runs(disk: Disk, play: Run, tmp_path: Path) -> None:
     arm = tmp_path / "arm"
     code = f"os.mkdir('a'); Path({str(arm)!r}).write_text('mkdir:2\\n'); os.mkdir('b')\n"
-    ended = run(BEGIN + code + "os.mkdir('c'); os.mkdir('d')", FAULTS_KILL_FILE=str(arm))
+    ended = play(code + "os.mkdir('c'); os.mkdir('d')", FAULTS_KILL_FILE=str(arm))
     assert ended.code == -signal.SIGKILL
     assert sorted(path.name for path in disk.root.iterdir()) == ["a", "b"]
 
 
-def test_a_process_under_test_does_not_outlive_a_harness_that_is_killed(
-    disk: Disk, run: Run
-) -> None:
+def test_a_process_under_test_does_not_outlive_a_harness_that_is_killed(run: Run) -> None:
     code = """
 import os, signal, subprocess, sys
 sleeper = [sys.executable, "-c", "import time; print(1, flush=True); time.sleep(60)"]
@@ -263,81 +281,86 @@ print(child.pid, flush=True)
 os.kill(os.getpid(), signal.SIGKILL)
 """
     pid = int(run(code).out)
-    for _ in range(500):
-        try:
-            state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
-        except (FileNotFoundError, ProcessLookupError):
-            return
-        if state == "Z":
-            return
-        time.sleep(0.01)
-    pytest.fail("it lives on")
+
+    until(lambda: has_ended(pid))
 
 
 # --- the product's own protocol, and broken ones --------------------------------------------------
 
-WRITE_WHOLE = """
-from storage.durable_files import write_atomically
-write_atomically(Path('a'), b'new' * 400)
-"""
-WITHOUT_FSYNC = """
-Path('.a.tmp').write_bytes(b'new' * 400)
-os.replace('.a.tmp', 'a')
-fd = os.open('.', os.O_RDONLY); os.fsync(fd)
-"""
-WITHOUT_FOLDER = """
-f = open('.a.tmp', 'wb'); f.write(b'new' * 400); f.flush(); os.fsync(f)
-os.replace('.a.tmp', 'a')
-"""
-IN_PLACE = """
-f = open('a', 'wb'); f.write(b'new' * 400); f.flush(); os.fsync(f)
-fd = os.open('.', os.O_RDONLY); os.fsync(fd)
-"""
+WHOLE = "from storage.durable_files import write_atomically\nwrite_atomically(Path('a'), NEW)"
+WITHOUT_FSYNC = "Path('.a.tmp').write_bytes(NEW); os.replace('.a.tmp', 'a'); sync('.')"
+WITHOUT_FOLDER = "write('.a.tmp', NEW); os.replace('.a.tmp', 'a')"
+IN_PLACE = "write('a', NEW); sync('.')"
+OVER = "f = open('a', 'r+b', buffering=0); f.write(NEW); os.fsync(f)"
+OLD, NEW = b"old" * 400, b"new" * 400
 
 
-def every_cut(disk: Disk, run: Run, code: str) -> tuple[set[bytes | None], set[bytes | None]]:
-    """What `a` may hold if the power fails at any call of `code`, and what when it has ended."""
-    found: set[bytes | None] = set()
-    number = 0
-    while True:
-        write_whole_disk(disk, {"a": Remains(b"old", 0o644)})
-        number, when = number + 1, "before"
-        ended = run(BEGIN + code, FAULTS_KILL=f"any:{number}:before")
-        found |= contents(disk, "a")
-        if ended.code == 0:
-            return found, contents(disk, "a")
-        write_whole_disk(disk, {"a": Remains(b"old", 0o644)})
-        run(BEGIN + code, FAULTS_KILL=f"any:{number}:after")
-        found |= contents(disk, "a")
-        assert number < 20, when
-
-
-def write_whole_disk(disk: Disk, tree: Tree) -> None:
-    for path in disk.root.iterdir():
-        path.unlink()
-    write_tree(tree, disk.root)
-    disk.begin()
-
-
-def test_write_whole_leaves_the_old_or_the_new_content_whatever_happens_when(
-    disk: Disk, run: Run
+@pytest.mark.parametrize(
+    ("code", "meanwhile", "at_the_end"),
+    [(WHOLE, {OLD, NEW}, {NEW}), (WITHOUT_FOLDER, {OLD, NEW}, {OLD, NEW})],
+)
+def test_an_atomic_writer_leaves_the_old_or_the_new_content_at_any_power_cut(
+    disk: Disk, play: Run, code: str, meanwhile: set[bytes], at_the_end: set[bytes]
 ) -> None:
-    found, at_the_end = every_cut(disk, run, WRITE_WHOLE)
-    assert found == {b"old", b"new" * 400}
-    assert at_the_end == {b"new" * 400}
+    assert every_cut(disk, play, code) == (meanwhile, at_the_end)
 
 
-def test_a_writer_that_renames_what_it_has_not_synced_is_caught(disk: Disk, run: Run) -> None:
-    _, at_the_end = every_cut(disk, run, WITHOUT_FSYNC)
+def test_a_writer_that_renames_what_it_has_not_synced_is_caught(disk: Disk, play: Run) -> None:
+    _, at_the_end = every_cut(disk, play, WITHOUT_FSYNC)
     assert {b"", bytes(1200)} <= at_the_end
 
 
-def test_a_writer_that_does_not_sync_the_folder_is_caught(disk: Disk, run: Run) -> None:
-    found, at_the_end = every_cut(disk, run, WITHOUT_FOLDER)
-    assert found == at_the_end == {b"old", b"new" * 400}
+@pytest.mark.parametrize("code", [IN_PLACE, OVER])
+def test_a_writer_in_place_is_caught(disk: Disk, play: Run, code: str) -> None:
+    found, at_the_end = every_cut(disk, play, code)
+    assert found - {OLD, NEW}
+    assert (b"" in found) == (code == IN_PLACE)  # which cuts the file before it writes
+    assert at_the_end == {NEW}
 
 
-def test_a_writer_in_place_is_caught(disk: Disk, run: Run) -> None:
-    found, at_the_end = every_cut(disk, run, IN_PLACE)
-    assert b"" in found
-    assert at_the_end == {b"new" * 400}
+def every_cut(disk: Disk, play: Run, code: str) -> tuple[set[bytes | None], set[bytes | None]]:
+    """What `a` may hold if the power fails at any call of `code`, and what when it has ended."""
+    found: set[bytes | None] = set()
+    for number in range(1, 20):
+        for when in ("before", "after"):
+            before(disk, a=OLD)
+            ended = play(f"NEW = {NEW!r}\n{code}", FAULTS_KILL=f"any:{number}:{when}")
+            found |= contents(disk, "a")
+            if ended.code == 0:
+                return found, contents(disk, "a")
+    raise AssertionError("it makes ever more calls")
+
+
+SEAL = """
+real, left_out = os.fsync, {left_out!r}
+def fsync(descriptor):
+    number = descriptor if isinstance(descriptor, int) else descriptor.fileno()
+    if left_out not in os.readlink(f"/proc/self/fd/{{number}}"):
+        real(descriptor)
+os.fsync = fsync
+from service.sessions.recovery import recover_locked_folder
+recover_locked_folder(Path("."))
+"""
+
+
+@pytest.mark.parametrize(
+    ("left_out", "finding"),
+    [
+        ("nothing", None),
+        (".frames.parquet", "frames.parquet of .* is damaged"),
+        (".session.json", "session.json of .* is damaged"),
+    ],
+)
+def test_a_sync_that_is_missing_in_the_product_is_found_by_the_cuts_behind_it(
+    disk: Disk, play: Run, left_out: str, finding: str | None
+) -> None:
+    stream(disk.root, info_of(), (0, 99), next_seq=100)
+    session(disk.root)
+    disk.begin()
+    assert play(SEAL.format(left_out=left_out)).code == 0
+    assert loaded(disk.root).state == "sealed"
+    rng = random.Random(1)
+    trees = [disk.possible(RandomDraws(rng)) for _ in range(40)]
+    found = " ".join(said for tree in trees for said in sessions_are_whole(tree, ID))
+    assert bool(found) == (finding is not None), found
+    assert finding is None or re.search(finding, found)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import socket
+import socketserver
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
+from typing import Any
 
 import pytest
 
@@ -14,40 +16,32 @@ from tests.faults.proxy import Proxy, Quality
 from tests.waiting import PATIENCE_S
 
 
-class Echo:
-    """A server that sends back what it hears."""
+class Echo(socketserver.ThreadingTCPServer):
+    """A server that sends back what it hears, in a thread of its own."""
+
+    allow_reuse_address = True
 
     def __init__(self, port: int = 0) -> None:
-        self._listening = socket.create_server(("127.0.0.1", port))
-        self.port: int = self._listening.getsockname()[1]
         self._open: list[socket.socket] = []
-        self._threads = [threading.Thread(target=self._accept)]
-        self._threads[0].start()
+        super().__init__(("127.0.0.1", port), None)  # type: ignore[arg-type]  # `finish_request` is ours
+        self.port: int = self.server_address[1]
+        self._thread = threading.Thread(target=self.serve_forever, args=(0.02,))
+        self._thread.start()
 
-    def stop(self) -> None:
-        self._listening.shutdown(socket.SHUT_RDWR)
-        self._listening.close()
+    def finish_request(self, request: Any, client_address: Any) -> None:
+        self._open.append(request)
+        with suppress(OSError):
+            while data := request.recv(65536):
+                request.sendall(data)
+
+    def close(self) -> None:
+        self.shutdown()
         for connection in self._open:
             with suppress(OSError):
                 connection.shutdown(socket.SHUT_RDWR)
-        for thread in self._threads:
-            thread.join(5.0)
-            assert not thread.is_alive()
-
-    def _accept(self) -> None:
-        with suppress(OSError):
-            while True:
-                connection, _ = self._listening.accept()
-                self._open.append(connection)
-                thread = threading.Thread(target=self._serve, args=(connection,))
-                self._threads.append(thread)
-                thread.start()
-
-    @staticmethod
-    def _serve(connection: socket.socket) -> None:
-        with connection, suppress(OSError):
-            while data := connection.recv(65536):
-                connection.sendall(data)
+        self.server_close()
+        self._thread.join(5.0)
+        assert not self._thread.is_alive()
 
 
 class Heard:
@@ -68,8 +62,7 @@ class Heard:
 def echo() -> Iterator[Echo]:
     server = Echo()
     yield server
-    with suppress(OSError):
-        server.stop()
+    server.close()
 
 
 @pytest.fixture
@@ -115,47 +108,41 @@ def test_a_cut_link_resets_what_is_open_and_what_is_opened_and_comes_back_on_the
         assert answer(connection, b"again") == b"again"
 
 
-def test_in_a_black_hole_nobody_hears_anything_and_it_all_comes_late(proxy: Proxy) -> None:
-    with connect(proxy) as connection:
-        assert answer(connection, b"hello") == b"hello"
+@pytest.mark.parametrize("is_begun_before", [True, False])
+def test_in_a_black_hole_nobody_hears_anything_and_it_all_comes_late(
+    proxy: Proxy, is_begun_before: bool
+) -> None:
+    if not is_begun_before:
         proxy.black_hole()
+    with connect(proxy) as connection:
+        if is_begun_before:
+            assert answer(connection, b"hello") == b"hello"
+            proxy.black_hole()
         connection.sendall(b"lost?")
         connection.settimeout(0.2)
         with pytest.raises(TimeoutError):
             connection.recv(1)
         proxy.mend()
-        connection.settimeout(10.0)
+        connection.settimeout(PATIENCE_S)
         assert connection.recv(5) == b"lost?"
 
 
-def test_a_connection_begun_in_a_black_hole_is_open_and_silent(proxy: Proxy) -> None:
-    proxy.black_hole()
-    with connect(proxy) as connection:
-        connection.sendall(b"hello")
-        connection.settimeout(0.2)
-        with pytest.raises(TimeoutError):
-            connection.recv(1)
-        proxy.mend()
-        connection.settimeout(10.0)
-        assert connection.recv(5) == b"hello"
-
-
-def test_what_is_delayed_comes_in_order_and_not_before(proxy: Proxy) -> None:
-    proxy.quality = Quality(delay_s=0.1, jitter_s=0.1)
+@pytest.mark.parametrize(
+    ("quality", "size", "least_s"),
+    [
+        (Quality(delay_s=0.1, jitter_s=0.1), 25_600, 0.2),  # both ways
+        (Quality(bytes_per_s=100_000), 40_000, 0.35),
+    ],
+)
+def test_delayed_or_throttled_bytes_come_in_order_and_not_early(
+    proxy: Proxy, quality: Quality, size: int, least_s: float
+) -> None:
+    proxy.quality = quality
     with connect(proxy) as connection:
         begin_s = time.monotonic()
-        data = bytes(range(256)) * 100
+        data = (bytes(range(256)) * 200)[:size]
         assert answer(connection, data) == data
-        assert time.monotonic() - begin_s >= 0.2  # both ways
-
-
-def test_a_throttled_link_takes_as_long_as_it_must(proxy: Proxy) -> None:
-    proxy.quality = Quality(bytes_per_s=100_000)
-    with connect(proxy) as connection:
-        begin_s = time.monotonic()
-        data = bytes(40_000)
-        assert answer(connection, data) == data
-        assert time.monotonic() - begin_s >= 0.35
+        assert time.monotonic() - begin_s >= least_s
 
 
 def test_bits_flip_on_the_way_to_the_server_only_and_are_counted(echo: Echo) -> None:
@@ -180,12 +167,9 @@ def test_bits_that_begin_to_flip_while_a_connection_is_open_flip(proxy: Proxy) -
 
 
 def test_a_dead_server_is_a_reset_and_one_that_is_back_is_reached(proxy: Proxy, echo: Echo) -> None:
-    echo.stop()
+    echo.close()
     with suppress(ConnectionResetError), connect(proxy) as connection:
         assert connection.recv(1) == b""
     again = Echo(echo.port)
-    try:
-        with connect(proxy) as connection:
-            assert answer(connection, b"again") == b"again"
-    finally:
-        again.stop()
+    with closing(again), connect(proxy) as connection:
+        assert answer(connection, b"again") == b"again"

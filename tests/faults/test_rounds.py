@@ -19,9 +19,8 @@ import pytest
 
 from tests.faults.checks import findings, sessions_are_whole
 from tests.faults.draws import RandomDraws
-from tests.faults.machines import Machine, RoundError, wait_for
+from tests.faults.machines import RoundError, wait_for
 from tests.faults.power import read_tree
-from tests.faults.product import Product, product
 from tests.faults.rounds import play
 from tests.faults.stage import Stage
 from tests.faults.stories import (
@@ -59,16 +58,6 @@ STORIES_ALONE = {
     "alone, no power at the end": ("power_and_recover",),
 }
 
-EVERYTHING = Product(node_journal=True, node_record=True, verify=True, recover=True)
-
-
-@pytest.fixture
-def journal() -> Product:
-    """The product, whose node keeps a journal, alone as well: only then is nothing lost."""
-    what = product()
-    assert what == EVERYTHING
-    return what
-
 
 def test_the_chosen_stories_show_every_kind_of_fault() -> None:
     assert {kind for kinds in STORIES.values() for kind in kinds} == {*ANYTIME, *AT_THE_END, *FULL}
@@ -77,11 +66,11 @@ def test_the_chosen_stories_show_every_kind_of_fault() -> None:
 
 
 def test_a_seed_is_a_story_and_nobody_is_asked_to_fill_a_disk_who_may_not() -> None:
-    drawn = [draw_story(seed, EVERYTHING, may_mount=True) for seed in range(500)]
-    assert drawn == [draw_story(seed, EVERYTHING, may_mount=True) for seed in range(500)]
+    drawn = [draw_story(seed, may_mount=True) for seed in range(500)]
+    assert drawn == [draw_story(seed, may_mount=True) for seed in range(500)]
     kinds = {fault.kind for story in drawn for fault in story.faults}
     assert kinds == {*ANYTIME, *AT_THE_END, *FULL, *ALONE, *AT_THE_END_ALONE}
-    modest = [draw_story(seed, EVERYTHING, may_mount=False) for seed in range(500)]
+    modest = [draw_story(seed, may_mount=False) for seed in range(500)]
     assert not any(story.small_disk_of for story in modest)
 
 
@@ -93,7 +82,7 @@ def test_a_seed_is_a_story_and_nobody_is_asked_to_fill_a_disk_who_may_not() -> N
         for name in (*STORIES, *STORIES_ALONE)
     ],
 )
-def test_a_chosen_round_is_good(name: str, tmp_path: Path, journal: Product) -> None:
+def test_a_chosen_round_is_good(name: str, tmp_path: Path) -> None:
     if name.startswith("full") and os.geteuid() != 0:
         pytest.skip("to mount a small disk one has to be root")
     kinds = STORIES.get(name) or STORIES_ALONE[name]
@@ -131,19 +120,7 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
 def judge(stage: Stage) -> None:
     """The session is what it has to be."""
     for facts in stage.end():
-        assert not findings(facts, product()), stage.log
-
-
-def dies(machine: Machine) -> None:
-    """The kill that was chosen comes; then all its processes are gone."""
-    wait_for(f"the {machine.name} is killed", lambda: not machine.is_alive, 20.0)
-    machine.kill()
-
-
-def server_again(stage: Stage) -> None:
-    stage.server.start()
-    stage.server.wait_ready()
-    stage.wait_back()
+        assert not findings(facts), stage.log
 
 
 def stop_until_it_dies(stage: Stage, call: str) -> bool:
@@ -167,58 +144,44 @@ def stop_until_it_dies(stage: Stage, call: str) -> bool:
 
 @pytest.mark.soak
 @pytest.mark.real_time
-def test_a_server_killed_at_each_call_of_stopping_and_sealing_seals_all_the_same(
-    stage: Stage,
-) -> None:
-    number = 1
-    while stop_until_it_dies(stage, f"{CALLS}@sessions/:{number}:before"):
-        assert not sessions_are_whole(read_tree(stage.server.root), stage.session_id), number
-        number += 1
-        assert number < _CALLS_MAX
-    assert number > 6
-    judge(stage)
-
-
-@pytest.mark.soak
-@pytest.mark.real_time
-def test_a_power_cut_after_each_call_of_stopping_and_sealing_leaves_every_session_whole(
-    stage: Stage, journal: Product
+@pytest.mark.parametrize(("when", "is_power"), [("before", False), ("after", True)])
+def test_a_server_that_dies_at_each_call_of_stopping_and_sealing_leaves_every_session_whole(
+    stage: Stage, when: str, is_power: bool
 ) -> None:
     rng = random.Random(5)
     number = 1
-    while stop_until_it_dies(stage, f"{CALLS}@sessions/:{number}:after"):
-        stage.server.kill()
-        for _ in range(_DRAWS):
-            tree = stage.server.disk.possible(RandomDraws(rng))
-            assert not sessions_are_whole(tree, stage.session_id), number
-        stage.server.cut_power(rng)
+    while stop_until_it_dies(stage, f"{CALLS}@sessions/:{number}:{when}"):
+        if not is_power:
+            assert not sessions_are_whole(read_tree(stage.server.root), stage.session_id), number
+        else:
+            stage.server.kill()
+            for _ in range(_DRAWS):
+                tree = stage.server.disk.possible(RandomDraws(rng))
+                assert not sessions_are_whole(tree, stage.session_id), number
+            stage.server.cut_power(rng)
         number += 1
         assert number < _CALLS_MAX
     assert number > 6
-    judge(stage)
-
-
-@pytest.mark.soak
-@pytest.mark.real_time
-def test_a_server_killed_at_syncs_of_its_journal_keeps_what_it_has_promised(stage: Stage) -> None:
-    for call in SYNCS:
-        stage.server.kill_at(call)
-        dies(stage.server)
-        server_again(stage)
     judge(stage)
 
 
 @pytest.mark.real_time
 @pytest.mark.in_turn(each=True)
-def test_a_server_without_power_at_syncs_of_its_journal_keeps_what_it_has_promised(
-    stage: Stage, journal: Product
+@pytest.mark.parametrize("how", [pytest.param("killed", marks=pytest.mark.soak), "power"])
+def test_a_server_that_dies_at_syncs_of_its_journal_keeps_what_it_has_promised(
+    stage: Stage, how: str
 ) -> None:
     rng = random.Random(6)
+    server = stage.server
     for call in SYNCS:
-        stage.server.kill_at(call)
-        dies(stage.server)
-        stage.note(f"{call}, power of the server: {stage.server.cut_power(rng)}")
-        server_again(stage)
+        server.kill_at(call)
+        wait_for("the server is killed", lambda: not server.is_alive, 20.0)
+        server.kill()
+        if how == "power":
+            stage.note(f"{call}, power of the server: {server.cut_power(rng)}")
+        server.start()
+        server.wait_ready()
+        stage.wait_back()
     judge(stage)
 
 
@@ -226,7 +189,7 @@ def test_a_server_without_power_at_syncs_of_its_journal_keeps_what_it_has_promis
 @pytest.mark.in_turn(each=True)
 @pytest.mark.parametrize("how", [pytest.param("killed", marks=pytest.mark.soak), "power"])
 def test_a_node_killed_at_syncs_of_its_journal_loses_no_more_than_it_says(
-    stage: Stage, journal: Product, how: str
+    stage: Stage, how: str
 ) -> None:
     rng = random.Random(7)
     for call in ("any@journal/:1:before", "fsync@journal/:2:after", "fsync@journal/:1:before"):

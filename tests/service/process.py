@@ -104,3 +104,10 @@ def acquisition_of(node: Process) -> int:
         if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
     )
     return found
+
+
+def has_ended(pid: int) -> bool:
+    """Return whether a process is gone, or a zombie."""
+    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
+    return True

@@ -5,6 +5,7 @@ Standard library only, and nothing of the product. Everything is off unless the 
     FAULTS_ROOT       the folder that is watched
     FAULTS_LOG        where calls are noted, a line of JSON each, outside of that folder
     FAULTS_GRAVEYARD  what loses its name is kept here until that is durable; same file system
+    FAULTS_SYNCED     what each file held at its last fsync
     FAULTS_KILL       KIND[+KIND...][@PART_OF_PATH]:N[:before|after]: SIGKILL at the Nth such call
     FAULTS_KILL_FILE  a file that may appear later, with the same in it; counting begins then
     FAULTS_SLOW       a file with the seconds that every fsync takes longer
@@ -22,16 +23,11 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 from fault_kill import KillPoint
 
-ROOT_ENV = "FAULTS_ROOT"
-LOG_ENV = "FAULTS_LOG"
-GRAVEYARD_ENV = "FAULTS_GRAVEYARD"
-KILL_ENV = "FAULTS_KILL"
-KILL_FILE_ENV = "FAULTS_KILL_FILE"
-SLOW_ENV = "FAULTS_SLOW"
 _NAMES = (
     *("fsync", "fdatasync", "rename", "replace", "unlink", "remove", "mkdir", "rmdir", "link"),
     *("open", "close", "write", "read", "stat", "fstat", "scandir", "readlink"),
@@ -41,16 +37,8 @@ _real = {name: getattr(os, name) for name in _NAMES}
 
 def install_from_environment() -> None:
     """Watch this process if the environment says so."""
-    environment = os.environ
-    if root := environment.get(ROOT_ENV):
-        _Recorder(
-            os.path.realpath(root),
-            log=environment.get(LOG_ENV),
-            graveyard=environment.get(GRAVEYARD_ENV),
-            kill=environment.get(KILL_ENV),
-            kill_file=environment.get(KILL_FILE_ENV),
-            slow_file=environment.get(SLOW_ENV),
-        ).install()
+    if root := os.environ.get("FAULTS_ROOT"):
+        _Recorder(os.path.realpath(root)).install()
 
 
 def scan(folder: str | int) -> dict[str, tuple[int, str]]:
@@ -63,27 +51,21 @@ def scan(folder: str | int) -> dict[str, tuple[int, str]]:
 
 
 class _Recorder:
-    def __init__(
-        self,
-        root: str,
-        *,
-        log: str | None,
-        graveyard: str | None,
-        kill: str | None,
-        kill_file: str | None,
-        slow_file: str | None,
-    ) -> None:
+    def __init__(self, root: str) -> None:
         self._root = root
-        self._graveyard = graveyard
+        self._graveyard = os.environ.get("FAULTS_GRAVEYARD")
+        self._synced_copies = os.environ.get("FAULTS_SYNCED")
         self._log = -1
-        if log is not None:
+        if log := os.environ.get("FAULTS_LOG"):
             self._log = _real["open"](log, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+        kill = os.environ.get("FAULTS_KILL")
         self._kill = KillPoint(kill) if kill else None
-        self._kill_file = kill_file
-        self._slow_file = slow_file
+        self._kill_file = os.environ.get("FAULTS_KILL_FILE")
+        self._slow_file = os.environ.get("FAULTS_SLOW")
         # A listing taken while names change would be neither the old nor the new one.
         self._lock = threading.RLock()
         self._graves: dict[int, list[tuple[str, int]]] = {}
+        self._copies: dict[int, tuple[int, str]] = {}
         self._count = 0
 
     def install(self) -> None:
@@ -122,10 +104,15 @@ class _Recorder:
             before = _real["fstat"](number)
             is_folder = stat.S_ISDIR(before.st_mode)
             names: dict[str, tuple[int, str]] = {}
+            copy = None
             with self._lock:
                 t_ns = time.monotonic_ns()
                 if is_folder:
                     names = scan(number)
+                elif self._synced_copies is not None:
+                    self._count += 1
+                    copy = os.path.join(self._synced_copies, f"{os.getpid()}-{self._count}")
+                    _copy(f"/proc/self/fd/{number}", copy)
                 graves = self._graves.pop(before.st_ino, []) if is_folder else []
             self._point("fsync", path, "before")
             self._dawdle()
@@ -135,7 +122,10 @@ class _Recorder:
             if is_folder:
                 self._note(e="folder", t=t_ns, ino=before.st_ino, names=names, path=path)
             else:
-                self._note(e="file", t=t_ns, ino=before.st_ino, len=before.st_size, path=path)
+                facts = {"ino": before.st_ino, "len": before.st_size, "copy": copy}
+                self._note(e="file", t=t_ns, **facts, path=path)
+                if copy is not None:
+                    self._keep_newest(before.st_ino, t_ns, copy)
             self._bury(graves)
             self._point("fsync", path, "after")
 
@@ -144,61 +134,37 @@ class _Recorder:
     # --- what changes names -----------------------------------------------------------------------
 
     def _moved(self, name: str) -> Callable[..., None]:
-        real = _real[name]
+        def move(src: Any, dst: Any, **of: Any) -> None:
+            old, new = _place(src, of.get("src_dir_fd")), _place(dst, of.get("dst_dir_fd"))
 
-        def move(
-            src: Any, dst: Any, *, src_dir_fd: int | None = None, dst_dir_fd: int | None = None
-        ) -> None:
-            def act() -> None:
-                real(src, dst, src_dir_fd=src_dir_fd, dst_dir_fd=dst_dir_fd)
-
-            old, new = _place(src, src_dir_fd), _place(dst, dst_dir_fd)
-            if not (self._inside(old) or self._inside(new)):
-                act()
-                return
-            self._point(name, new, "before")
-            with self._lock:
+            def changes() -> tuple[_Change, ...]:
                 inode = _inode(old)
-                self._changing(act, (old, inode, None), (new, _inode(new), inode))
-            self._point(name, new, "after")
+                return (old, inode, None), (new, _inode(new), inode)
+
+            is_inside = self._inside(old) or self._inside(new)
+            self._act(name, new, lambda: _real[name](src, dst, **of), changes, is_inside)
 
         return move
 
     def _unlinked(self, name: str) -> Callable[..., None]:
-        real = _real[name]
-
         def unlink(path: Any, *, dir_fd: int | None = None) -> None:
-            def act() -> None:
-                real(path, dir_fd=dir_fd)
-
             place = _place(path, dir_fd)
-            if not self._inside(place):
-                act()
-                return
-            self._point("unlink", place, "before")
-            with self._lock:
-                self._changing(act, (place, _inode(place), None))
-            self._point("unlink", place, "after")
+            act = partial(_real[name], path, dir_fd=dir_fd)
+            self._act("unlink", place, act, lambda: ((place, _inode(place), None),))
 
         return unlink
 
     def _rmdir(self, path: Any, *, dir_fd: int | None = None) -> None:
         place = _place(path, dir_fd)
-        if not self._inside(place):
-            _real["rmdir"](path, dir_fd=dir_fd)
-            return
 
         def act() -> None:
-            grave = self._grave()
+            grave = self._grave() if self._inside(place) else None
             if grave is None or _inode(place) is None or scan(place):
                 _real["rmdir"](path, dir_fd=dir_fd)  # complains as it should
             else:
                 _real["rename"](place, grave)  # a folder can have no second name
 
-        self._point("rmdir", place, "before")
-        with self._lock:
-            self._changing(act, (place, _inode(place), None))
-        self._point("rmdir", place, "after")
+        self._act("rmdir", place, act, lambda: ((place, _inode(place), None),))
 
     def _mkdir(self, path: Any, mode: int = 0o777, *, dir_fd: int | None = None) -> None:
         place = _place(path, dir_fd)
@@ -214,32 +180,27 @@ class _Recorder:
         if inside:
             self._point("mkdir", place, "after")
 
-    def _link(
-        self,
-        src: Any,
-        dst: Any,
-        *,
-        src_dir_fd: int | None = None,
-        dst_dir_fd: int | None = None,
-        follow_symlinks: bool = True,
-    ) -> None:
-        def act() -> None:
-            _real["link"](
-                src,
-                dst,
-                src_dir_fd=src_dir_fd,
-                dst_dir_fd=dst_dir_fd,
-                follow_symlinks=follow_symlinks,
-            )
+    def _link(self, src: Any, dst: Any, **of: Any) -> None:
+        old, new = _place(src, of.get("src_dir_fd")), _place(dst, of.get("dst_dir_fd"))
+        act = partial(_real["link"], src, dst, **of)
+        self._act("link", new, act, lambda: ((new, None, _inode(old)),))
 
-        new = _place(dst, dst_dir_fd)
-        if not self._inside(new):
+    def _act(
+        self,
+        kind: str,
+        place: str,
+        act: Callable[[], None],
+        changes: Callable[[], tuple[_Change, ...]],
+        is_inside: bool | None = None,
+    ) -> None:
+        """Do what gives and takes names; in the watched folder it is noted, and can be undone."""
+        if not (self._inside(place) if is_inside is None else is_inside):
             act()
             return
-        self._point("link", new, "before")
+        self._point(kind, place, "before")
         with self._lock:
-            self._changing(act, (new, None, _inode(_place(src, src_dir_fd))))
-        self._point("link", new, "after")
+            self._changing(act, *changes())
+        self._point(kind, place, "after")
 
     def _audit(self, event: str, arguments: tuple[Any, ...]) -> None:
         """Before a file is cut: keep what is cut off, which may be on the disk again later."""
@@ -262,17 +223,15 @@ class _Recorder:
             return
         grave = self._grave()
         assert grave is not None
-        source = _real["open"](path, os.O_RDONLY)
-        target = _real["open"](grave, os.O_WRONLY | os.O_CREAT, 0o600)
-        try:
-            offset = length
-            while piece := os.pread(source, 1 << 20, offset):
-                _real["write"](target, piece)
-                offset += len(piece)
-        finally:
-            _real["close"](source)
-            _real["close"](target)
+        _copy(path, grave, length)
         self._note(e="cut", t=time.monotonic_ns(), ino=before.st_ino, len=length, tail=grave)
+
+    def _keep_newest(self, inode: int, t_ns: int, copy: str) -> None:
+        with self._lock:
+            older, newest = sorted([self._copies.get(inode, (0, "")), (t_ns, copy)])
+            self._copies[inode] = newest
+        if older[1]:
+            _real["unlink"](older[1])
 
     def _changing(self, act: Callable[[], None], *changes: _Change) -> None:
         """Do `act`, which gives and takes names, so that it can be undone."""
@@ -353,6 +312,19 @@ class _Recorder:
 
 _Change = tuple[str, tuple[int, str] | None, tuple[int, str] | None]
 """A path, and its inode and type before and after."""
+
+
+def _copy(path: str, to: str, offset: int = 0) -> None:
+    """Copy a file from an offset on."""
+    source = _real["open"](path, os.O_RDONLY)
+    target = _real["open"](to, os.O_WRONLY | os.O_CREAT, 0o600)
+    try:
+        while piece := os.pread(source, 1 << 20, offset):
+            _real["write"](target, piece)
+            offset += len(piece)
+    finally:
+        _real["close"](source)
+        _real["close"](target)
 
 
 def _path_of(descriptor: int) -> str:
