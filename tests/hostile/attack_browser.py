@@ -61,11 +61,7 @@ def page_of_an_attacker(play: Play) -> Outcome:
     if CHROMIUM is None:
         pytest.skip("no Chromium; on Debian: sudo apt-get install chromium")
     outcome = Outcome()
-    with (
-        Served(play.folder) as served,
-        _site() as foreign,
-        sync_playwright() as playwright,
-    ):
+    with Served(play.folder) as served, _site() as foreign, sync_playwright() as playwright:
         options = [*CHROMIUM_OPTIONS, f"--host-resolver-rules={NAMES}"]
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=options)
         try:

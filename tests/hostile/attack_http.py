@@ -16,10 +16,7 @@ TOKEN = "hostile-token"  # noqa: S105  # of this test
 
 
 @attack(
-    "requests drawn from the API's description, `serve`",
-    tries=8,
-    soak_tries=12_000,
-    is_alone=False,
+    "requests drawn from the API's description, `serve`", tries=8, soak_tries=12_000, is_alone=False
 )
 def of_serve(play: Play) -> Outcome:
     """Operations of a server on loopback, with drawn parameters and bodies, right and wrong.

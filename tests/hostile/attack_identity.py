@@ -12,7 +12,7 @@ from websockets.exceptions import ConnectionClosed
 from service.node_identity import generate_secret
 from service.protocol import Challenge, Proof
 from tests.hostile.attack import Outcome, Play, attack
-from tests.hostile.stage import Served, recording, traces
+from tests.hostile.stage import Served, recording
 from tests.service.fake_node import Earlier, FakeNode
 
 _HOUR_NS = 3_600_000_000_000
@@ -30,7 +30,7 @@ def takeovers(play: Play) -> Outcome:
     node's connection ends, or its recording is not complete.
     """
     outcome = Outcome()
-    with Served(play.folder) as served, recording(served, outcome) as node:
+    with Served(play.folder, outcome=outcome) as served, recording(served, outcome) as node:
         for number in range(play.tries):
             time.sleep(play.random.uniform(0.1, 0.4))
             happened = _take_over(served, node, play.random)
@@ -38,11 +38,14 @@ def takeovers(play: Play) -> Outcome:
                 outcome.saw(happened)
             else:
                 outcome.failed(f"try {number}: {happened}; the log ends with {served.log[-3:]}")
-        time.sleep(0.5)
-        if not served.node()["connected"]:
-            outcome.failures.append("the node is no longer connected")
-        outcome.failures += traces(served)[:5]
+        _check_connected(served, outcome)
     return outcome
+
+
+def _check_connected(served: Served, outcome: Outcome) -> None:
+    time.sleep(0.5)
+    if not served.node()["connected"]:
+        outcome.failures.append("the node is no longer connected")
 
 
 class _Stranger(FakeNode):
@@ -90,16 +93,13 @@ def frames_ahead(play: Play) -> Outcome:
     true frames of the same numbers.
     """
     outcome = Outcome()
-    with Served(play.folder) as served, recording(served, outcome) as node:
+    with Served(play.folder, outcome=outcome) as served, recording(served, outcome) as node:
         for _ in range(play.tries):
             time.sleep(0.05)
             outcome.saw(_send_ahead(node, play.random))
-        time.sleep(0.5)
-        if not served.node()["connected"]:
-            outcome.failures.append("the node is no longer connected")
+        _check_connected(served, outcome)
         if "ahead" not in " ".join(served.node()["warnings"]):
             outcome.failures.append("no warning counts the frames that were refused")
-        outcome.failures += traces(served)[:5]
         outcome.failures += _find_forged(served, node)
     return outcome
 

@@ -9,7 +9,7 @@ from functools import partial
 
 import foottile
 from tests.hostile.attack import Outcome, Play, attack
-from tests.hostile.stage import Served, traces
+from tests.hostile.stage import Served
 from tests.service.fake_node import FakeNode
 from tests.waiting import until
 
@@ -67,7 +67,8 @@ def killed(play: Play) -> Outcome:
     told of a loss; if the two have not the same numbers; if the server grows by more than 100 MB,
     or speaks of a bug.
     """
-    outcome, served = Outcome(), Served(play.folder)
+    outcome = Outcome()
+    served = Served(play.folder, outcome=outcome)
     with ExitStack() as stack:
         server = stack.enter_context(ExitStack())
         server.enter_context(served)
@@ -90,7 +91,6 @@ def killed(play: Play) -> Outcome:
             outcome.figures["the server grew by"] = f"{served.rss_mb - rss_mb:.1f} MB"
             if served.rss_mb - rss_mb > _GROWN_MAX_MB:
                 outcome.failed(f"the server grew by {served.rss_mb - rss_mb:.0f} MB")
-            outcome.failures += traces(served)
             served.process.process.kill()
             stalled.close()
             began_s = time.monotonic()
@@ -116,5 +116,4 @@ def killed(play: Play) -> Outcome:
                 outcome.failed("; ".join(wrong))
             else:
                 outcome.saw("every frame came once, to each")
-        outcome.failures += traces(served)
     return outcome

@@ -45,7 +45,7 @@ from tests.builders.calibrations import make_calibration, make_effects, newton_t
 from tests.builders.frames import make_frames, with_columns
 from tests.builders.odd_values import ODD_VALUES
 from tests.hostile.attack import Outcome, Play, attack
-from tests.hostile.stage import Served, recording, traces
+from tests.hostile.stage import Served, recording
 from tests.hostile.wrong_messages import DEEP, checked_text, damaged, wrong_batch, wrong_text
 
 _SIDE_BY_SIDE = 4
@@ -71,17 +71,15 @@ def messages(play: Play) -> Outcome:
     folder, or `foottile verify` finds damage in it.
     """
     outcome = Outcome()
-    with Served(play.folder) as served:
+    with Served(play.folder, outcome=outcome) as served:
         with recording(served, outcome):
             asyncio.run(_attacked(play, served, outcome))
         _check_gap(outcome)
         for number in range(_SIDE_BY_SIDE):
             asyncio.run(_name_is_free(served, number, outcome))
-        outcome.failures += traces(served)[:5]
-    with Served(play.folder) as again:
+    with Served(play.folder, outcome=outcome) as again:
         if not again.http.get("/nodes").json()["items"]:
             outcome.failures.append("after a restart the server knows no node")
-        outcome.failures += traces(again)[:5]
     _check_files(play.folder / "data", outcome)
     return outcome
 

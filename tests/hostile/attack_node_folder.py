@@ -21,8 +21,8 @@ from storage.wire import encode_as_messages
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames
 from tests.hostile.attack import Outcome, Play, attack
-from tests.hostile.damages import DAMAGES, plays
-from tests.hostile.data_folders import copied, digest, sha
+from tests.hostile.damages import damaged_copies
+from tests.hostile.data_folders import digest
 from tests.waiting import until
 
 BOOTS = ("a" * 32, "b" * 32)
@@ -72,12 +72,7 @@ def folder_of_a_node(play: Play) -> Outcome:
     """
     outcome = Outcome()
     data = node_folder(play.folder / "node")
-    for path, damage in plays(data, play.tries, play.random):
-        what = f"{path} {damage}"
-        copy = copied(data, play.folder / "copy")
-        DAMAGES[damage](copy / path, play.random)
-        is_same = (copy / path).is_file() and sha(copy / path) == sha(data / path)
-        is_same = is_same and not (copy / path).is_symlink()
+    for copy, path, what, is_same in damaged_copies(data, play):
         try:
             wrong, said = _goes_on(copy, [boot for boot in BOOTS if boot not in path.parts])
         except FootTileError as error:

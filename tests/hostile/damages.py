@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import filecmp
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from random import Random
+
+from tests.hostile.attack import Play
 
 FOREIGN = {
     "an empty list": b"[]",
@@ -23,6 +27,9 @@ def files_of(folder: Path) -> list[Path]:
     return sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
 
 
+Damage = Callable[[Path, Random], None]
+
+
 def _flipped(path: Path, random: Random) -> None:
     content = bytearray(path.read_bytes())
     if content:
@@ -35,24 +42,18 @@ def _cut(path: Path, random: Random) -> None:
     path.write_bytes(content[: random.randrange(len(content) or 1)])
 
 
-def _empty(path: Path, _: Random) -> None:
-    path.write_bytes(b"")
-
-
 def _folder(path: Path, _: Random) -> None:
     path.unlink()
     path.mkdir()
     (path / "inside").write_bytes(b"x")
 
 
-def _nowhere(path: Path, _: Random) -> None:
-    path.unlink()
-    path.symlink_to("nowhere")
+def _linked(target: str) -> Damage:
+    def linked(path: Path, _: Random) -> None:
+        path.unlink()
+        path.symlink_to(target)
 
-
-def _endless(path: Path, _: Random) -> None:
-    path.unlink()
-    path.symlink_to("/dev/zero")
+    return linked
 
 
 def _moved(path: Path, _: Random) -> None:
@@ -70,42 +71,54 @@ def _forbidden(path: Path, _: Random) -> None:
     path.chmod(0)
 
 
-def _foreign(content: bytes) -> Callable[[Path, Random], None]:
+def _replaced(content: bytes) -> Damage:
     def replaced(path: Path, _: Random) -> None:
         path.write_bytes(content)
 
     return replaced
 
 
-DAMAGES: dict[str, Callable[[Path, Random], None]] = {
+DAMAGES: dict[str, Damage] = {
     "a bit flipped": _flipped,
     "cut off": _cut,
-    "emptied": _empty,
+    "emptied": _replaced(b""),
     "replaced by a folder": _folder,
-    "replaced by a link to nowhere": _nowhere,
-    "replaced by a link to /dev/zero": _endless,
+    "replaced by a link to nowhere": _linked("nowhere"),
+    "replaced by a link to /dev/zero": _linked("/dev/zero"),
     "replaced by a link to itself elsewhere": _moved,
     "replaced by a pipe": _pipe,
-    **{f"replaced by {name}": _foreign(content) for name, content in FOREIGN.items()},
+    **{f"replaced by {name}": _replaced(content) for name, content in FOREIGN.items()},
     # Root may read everything.
     **({} if os.geteuid() == 0 else {"forbidden": _forbidden}),
 }
 
 
-def plays(folder: Path, tries: int, random: Random) -> Iterator[tuple[Path, str]]:
-    """Files and what happens to them: every pair once in random order, then again from the start.
+NO_FILE = [
+    name for name in DAMAGES if name.endswith(("folder", "nowhere", "zero", "where", "pipe"))
+]
+"""Damages after which there is no file any more."""
 
-    Of the flips there are as many as of all other damages together.
+
+def damaged_copies(folder: Path, play: Play) -> Iterator[tuple[Path, Path, str, bool]]:
+    """Copies with each damage of each file once in random order, then again from the start.
+
+    Of each: the copy, the damaged file in it, file and damage in words, and whether the file has
+    its content all the same. There are as many flips as all other damages together.
     """
-    files = files_of(folder)
+    files, copy = files_of(folder), play.folder / "copy"
     others = [name for name in DAMAGES if name != "a bit flipped"]
     pairs = [(path, name) for path in files for name in others]
     done = 0
-    while done < tries:
-        random.shuffle(pairs)
-        for path, name in pairs:
-            yield path, name
-            yield random.choice(files), "a bit flipped"
+    while done < play.tries:
+        play.random.shuffle(pairs)
+        for pair in pairs:
+            for path, name in (pair, (play.random.choice(files), "a bit flipped")):
+                shutil.rmtree(copy, ignore_errors=True)
+                shutil.copytree(folder, copy)
+                DAMAGES[name](copy / path, play.random)
+                is_file = (copy / path).is_file() and not (copy / path).is_symlink()
+                is_same = is_file and filecmp.cmp(copy / path, folder / path, shallow=False)
+                yield copy, path, f"{path} {name}", is_same
             done += 2
-            if done >= tries:
+            if done >= play.tries:
                 return

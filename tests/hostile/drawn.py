@@ -65,19 +65,14 @@ def play_drawn(served: Served, play: Play, *, token: str | None = None) -> Outco
                 n = min(at_once, play.tries - outcome.tries)
                 if n > 0:
                     _play(operation, mode, n, play.random.randrange(2**32), ask)
-    if found := traces(served):
-        outcome.failures.append(f"the log: {found[:5]}")
+    outcome.failures += [f"the log: {line}" for line in traces(served)[:5]]
     if served.http.get("/ready").status_code != HTTPStatus.OK:
         outcome.failures.append("the server is not ready any more")
     return outcome
 
 
 def _play(
-    operation: Any,
-    mode: GenerationMode,
-    n: int,
-    drawn: int,
-    ask: Callable[[AnyCase], None],
+    operation: Any, mode: GenerationMode, n: int, drawn: int, ask: Callable[[AnyCase], None]
 ) -> None:
     @seed(drawn)
     @settings(

@@ -28,6 +28,7 @@ class Served(Running):
     Args:
         folder: for its data and its output.
         arguments: the command and its options.
+        outcome: has a failure if the log speaks of a bug in the end.
         files_max: how many descriptors it may open.
         environment: of its own.
     """
@@ -36,11 +37,13 @@ class Served(Running):
         self,
         folder: Path,
         *arguments: object,
+        outcome: Outcome | None = None,
         files_max: int | None = None,
         **environment: str,
     ) -> None:
         super().__init__(folder / "data", token=environment.get("FOOTTILE_TOKEN"))
         self._arguments = arguments or ("serve",)
+        self._outcome = outcome
         self._files_max = files_max
         self._environment = environment
         self.process: Process
@@ -59,6 +62,8 @@ class Served(Running):
         return self
 
     def __exit__(self, *_: object) -> None:
+        if self._outcome is not None:
+            self._outcome.failures += [f"the log: {line}" for line in traces(self)[:5]]
         self.http.close()
         self.process.process.terminate()
         with suppress(Exception):
