@@ -1,11 +1,17 @@
-"""Folders of sealed sessions: a foot that stands and hops, in fractions of a second each."""
+"""Folders of sealed sessions, of a foot that stands and hops, and tasks that are run on them."""
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 
+from service.offline.archive.jobs import Job, Outcome, run_jobs
+from service.offline.archive.locations import find_session_locations
+from service.offline.archive.tasks import EstimateTask, SessionTask
+from service.offline.process_pool import map_in_processes
 from service.sessions.inputs import SessionInputs
 from service.sessions.sealing import seal_session
 from storage.journal.journal import Journal
@@ -16,6 +22,7 @@ from tests.builders.arrays import PERIOD_NS, UTC_NS
 from tests.service.sessions.pieces import array, calibration, frames, hopping
 
 IDS = tuple(f"20260101T00000{number}Z-00000{number}" for number in range(6))
+STATIC = EstimateTask(calibration=None, models=("static",), lag_ms=100.0, scene=None, tare_s=None)
 HOP = 50
 """Frames of a hop, and between two."""
 
@@ -92,3 +99,29 @@ def long_session(path: Path) -> Path:
     with SealedFileWriter(path, array(50.0), {}) as writer:
         writer.append_frames(batch, {})
     return path
+
+
+def ran(task: SessionTask, place: Path | str, out: Path | str | None) -> dict[str, Outcome]:
+    """What comes of a task, in this process, by the sessions' names."""
+    where = None if out is None else str(out)
+    jobs = [Job(found, task, where) for found in find_session_locations([str(place)])]
+    return {each.name: each for each in run_jobs(jobs, partial(map_in_processes, process_count=1))}
+
+
+def made(found: dict[str, Outcome]) -> set[str]:
+    """Names of the sessions whose results were made."""
+    return {name for name, outcome in found.items() if outcome.state == "made"}
+
+
+def contents(out: Path) -> dict[str, bytes]:
+    """All files of results."""
+    return {str(p.relative_to(out)): p.read_bytes() for p in out.glob("*/*") if p.is_file()}
+
+
+def with_a_damaged_page(path: Path) -> bytes:
+    """A sealed file's bytes with a bit flipped in the data of `grf_n`."""
+    at = pq.read_schema(path).get_field_index("grf_n")
+    chunk = pq.ParquetFile(path).metadata.row_group(0).column(at)
+    content = bytearray(path.read_bytes())
+    content[chunk.data_page_offset + chunk.total_compressed_size - 5] ^= 1
+    return bytes(content)

@@ -69,7 +69,7 @@ def test_bounds_are_counted_where_they_are_all_that_is_known() -> None:
     assert a.bounds == CoverageCount(2, 1)
 
 
-def test_frames_after_what_was_unseen_are_counted_among_the_others_and_by_themselves() -> None:
+def test_frames_after_saturation_are_counted_among_the_others_and_by_themselves() -> None:
     after = EstimateFlag.AFTER_SATURATION
     status = [after | EstimateFlag.SATURATED, after, after, after, 0]
     grf_n = [9.0, 10.1, 10.4, np.nan, 10.0]
@@ -150,7 +150,7 @@ def test_masked_centres_are_counted_under_load_only() -> None:
     assert (a.cop_frames, a.cop_masked_frames) == (1, 1)
 
 
-def test_of_tiles_in_one_row_the_measured_coordinate_alone_is_scored() -> None:
+def test_tiles_in_one_row_are_scored_by_the_measured_coordinate_alone() -> None:
     nothing = [np.nan] * 3
     in_y = compute_accuracy(columns([10.0] * 3, cop_x_m=[0.003, np.nan, -0.001], cop_y_m=nothing))
     assert (in_y.cop_frames, in_y.cop_masked_frames) == (2, 1)
@@ -229,7 +229,7 @@ def test_a_published_estimate_is_compared_with_the_truth_one_look_ahead_later() 
     assert late.grf_mae_n == 0.0
 
 
-def test_where_there_is_nothing_to_judge_figures_are_nan_and_null_in_json() -> None:
+def test_figures_without_frames_are_nan_and_null_in_json() -> None:
     a = compute_accuracy(columns([0.4, 0.4], cop_x_m=[np.nan, np.nan]))
     assert (a.grf_frames, a.cop_frames, a.stances) == (0, 0, 0)
     figures = to_json_value(a)

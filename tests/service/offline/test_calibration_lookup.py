@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
+from random import Random
 
 import pytest
 
@@ -14,7 +15,9 @@ from service.offline.calibration_lookup import find_calibration, read_calibratio
 from service.sessions.calibration_file import write_calibration
 from storage.verify.data_folder import find_verdict, verify_path
 from tests.builders.calibrations import make_calibration, newton_tile
+from tests.hostile.damages import DAMAGES, Damage
 
+SEEDED = Random(1)  # noqa: S311  # no secret
 CALIBRATION = make_calibration(newton_tile("T01"), newton_tile("T02", rmse_n=0.1))
 
 
@@ -25,7 +28,9 @@ def path(tmp_path: Path) -> Path:
     return path
 
 
-def test_what_is_written_is_read_and_every_byte_of_it_is_proven(path: Path, tmp_path: Path) -> None:
+def test_a_written_calibration_is_read_and_every_byte_of_it_is_proven(
+    path: Path, tmp_path: Path
+) -> None:
     whole = path.read_bytes()
     assert read_calibration(path) == CALIBRATION
     (tmp_path / "link.json").symlink_to(path)
@@ -45,7 +50,7 @@ def test_what_is_written_is_read_and_every_byte_of_it_is_proven(path: Path, tmp_
 def test_verify_proves_it_and_a_folder_of_them(path: Path, tmp_path: Path) -> None:
     write_calibration(tmp_path / "heel.json", CALIBRATION)
     assert [find_verdict(verify_path(each)) for each in (path, tmp_path)] == ["complete"] * 2
-    _flipped(path)
+    DAMAGES["a bit flipped"](path, SEEDED)
     assert [find_verdict(verify_path(each)) for each in (path, tmp_path)] == ["damaged"] * 2
     path.write_text(CALIBRATION.to_json())
     assert "it has no hash" in " ".join(verify_path(path).problems)
@@ -70,7 +75,7 @@ def test_an_edit_is_refused_until_the_user_says_that_it_is_meant(path: Path) -> 
     assert read_calibration(path) == meant
 
 
-def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
+def test_a_calibration_that_is_no_file_is_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "circle").symlink_to("circle")
     for name in (".", "pipe", "circle", "none"):
@@ -95,40 +100,23 @@ def pressed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return names
 
 
-def _emptied(path: Path) -> None:
-    path.write_bytes(b"")
-
-
-def _flipped(path: Path) -> None:
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 2
-    path.write_bytes(content)
-
-
-def _without_hashes(path: Path) -> None:
+def _without_hashes(path: Path, _: Random) -> None:
     lines = path.read_text().splitlines()
     path.write_text("\n".join(line for line in lines if not re.search('"(id|check)":', line)))
 
 
-def _of_another_tile(path: Path) -> None:
+def _of_another_tile(path: Path, _: Random) -> None:
     write_calibration(path, CALIBRATION.model_copy(update={"tiles": (newton_tile("T07"),)}))
 
 
-def _a_folder(path: Path) -> None:
-    path.unlink()
-    path.mkdir()
-
-
-def _a_link(path: Path) -> None:
-    path.unlink()
-    path.symlink_to("nowhere")
+FILES = ("a bit flipped", "emptied", "replaced by a folder", "replaced by a link to nowhere")
 
 
 @pytest.mark.parametrize(
-    "damaged", [_emptied, _flipped, _without_hashes, _of_another_tile, _a_folder, _a_link]
+    "damage", [_without_hashes, _of_another_tile, *(DAMAGES[name] for name in FILES)]
 )
 def test_a_cached_calibration_that_does_not_prove_itself_is_set_aside_and_made_anew(
-    tmp_path: Path, pressed: list[str], damaged: object
+    tmp_path: Path, pressed: list[str], damage: Damage
 ) -> None:
     said: list[str] = []
 
@@ -141,8 +129,7 @@ def test_a_cached_calibration_that_does_not_prove_itself_is_set_aside_and_made_a
     assert found() == first
     assert pressed == ["emulated-rig-A01"]
     (kept,) = (tmp_path / "cache").iterdir()
-    assert callable(damaged)
-    damaged(kept)
+    damage(kept, SEEDED)
     said.clear()
     assert found() == first
     assert pressed == ["emulated-rig-A01"] * 2

@@ -141,7 +141,7 @@ def test_forces_and_clocks_that_contradict_each_other_are_said(tmp_path: Path) -
     assert any("the clocks say a lag of -500.000 ms" in note for note in found.notes)
 
 
-def test_without_a_clock_table_beside_one_of_them_no_lag_is_known_by_clocks(tmp_path: Path) -> None:
+def test_the_clocks_give_no_lag_if_one_session_lacks_its_clock_table(tmp_path: Path) -> None:
     path, other = seal(tmp_path / "ours"), seal(tmp_path / "theirs")
     (tmp_path / "theirs" / "clock.parquet").unlink()
     assert compare_session(path, other, OWN).clock_lag is None

@@ -77,7 +77,7 @@ def test_a_slice_counts_from_each_sessions_own_beginning(feet: list[Path], tmp_p
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_what_cannot_be_put_together_leaves_no_file(
+def test_sessions_that_cannot_be_merged_leave_no_file(
     feet: list[Path], tmp_path: Path, options: ExportOptions, count: int, said: str
 ) -> None:
     with pytest.raises(UsageError, match=said):
@@ -85,7 +85,7 @@ def test_what_cannot_be_put_together_leaves_no_file(
     assert not list(tmp_path.iterdir())
 
 
-def test_on_the_servers_axis_a_session_alone_says_how_far_it_may_be_off(
+def test_a_session_on_the_servers_axis_states_its_uncertainty(
     feet: list[Path], tmp_path: Path
 ) -> None:
     export_session(feet[1], tmp_path / "right.c3d", TOGETHER)

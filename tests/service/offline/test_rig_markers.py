@@ -80,7 +80,7 @@ def test_a_step_that_is_misspelt_is_refused_and_no_stroke_goes_on(
         read_indentations([path])
 
 
-def test_without_a_step_or_a_table_of_marks_it_is_no_bench(recorded: Path) -> None:
+def test_a_recording_without_a_step_or_markers_is_refused(recorded: Path) -> None:
     path = marked(recorded, session_in(recorded).markers[0])
     with pytest.raises(CalibrationError, match="markers such as `T01 load`"):
         read_indentations([path])

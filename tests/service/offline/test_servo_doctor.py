@@ -30,9 +30,7 @@ def test_an_answer_that_a_busy_machine_hears_late_is_still_an_answer(
     assert diagnosis.is_well
 
 
-def test_who_never_answers_is_not_found_however_patient_one_is(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_silent_servo_is_not_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "TIMEOUTS_S", (0.01, 0.02))
     with FaultyServo(lambda _: 0, VirtualClock()) as servo, servo.silent():
         diagnosis = diagnose_servo(servo.port, VirtualClock(), None)
@@ -48,7 +46,7 @@ def test_a_port_that_is_not_there_is_a_finding_and_no_failure_of_the_doctor(tmp_
     assert "group dialout" in diagnosis.verdict
 
 
-def test_who_holds_a_busy_port_is_named() -> None:
+def test_the_process_that_holds_a_busy_port_is_named() -> None:
     with (
         FaultyServo(lambda _: 0, VirtualClock()) as servo,
         contextlib.closing(open_serial_line(servo.port, 57_600, 0.02)),

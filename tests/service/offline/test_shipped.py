@@ -38,7 +38,7 @@ def pressed(serial: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cal
 
 
 @pytest.mark.skipif("FOOTTILE_WRITE_RIG" not in os.environ, reason="writes them")
-def test_they_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shipped_calibrations_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for serial in TILES:
         pressed(serial, tmp_path, monkeypatch)
     shutil.rmtree(SHIPPED_FOLDER, ignore_errors=True)

@@ -28,15 +28,14 @@ class Store:
         self._server = ThreadedMotoServer("127.0.0.1", 0, verbose=False)
         self._server.start()
         self.host, self.port = self._server.get_host_and_port()
+        self.endpoint = f"http://{self.host}:{self.port}"
         again = http.client.HTTPConnection(self.host, self.port)  # a process has one memory for all
         again.request("POST", "/moto-api/reset")
         again.getresponse().read()
         again.close()
         for name, value in self.environment().items():
             self._monkeypatch.setenv(name, value)
-        self.files = fs.S3FileSystem(
-            endpoint_override=f"http://{self.host}:{self.port}", allow_bucket_creation=True
-        )
+        self.files = fs.S3FileSystem(endpoint_override=self.endpoint, allow_bucket_creation=True)
         self.files.create_dir(BUCKET)
         return self
 
@@ -50,7 +49,7 @@ class Store:
             "AWS_SECRET_ACCESS_KEY": "two",
             "AWS_REGION": "us-east-1",
             "AWS_EC2_METADATA_DISABLED": "true",
-            "AWS_ENDPOINT_URL": f"http://{self.host}:{self.port}",
+            "AWS_ENDPOINT_URL": self.endpoint,
         }
 
     def put(self, folder: Path, prefix: str) -> None:

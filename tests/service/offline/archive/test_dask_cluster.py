@@ -15,16 +15,18 @@ from service.offline.archive.dask_cluster import map_on_cluster
 from service.offline.archive.jobs import Job, run_job, run_jobs
 from service.offline.archive.locations import find_session_locations
 from service.offline.archive.result_store import ResultStore
-from service.offline.archive.tasks import EstimateTask
-from service.offline.process_pool import Unfinished, map_in_processes
+from service.offline.process_pool import Unfinished
 from tests.service.offline.archive.clusters import Cluster
-from tests.service.offline.archive.workers import counted, killed_at_two, raising, squared
-from tests.service.offline.archives import IDS, long_session
+from tests.service.offline.archive.workers import (
+    assert_each_task_comes_with_its_result,
+    killed_at_two,
+    squared,
+)
+from tests.service.offline.archives import IDS, STATIC, contents, long_session, made, ran
 from tests.service.sessions.pieces import calibration
 
 pytestmark = [pytest.mark.process, pytest.mark.slow, pytest.mark.in_turn]
 COPIES = 10
-STATIC = EstimateTask(calibration=None, models=("static",), lag_ms=100.0, scene=None, tare_s=None)
 
 
 @pytest.fixture(scope="module")
@@ -47,10 +49,6 @@ def jobs(trials: Path, out: Path) -> Iterator[Job]:
         yield Job(place, STATIC, str(out))
 
 
-def contents(out: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(out)): p.read_bytes() for p in out.glob("*/*") if p.is_file()}
-
-
 def test_a_worker_that_is_killed_costs_nothing_and_results_are_those_of_one_process(
     cluster: Cluster, trials: Path, tmp_path: Path
 ) -> None:
@@ -66,10 +64,7 @@ def test_a_worker_that_is_killed_costs_nothing_and_results_are_those_of_one_proc
             cluster.workers[0].kill()
     assert len(states) == COPIES
     assert states.count("there") <= 1
-    for outcome in run_jobs(
-        jobs(trials, tmp_path / "alone"), partial(map_in_processes, process_count=1)
-    ):
-        assert outcome.state == "made"
+    assert len(made(ran(STATIC, f"{trials}/*.parquet", tmp_path / "alone"))) == COPIES
     assert contents(out) == contents(tmp_path / "alone")
     ResultStore(str(out)).remove_work_folder()
     assert not (out / ".work").exists()
@@ -93,42 +88,14 @@ def test_a_long_session_goes_from_worker_to_worker_and_a_killed_one_costs_its_pi
             cluster.workers[-2].kill()
         states.append(outcome.state)
     assert states in (["made", "made"], ["made", "there"])  # it may have had no time to tell
-    for outcome in run_jobs(
-        [Job(p, task, str(tmp_path / "alone")) for p in places],
-        partial(map_in_processes, process_count=1),
-    ):
-        assert outcome.state == "made"
+    assert len(made(ran(task, f"{tmp_path}/raw/*.parquet", tmp_path / "alone"))) == 2
     assert contents(tmp_path / "out") == contents(tmp_path / "alone")
     assert list((tmp_path / "out" / ".pieces").iterdir()) == []
 
 
-def test_a_task_that_goes_on_is_called_again(cluster: Cluster, tmp_path: Path) -> None:
-    tasks = [tmp_path / "2", tmp_path / "0"]
-    found = dict(map_on_cluster(counted, tasks, scheduler_address=cluster.address))
-    assert found == {tmp_path / "2": 3, tmp_path / "0": 1}
-
-
-def test_no_more_tasks_are_taken_than_are_under_way(cluster: Cluster) -> None:
-    taken: list[int] = []
-
-    def tasks() -> Iterator[int]:
-        for number in range(50):
-            taken.append(number)
-            yield number
-
-    results = {}
-    for given, (task, result) in enumerate(
-        map_on_cluster(squared, tasks(), scheduler_address=cluster.address), start=1
-    ):
-        assert len(taken) <= given + 3
-        results[task] = result
-    assert results == {n: n * n for n in range(50)}
-
-
-def test_an_error_comes_with_its_task(cluster: Cluster) -> None:
-    found = dict(map_on_cluster(raising, range(4), scheduler_address=cluster.address))
-    assert isinstance(found.pop(2), ValueError)
-    assert found == {0: 0, 1: 1, 3: 3}
+def test_each_task_comes_with_its_result(cluster: Cluster, tmp_path: Path) -> None:
+    map_tasks = partial(map_on_cluster, scheduler_address=cluster.address)
+    assert_each_task_comes_with_its_result(map_tasks, tmp_path, ahead=3)
 
 
 def test_a_worker_of_another_version_is_refused(
@@ -142,7 +109,7 @@ def test_a_worker_of_another_version_is_refused(
         list(map_on_cluster(squared, range(3), scheduler_address=cluster.address))
 
 
-def test_where_no_scheduler_is_that_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_scheduler_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.offline.archive.dask_cluster._CONNECT_S", 1.0)
     with pytest.raises(LinkError, match="no Dask cluster"):
         list(map_on_cluster(squared, range(3), scheduler_address="tcp://127.0.0.1:9"))

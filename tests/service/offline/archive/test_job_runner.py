@@ -4,48 +4,29 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from devices.errors import UsageError
-from service.offline.archive.jobs import (
-    MAX_LISTED_FAILURES,
-    Job,
-    Outcome,
-    OutcomeCounts,
-    run_job,
-    run_jobs,
-)
+from service.offline.archive.jobs import MAX_LISTED_FAILURES, Job, Outcome, OutcomeCounts, run_job
 from service.offline.archive.locations import find_session_locations
 from service.offline.archive.query import find_sessions, run_query
 from service.offline.archive.result_store import ResultStore
-from service.offline.archive.tasks import EstimateTask, ExportTask, SessionTask, VerifyTask
+from service.offline.archive.tasks import ExportTask, VerifyTask
 from service.offline.export import ExportOptions
 from service.offline.process_pool import Unfinished, map_in_processes
 from storage.verify.data_folder import find_verdict, verify_path
-from tests.service.offline.archives import IDS, long_session, recording
+from tests.service.offline.archives import IDS, STATIC, contents, long_session, made, ran, recording
 from tests.service.sessions.pieces import calibration
 
-ESTIMATE = EstimateTask(calibration=None, models=("static",), lag_ms=100.0, scene=None, tare_s=None)
-STATIC = replace(ESTIMATE, calibration=calibration())
+CALIBRATED = replace(STATIC, calibration=calibration())
 CSV = ExportTask(ExportOptions("csv"))
-
-
-def ran(task: SessionTask, place: Path | str, out: Path | str | None) -> dict[str, Outcome]:
-    where = None if out is None else str(out)
-    jobs = [Job(found, task, where) for found in find_session_locations([str(place)])]
-    return {each.name: each for each in run_jobs(jobs, partial(map_in_processes, process_count=1))}
 
 
 def states(found: dict[str, Outcome]) -> set[str]:
     return {outcome.state for outcome in found.values()}
-
-
-def contents(out: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(out)): p.read_bytes() for p in out.glob("*/*") if p.is_file()}
 
 
 def stamps(out: Path) -> dict[str, tuple[int, int]]:
@@ -70,8 +51,8 @@ def test_a_long_session_is_done_in_pieces_by_whoever_is_free_and_is_the_same(
 ) -> None:
     (tmp_path / "raw").mkdir()
     long = long_session(tmp_path / "raw" / "long.parquet")
-    whole = ran(STATIC, long, tmp_path / "whole")
-    in_pieces = replace(STATIC, piece_frames=1)
+    whole = ran(CALIBRATED, long, tmp_path / "whole")
+    in_pieces = replace(CALIBRATED, piece_frames=1)
     given = list[str]()
 
     def seen(job: Job) -> Outcome | Unfinished:
@@ -80,10 +61,8 @@ def test_a_long_session_is_done_in_pieces_by_whoever_is_free_and_is_the_same(
         given.append(" ".join(there) if isinstance(done, Unfinished) else done.state)
         return done
 
-    (job,) = [
-        Job(found, in_pieces, str(tmp_path / "out"))
-        for found in find_session_locations([str(long)])
-    ]
+    (place,) = find_session_locations([str(long)])
+    job = Job(place, in_pieces, str(tmp_path / "out"))
     ((_, outcome),) = map_in_processes(seen, [job], 1)
     assert given == ["0000.json", "0000.json 0001.json", "0000.json 0001.json 0002.json", "made"]
     assert isinstance(outcome, Outcome)
@@ -96,7 +75,7 @@ def test_a_long_session_is_done_in_pieces_by_whoever_is_free_and_is_the_same(
 def test_pieces_of_other_options_are_not_taken_and_go_with_the_result(tmp_path: Path) -> None:
     (tmp_path / "raw").mkdir()
     long = long_session(tmp_path / "raw" / "long.parquet")
-    in_pieces, out = replace(STATIC, piece_frames=1), str(tmp_path / "out")
+    in_pieces, out = replace(CALIBRATED, piece_frames=1), str(tmp_path / "out")
     (place,) = find_session_locations([str(long)])
     for lag_ms in (100.0, 100.0, 50.0):
         assert isinstance(run_job(Job(place, replace(in_pieces, lag_ms=lag_ms), out)), Unfinished)
@@ -105,7 +84,7 @@ def test_pieces_of_other_options_are_not_taken_and_go_with_the_result(tmp_path: 
     found = ran(replace(in_pieces, lag_ms=50.0), long, out)
     assert found["long"].state == "made"
     assert not (tmp_path / "out" / ".pieces" / "long").exists()
-    ran(replace(STATIC, lag_ms=50.0), long, tmp_path / "whole")
+    ran(replace(CALIBRATED, lag_ms=50.0), long, tmp_path / "whole")
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
 
 
@@ -116,14 +95,11 @@ def test_a_result_of_other_options_or_another_input_is_made_anew(
     ran(CSV, archive, out)
     arrow = ran(ExportTask(ExportOptions("arrow")), archive, out)
     assert states(arrow) == {"made"}
-    assert {path.name for path in (out / IDS[0]).iterdir()} == {
-        "frames.arrow",
-        "export.made.json",
-    }
+    names = {path.name for path in (out / IDS[0]).iterdir()}
+    assert names == {"frames.arrow", "export.made.json"}
     changed = archive / "sessions" / IDS[1]
     shutil.copytree(archive / "sessions" / IDS[2], changed, dirs_exist_ok=True)
-    made = ran(ExportTask(ExportOptions("arrow")), archive, out)
-    assert {name for name, outcome in made.items() if outcome.state == "made"} == {IDS[1]}
+    assert made(ran(ExportTask(ExportOptions("arrow")), archive, out)) == {IDS[1]}
 
 
 @pytest.mark.parametrize("lost", ["export.made.json", "frames.csv"])
@@ -134,8 +110,7 @@ def test_a_result_of_which_a_part_is_missing_is_made_again(
     ran(CSV, archive, out)
     whole = (out / IDS[1] / "frames.csv").read_bytes()
     (out / IDS[1] / lost).unlink()
-    found = ran(CSV, archive, out)
-    assert {name for name, outcome in found.items() if outcome.state == "made"} == {IDS[1]}
+    assert made(ran(CSV, archive, out)) == {IDS[1]}
     assert (out / IDS[1] / "frames.csv").read_bytes() == whole
 
 
@@ -146,7 +121,7 @@ def test_one_session_fails_alone_and_says_why(archive: Path, tmp_path: Path) -> 
     content[2000] ^= 1
     frames.write_bytes(content)
     (archive / "sessions" / IDS[2] / "session.json").unlink()
-    found = ran(ESTIMATE, archive, tmp_path / "out")
+    found = ran(STATIC, archive, tmp_path / "out")
     reasons = {name: o.reason for name, o in found.items() if o.state == "failed"}
     assert set(reasons) == {IDS[1], IDS[2], IDS[4]}
     assert "hash" in reasons[IDS[1]]
@@ -187,7 +162,7 @@ def test_a_result_never_takes_the_place_of_its_session_and_stays_in_its_folder(
     before = stamps(archive / "sessions")
     (tmp_path / "link").symlink_to(archive / "sessions")
     for out in (archive / "sessions", tmp_path / "link"):
-        found = ran(ESTIMATE, archive, out)
+        found = ran(STATIC, archive, out)
         assert states(found) == {"failed"}
         assert "the place of the session itself" in found[IDS[0]].reason
     assert stamps(archive / "sessions") == before
@@ -208,7 +183,7 @@ def test_estimated_sessions_are_an_archive_that_can_be_proven_and_asked(
     archive: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    assert states(ran(ESTIMATE, archive, out)) == {"made"}
+    assert states(ran(STATIC, archive, out)) == {"made"}
     for name in IDS[:4]:
         report = verify_path(out / name)
         assert find_verdict(report) == "complete", report.to_json_dict()["problems"]
@@ -234,7 +209,9 @@ def test_a_worker_of_another_version_refuses(archive: Path, tmp_path: Path) -> N
         run_job(replace(job, client_version="foottile 0.0.1 (000000000000)"))
 
 
-def test_what_a_killed_worker_has_left_is_taken_away_and_others_work_is_not(tmp_path: Path) -> None:
+def test_the_rest_of_a_killed_worker_is_removed_and_the_work_of_others_is_not(
+    tmp_path: Path,
+) -> None:
     from service.offline.archive.local_copies import _MACHINE, create_workspace
 
     work = tmp_path / "out" / ".work"

@@ -7,13 +7,12 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as pq
 import pytest
 
 from devices.errors import FileFormatError, UsageError
 from service.offline.archive.query import MARKERS_SCHEMA, SESSIONS_SCHEMA, find_sessions, run_query
 from storage.sessions.reader import SealedFileReader
-from tests.service.offline.archives import IDS, recording, sealed
+from tests.service.offline.archives import IDS, recording, sealed, with_a_damaged_page
 
 PEAKS_N = {0: (20.0, 30.0, 40.0), 1: (24.0, 34.0, 44.0, 54.0), 2: (50.0, 50.0, 50.0)}
 THIRD_IN_MUD = """
@@ -52,7 +51,7 @@ def test_the_peaks_of_all_third_hops_in_mud(made: Path) -> None:
         assert row["is_whole"]
 
 
-def test_sessions_marks_and_frames_are_views_of_what_is_in_the_folders(made: Path) -> None:
+def test_sessions_markers_and_frames_are_views_of_the_folders(made: Path) -> None:
     sessions = answer("SELECT * FROM sessions ORDER BY session_id", made)
     assert [row["session_id"] for row in sessions] == list(IDS[:4])
     assert [row["scene"] for row in sessions] == ["mud", "mud", "plate", "mud"]
@@ -83,18 +82,16 @@ def test_frames_without_estimates_are_null_there(made: Path) -> None:
     assert row["known"] == 0
 
 
-def test_places_are_data_folders_folders_of_sessions_single_ones_and_globs(made: Path) -> None:
+def test_a_session_in_two_places_is_asked_once(made: Path) -> None:
     count = "SELECT count(*) AS n FROM sessions"
     one = made / "sessions" / IDS[0]
-    assert answer(count, made) == answer(count, made / "sessions") == [{"n": 4}]
-    assert answer(count, one) == [{"n": 1}]
     assert answer(count, made / "sessions" / "*Z-00000[01]") == [{"n": 2}]
-    assert answer(count, one, made) == [{"n": 4}]  # each once
+    assert answer(count, one, made) == [{"n": 4}]
     with pytest.raises(UsageError, match="no session or folder"):
         find_sessions([str(made / "nowhere")])
 
 
-def test_what_is_recorded_or_damaged_is_left_out_and_named(data: Path) -> None:
+def test_a_session_that_is_recording_or_damaged_is_left_out_and_named(data: Path) -> None:
     sessions = data / "sessions"
     recording(data, 4)
     (sessions / IDS[0] / "frames.parquet").unlink()
@@ -127,14 +124,7 @@ def test_a_session_that_is_there_twice_counts_once_and_the_other_is_named(
 
 def test_a_damaged_page_is_an_error_and_no_number(data: Path) -> None:
     path = data / "sessions" / IDS[0] / "frames.parquet"
-    chunk = (
-        pq.ParquetFile(path)
-        .metadata.row_group(0)
-        .column(pq.read_schema(path).get_field_index("grf_n"))
-    )
-    content = bytearray(path.read_bytes())
-    content[chunk.data_page_offset + chunk.total_compressed_size - 5] ^= 1
-    path.write_bytes(content)
+    path.write_bytes(with_a_damaged_page(path))
     with pytest.raises(FileFormatError, match="frames cannot be read"):
         answer("SELECT sum(grf_n) FROM frames", data)
 
@@ -199,7 +189,9 @@ def test_sums_of_integers_are_integers_however_great(made: Path) -> None:
     assert row["great"] == 2**64
 
 
-def test_only_what_a_question_is_about_is_read(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_question_reads_only_the_views_that_it_names(
+    made: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     archive = find_sessions([str(made)])
     # `frames` is a column here, and `stances` a text: neither is opened.
     monkeypatch.setattr(type(archive), "open_frames_dataset", None)

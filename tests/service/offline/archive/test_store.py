@@ -9,22 +9,27 @@ from functools import partial
 from itertools import count
 from pathlib import Path
 
-import pyarrow.parquet as pq
 import pytest
 
 from devices.errors import FileFormatError
 from service.offline.archive import locations
-from service.offline.archive.jobs import Job, Outcome, run_job, run_jobs
+from service.offline.archive.jobs import Job, run_job, run_jobs
 from service.offline.archive.locations import find_session_locations
 from service.offline.archive.query import find_sessions, run_query
-from service.offline.archive.tasks import EstimateTask, SessionTask, VerifyTask
+from service.offline.archive.tasks import VerifyTask
 from service.offline.process_pool import Unfinished, map_in_processes
 from tests.service.offline.archive.stores import BUCKET, BadWay, Store
-from tests.service.offline.archives import IDS, long_session
+from tests.service.offline.archives import IDS, STATIC, long_session, made, ran, with_a_damaged_page
 from tests.service.sessions.pieces import calibration
 
 pytestmark = pytest.mark.slow
-STATIC = EstimateTask(calibration=None, models=("static",), lag_ms=100.0, scene=None, tare_s=None)
+FOUND, SESSIONS = f"s3://{BUCKET}/2026", f"s3://{BUCKET}/2026/sessions"
+
+
+def way_to(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From now on the store is reached there."""
+    monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
+    locations._make_s3_filesystem.cache_clear()
 
 
 @pytest.fixture
@@ -36,27 +41,21 @@ def store(archive: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
     locations._make_s3_filesystem.cache_clear()
 
 
-def ran(task: SessionTask, out: str | None, *wanted: str) -> dict[str, Outcome]:
-    jobs = [Job(place, task, out) for place in find_session_locations(wanted)]
-    return {each.name: each for each in run_jobs(jobs, partial(map_in_processes, process_count=1))}
-
-
 def test_sessions_of_a_store_are_worked_on_and_results_put_back(
     store: Store, archive: Path, tmp_path: Path
 ) -> None:
     out = f"s3://{BUCKET}/estimated"
-    made = ran(STATIC, out, f"s3://{BUCKET}/2026")
-    assert {name: each.state for name, each in made.items()} == dict.fromkeys(IDS[:4], "made")
-    ran(STATIC, str(tmp_path / "out"), str(archive))
+    assert made(ran(STATIC, FOUND, out)) == set(IDS[:4])
+    ran(STATIC, archive, tmp_path / "out")
     for name in IDS[:4]:
         there = store.content(f"estimated/{name}")
         here = {path.name: path.read_bytes() for path in (tmp_path / "out" / name).iterdir()}
         assert there.pop("estimate.made.json") != here.pop("estimate.made.json")  # their places
         assert there == here
-    again = ran(STATIC, out, f"s3://{BUCKET}/2026")
-    assert {each.state for each in again.values()} == {"there"}
-    one = ran(VerifyTask(), None, f"{out}/{IDS[2]}", f"{out}/{IDS[3]}/frames.parquet")
-    assert [each.facts["verdict"] for each in one.values()] == ["complete", "complete"]
+    assert {each.state for each in ran(STATIC, FOUND, out).values()} == {"there"}
+    for place in (f"{out}/{IDS[2]}", f"{out}/{IDS[3]}/frames.parquet"):
+        (one,) = ran(VerifyTask(), place, None).values()
+        assert one.facts["verdict"] == "complete"
 
 
 def test_pieces_of_a_long_session_are_in_the_store_until_it_is_there(
@@ -71,7 +70,7 @@ def test_pieces_of_a_long_session_are_in_the_store_until_it_is_there(
     assert isinstance(run_job(job), Unfinished)
     (found,) = run_jobs([job], partial(map_in_processes, process_count=1))
     assert found.state == "made", found.reason
-    ran(task, str(tmp_path / "out"), str(long))
+    ran(task, long, tmp_path / "out")
     there = store.content("estimated/long")
     assert there["frames.parquet"] == (tmp_path / "out" / "long" / "frames.parquet").read_bytes()
     with pytest.raises(FileNotFoundError):
@@ -80,10 +79,9 @@ def test_pieces_of_a_long_session_are_in_the_store_until_it_is_there(
 
 def test_a_result_in_a_store_of_which_an_object_is_gone_is_made_again(store: Store) -> None:
     out = f"s3://{BUCKET}/proofs"
-    ran(VerifyTask(), out, f"s3://{BUCKET}/2026/sessions")
+    ran(VerifyTask(), SESSIONS, out)
     store.files.delete_file(f"{BUCKET}/proofs/{IDS[1]}/verify.json")
-    found = ran(VerifyTask(), out, f"s3://{BUCKET}/2026/sessions")
-    assert {name for name, each in found.items() if each.state == "made"} == {IDS[1]}
+    assert made(ran(VerifyTask(), SESSIONS, out)) == {IDS[1]}
 
 
 def test_a_store_that_refuses_and_breaks_off_costs_time_and_nothing_else(
@@ -98,22 +96,19 @@ def test_a_store_that_refuses_and_breaks_off_costs_time_and_nothing_else(
         return "cut" if is_read and next(frames_read) % 3 == 0 else "pass"
 
     with BadWay(store, trouble) as way:
-        monkeypatch.setenv("AWS_ENDPOINT_URL", way.endpoint)
-        locations._make_s3_filesystem.cache_clear()
-        made = ran(STATIC, f"s3://{BUCKET}/badly", f"s3://{BUCKET}/2026")
-        assert {each.state for each in made.values()} == {"made"}, made
+        way_to(way.endpoint, monkeypatch)
+        assert made(ran(STATIC, FOUND, f"s3://{BUCKET}/badly")) == set(IDS[:4])
         assert way.refused >= 3
         assert way.cut >= 1
-    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{store.host}:{store.port}")
-    locations._make_s3_filesystem.cache_clear()
-    ran(STATIC, f"s3://{BUCKET}/well", f"s3://{BUCKET}/2026")
+    way_to(store.endpoint, monkeypatch)
+    ran(STATIC, FOUND, f"s3://{BUCKET}/well")
     assert store.content("badly") == store.content("well")
 
 
 def test_a_session_that_a_store_will_not_give_fails_alone_and_the_next_run_makes_it(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out, asked = f"s3://{BUCKET}/proofs", f"s3://{BUCKET}/2026"
+    out = f"s3://{BUCKET}/proofs"
     closed: set[str] = set()
     monkeypatch.setattr(locations, "_S3_ATTEMPTS", 2)
 
@@ -121,21 +116,20 @@ def test_a_session_that_a_store_will_not_give_fails_alone_and_the_next_run_makes
         return "slow down" if any(name in path for name in closed) else "pass"
 
     with BadWay(store, trouble) as way:
-        monkeypatch.setenv("AWS_ENDPOINT_URL", way.endpoint)
-        locations._make_s3_filesystem.cache_clear()
+        way_to(way.endpoint, monkeypatch)
         closed.add(f"{IDS[1]}/frames.parquet")
-        found = ran(VerifyTask(), out, asked)
+        found = ran(VerifyTask(), FOUND, out)
         assert {name for name, each in found.items() if each.state == "failed"} == {IDS[1]}
         assert "cannot be read" in found[IDS[1]].reason
         closed.clear()
-        found = ran(VerifyTask(), out, asked)
+        found = ran(VerifyTask(), FOUND, out)
         assert {name: each.state for name, each in found.items()} == {
             **dict.fromkeys(IDS[:4], "there"),
             IDS[1]: "made",
         }
 
 
-def test_questions_to_a_store_read_what_they_are_about_and_answer_as_for_folders(
+def test_questions_to_a_store_read_only_their_files_and_are_answered_as_for_folders(
     store: Store, archive: Path, tmp_path: Path
 ) -> None:
     store.files.delete_file(f"{BUCKET}/2026/sessions/{IDS[1]}/stances.parquet")
@@ -167,13 +161,9 @@ def test_questions_to_a_store_read_what_they_are_about_and_answer_as_for_folders
 def test_a_damaged_page_in_a_store_is_an_error_and_no_number(
     store: Store, archive: Path, tmp_path: Path
 ) -> None:
-    path = archive / "sessions" / IDS[0] / "frames.parquet"
-    at = pq.read_schema(path).get_field_index("grf_n")
-    chunk = pq.ParquetFile(path).metadata.row_group(0).column(at)
-    content = bytearray(path.read_bytes())
-    content[chunk.data_page_offset + chunk.total_compressed_size - 5] ^= 1
+    content = with_a_damaged_page(archive / "sessions" / IDS[0] / "frames.parquet")
     with store.files.open_output_stream(f"{BUCKET}/2026/sessions/{IDS[0]}/frames.parquet") as sink:
-        sink.write(bytes(content))
+        sink.write(content)
     found = find_sessions([f"s3://{BUCKET}/2026"], tmp_path)
     with pytest.raises(FileFormatError, match="frames cannot be read"):
         run_query(found, "SELECT sum(grf_n) FROM frames")

@@ -1,10 +1,12 @@
-"""What workers are given to do in tests: by name, as another process imports it."""
+"""Tasks for workers, by names that another process imports, and the law of all that maps them."""
 
 from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from service.offline.process_pool import Unfinished
 
@@ -38,3 +40,24 @@ def killed_at_two(number: int) -> int:
     if number == 2:
         os.kill(os.getpid(), signal.SIGKILL)
     return number
+
+
+def assert_each_task_comes_with_its_result(map_tasks: Any, folder: Path, *, ahead: int) -> None:
+    """With its error, too; an unfinished one is given again; few are taken before their turn."""
+    tasks = [folder / "2", folder / "0", folder / "3"]
+    assert dict(map_tasks(counted, tasks)) == {path: int(path.name) + 1 for path in tasks}
+    found = dict(map_tasks(raising, range(4)))
+    assert isinstance(found.pop(2), ValueError)
+    assert found == {0: 0, 1: 1, 3: 3}
+    taken: list[int] = []
+
+    def numbers() -> Iterator[int]:
+        for number in range(50):
+            taken.append(number)
+            yield number
+
+    results = {}
+    for given, (task, result) in enumerate(map_tasks(squared, numbers()), start=1):
+        assert len(taken) <= given + ahead
+        results[task] = result
+    assert results == {n: n * n for n in range(50)}

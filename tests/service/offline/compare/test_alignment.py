@@ -26,7 +26,7 @@ def true_lag_s(found: Alignment, seconds: float) -> float:
     return TRUTH["lag_s"] + 1e-6 * TRUTH["drift_ppm"] * (found.mid_t_s - 0.5 * seconds)
 
 
-def test_without_noise_everything_is_found_far_below_a_sample() -> None:
+def test_signals_without_noise_are_aligned_far_below_a_sample() -> None:
     found = align_signals(*walk(1, noise=0.0, **TRUTH))
     assert found.lag_s.value == pytest.approx(true_lag_s(found, 20.0), abs=2e-5)
     assert found.drift_ppm.value == pytest.approx(80.0, abs=2.0)
@@ -34,7 +34,7 @@ def test_without_noise_everything_is_found_far_below_a_sample() -> None:
     assert found.scale.value == pytest.approx(0.93, abs=2e-4)
 
 
-def test_under_noise_the_lag_is_found_well_below_a_sample_and_says_how_well() -> None:
+def test_the_lag_of_noisy_signals_is_found_within_its_narrow_interval() -> None:
     found = align_signals(*walk(2, **TRUTH))
     low, high = found.lag_s.interval_95
     assert low <= true_lag_s(found, 20.0) <= high
@@ -104,7 +104,7 @@ def test_a_tenth_of_wild_samples_at_landings_moves_little() -> None:
     assert found.scale.value == pytest.approx(1.0, abs=0.02)
 
 
-def test_uncertainty_grows_away_from_the_middle_of_what_overlaps() -> None:
+def test_uncertainty_grows_away_from_the_middle_of_the_overlap() -> None:
     found = align_signals(*walk(6, 12.0))
     middle, end = found.compute_lag_sigma_s(np.array([found.mid_t_s, found.mid_t_s + 60.0]))
     assert middle == pytest.approx(found.lag_s.sigma)
@@ -114,7 +114,7 @@ def test_uncertainty_grows_away_from_the_middle_of_what_overlaps() -> None:
 # --- what a foot gets wrong all the time ----------------------------------------------------------
 
 
-def test_without_a_stated_uncertainty_of_ours_nothing_is_added() -> None:
+def test_an_unstated_uncertainty_of_ours_adds_nothing() -> None:
     found = align_signals(*walk(6, 12.0))
     assert (
         found.lag_s.repeating_sigma,
@@ -154,7 +154,7 @@ def test_phases_that_contradict_one_another_in_every_stance_make_the_lag_uncerta
     assert not only_blocks[0] <= 0.0 <= only_blocks[1]
 
 
-def test_what_our_foot_gets_wrong_is_in_its_force_and_not_again_in_what_the_lag_makes() -> None:
+def test_the_lag_does_not_count_the_error_of_our_foot_again() -> None:
     ours, reference = late_when_falling(0.004)
     found = align_signals(ours, reference)
     assert float(found.compute_lag_sigma_s(np.array([found.mid_t_s]))[0]) == pytest.approx(

@@ -9,7 +9,7 @@ from service.offline.compare.block_covariance import assign_blocks, compute_fit_
 
 
 @pytest.mark.parametrize("telling", [(0, 8000), (0, 700), (3000, 4500)])
-def test_of_independent_noise_the_variance_is_the_textbooks(telling: tuple[int, int]) -> None:
+def test_the_variance_of_independent_noise_is_the_textbooks(telling: tuple[int, int]) -> None:
     # In some hundred samples is all that tells of the slope, as in a single stance.
     rng, n, sigma = np.random.default_rng(1), 8000, 0.7
     slope = np.zeros(n)

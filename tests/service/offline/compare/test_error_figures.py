@@ -167,7 +167,7 @@ def test_coverage_of_the_cop_is_said_by_axis_if_the_reference_says_how_good_it_i
 
 
 @pytest.mark.parametrize("is_of_before", [False, True])
-def test_across_a_row_of_tiles_nothing_is_scored(is_of_before: bool) -> None:
+def test_the_coordinate_across_a_row_of_tiles_is_not_scored(is_of_before: bool) -> None:
     force_n = half_sines([20.0, 25.0])
     n = len(force_n)
     across: dict[str, Any] = {name: np.full(n, np.nan) for name in ("cop_y_m", "cop_sigma_y_m")}
@@ -204,7 +204,7 @@ def test_frames_in_a_gap_of_the_reference_are_not_there() -> None:
 # --- trials ---------------------------------------------------------------------------------------
 
 
-def test_marks_cut_trials_and_what_is_before_the_first_is_in_none() -> None:
+def test_markers_begin_trials_and_frames_before_the_first_are_in_none() -> None:
     t_ns = BEGAN_NS + np.arange(10, dtype=np.int64)
     markers = [TrialMarker("b", BEGAN_NS + 6), TrialMarker("a", BEGAN_NS + 2)]
     trials, what = split_into_trials(t_ns, np.zeros(10, np.uint16), markers)
@@ -212,7 +212,7 @@ def test_marks_cut_trials_and_what_is_before_the_first_is_in_none() -> None:
     assert what == "from marker to marker"
 
 
-def test_without_marks_each_part_is_a_trial() -> None:
+def test_each_part_is_a_trial_if_there_are_no_markers() -> None:
     part = np.array([0, 0, 1, 1, 1], dtype=np.uint16)
     trials, what = split_into_trials(np.arange(5, dtype=np.int64), part, [])
     assert [trial.rows.sum() for trial in trials] == [2, 3]

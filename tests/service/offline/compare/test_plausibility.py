@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from devices.errors import ComparisonError
+from service.offline.compare.alignment import Alignment
 from service.offline.compare.block_covariance import UncertainValue
 from service.offline.compare.paired_frames import PairedFrames, pair_frames
 from service.offline.compare.plausibility import (
@@ -24,6 +25,16 @@ FOOT_M = np.array([(0.02, 0.015), (0.02, -0.015), (-0.02, 0.015), (-0.02, -0.015
 FORCE_N = half_sines([10.0, 12.0])
 
 
+def aligned(
+    scale: float = 1.0, sigma: float = 0.0, drift_ppm: tuple[float, float] = (0.0, 0.0)
+) -> Alignment:
+    return replace(
+        same_clock(),
+        scale=UncertainValue(scale, sigma, 8.0),
+        drift_ppm=UncertainValue(*drift_ppm, 8.0),
+    )
+
+
 def under(x_m: np.ndarray) -> PairedFrames:
     cop_m = np.stack([x_m, np.zeros(len(FORCE_N))], axis=1)
     return pair_frames(columns(FORCE_N), reference(FORCE_N, cop_m=cop_m), same_clock())
@@ -31,10 +42,8 @@ def under(x_m: np.ndarray) -> PairedFrames:
 
 @pytest.mark.parametrize(("scale", "unit"), [(1000.0, "kN"), (800.0, "kN"), (0.0012, "mN")])
 def test_a_scale_of_a_thousand_is_another_unit(scale: float, unit: str) -> None:
-    aligned = same_clock()
-    wrong = replace(aligned, scale=replace(aligned.scale, value=scale))
     with pytest.raises(ComparisonError, match=f"may be {unit}"):
-        check_force_unit(wrong)
+        check_force_unit(aligned(scale))
 
 
 def over(seconds: float, step_s: float) -> ForceSignal:
@@ -58,8 +67,7 @@ def test_a_long_recording_around_a_short_session_is_no_wrong_unit() -> None:
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 9.81])
 def test_other_scales_are_for_the_user_to_judge(scale: float) -> None:
-    aligned = same_clock()
-    check_force_unit(replace(aligned, scale=replace(aligned.scale, value=scale)))
+    check_force_unit(aligned(scale))
 
 
 @pytest.mark.parametrize(
@@ -69,51 +77,36 @@ def test_other_scales_are_for_the_user_to_judge(scale: float) -> None:
 def test_a_scale_that_no_foot_has_is_said_with_the_unit_that_it_may_be(
     scale: float, says: str
 ) -> None:
-    aligned = same_clock()
-    wrong = replace(aligned, scale=replace(aligned.scale, value=scale))
-    (note,) = describe_implausible_alignment(wrong)
+    (note,) = describe_implausible_alignment(aligned(scale))
     assert says in note
-    assert advise_on_scale(wrong) == []
+    assert advise_on_scale(aligned(scale)) == []
 
 
 def test_clocks_that_differ_by_more_than_clocks_do_are_said() -> None:
-    aligned = same_clock()
-    drifting = replace(aligned, drift_ppm=UncertainValue(2963.0, 400.0, 8.0))
-    assert "2963 ppm" in describe_implausible_alignment(drifting)[0]
-    assert (
-        describe_implausible_alignment(
-            replace(aligned, drift_ppm=UncertainValue(2963.0, 1500.0, 8.0))
-        )
-        == []
-    )
-    assert (
-        describe_implausible_alignment(replace(aligned, drift_ppm=UncertainValue(90.0, 1.0, 8.0)))
-        == []
-    )
+    (note,) = describe_implausible_alignment(aligned(drift_ppm=(2963.0, 400.0)))
+    assert "2963 ppm" in note
+    for drift_ppm in ((2963.0, 1500.0), (90.0, 1.0)):
+        assert describe_implausible_alignment(aligned(drift_ppm=drift_ppm)) == []
 
 
 def test_a_gain_that_is_not_one_points_to_the_calibration_of_a_mounted_foot() -> None:
-    aligned = same_clock()
-    assert advise_on_scale(replace(aligned, scale=UncertainValue(0.99, 0.02, 8.0))) == []
-    (note,) = advise_on_scale(replace(aligned, scale=UncertainValue(0.8, 0.02, 8.0)))
+    assert advise_on_scale(aligned(0.99, 0.02)) == []
+    (note,) = advise_on_scale(aligned(0.8, 0.02))
     assert "calibrate --reference" in note
 
 
 TRAVEL = np.linspace(-0.015, 0.015, len(FORCE_N))
 
 
-def test_a_cop_under_the_foot_needs_no_word() -> None:
+def test_a_cop_under_the_foot_needs_no_word_and_one_beside_it_is_said() -> None:
     assert check_cop_position(under(TRAVEL), FOOT_M) == []
+    (note,) = check_cop_position(under(TRAVEL + 0.4), FOOT_M)
+    assert "outside the foot in 100 % of its frames" in note
 
 
 def test_a_cop_in_millimetres_read_as_metres_is_refused() -> None:
     with pytest.raises(ComparisonError, match="may be mm or cm"):
         check_cop_position(under(1e3 * TRAVEL), FOOT_M)
-
-
-def test_a_cop_beside_the_foot_is_said() -> None:
-    (note,) = check_cop_position(under(TRAVEL + 0.4), FOOT_M)
-    assert "outside the foot in 100 % of its frames" in note
 
 
 def test_a_centre_of_pressure_under_a_few_newtons_tells_nothing_of_its_unit() -> None:

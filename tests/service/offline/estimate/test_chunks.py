@@ -81,7 +81,6 @@ def in_pieces(source: Path, folder: Path, asked: EstimateRequest, piece_frames: 
     return out.read_bytes() + (folder / "stances.parquet").read_bytes()
 
 
-@pytest.mark.parametrize("piece_frames", [1, 2 * MINUTE, 5 * MINUTE])
 @pytest.mark.parametrize(
     "changes",
     [
@@ -91,26 +90,24 @@ def in_pieces(source: Path, folder: Path, asked: EstimateRequest, piece_frames: 
         {"tare_s": (70.0, 71.0), "models": ("static", "denoise")},  # not in the first one
     ],
 )
-def test_joined_they_are_to_the_byte_what_one_process_makes(
-    raw: Path, tmp_path: Path, changes: dict[str, Any], piece_frames: int
+def test_joined_pieces_are_the_bytes_that_one_process_makes(
+    raw: Path, tmp_path: Path, changes: dict[str, Any]
 ) -> None:
-    one, other = tmp_path / "one", tmp_path / "other"
-    one.mkdir()
-    other.mkdir()
     asked = request(**changes)
-    assert in_pieces(raw, one, asked, piece_frames) == in_one_go(raw, other, asked)
-    count = len(list((one / "pieces").glob("*.json")))
-    assert count == {1: 7 if "tare_s" not in changes else 6, 6000: 4, 15000: 2}[piece_frames]
+    whole = in_one_go(raw, tmp_path, asked)
+    for piece_frames, count in ((1, 6 if "tare_s" in changes else 7), (6000, 4), (15_000, 2)):
+        folder = tmp_path / str(piece_frames)
+        folder.mkdir()
+        assert in_pieces(raw, folder, asked, piece_frames) == whole, piece_frames
+        assert len(list((folder / "pieces").glob("*.json"))) == count
 
 
 def test_a_tare_that_is_taken_on_the_way_is_in_force_in_the_pieces_after_it(tmp_path: Path) -> None:
     tares = [taken_at(0, 0.0), taken_at(100 * 10**9, 5.0), taken_at(170 * 10**9, 2.0)]
     batch = frames(hopping(12_000, loaded_from=200), period_ns=PERIOD_NS)
     source = written(tmp_path / "raw.parquet", batch, tares=[tare.as_dict() for tare in tares])
-    one, other = tmp_path / "one", tmp_path / "other"
-    one.mkdir()
-    other.mkdir()
-    assert in_pieces(source, one, request(), 1) == in_one_go(source, other, request())
+    whole = in_one_go(source, tmp_path, request())
+    assert in_pieces(source, tmp_path, request(), 1) == whole
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +154,7 @@ def test_a_damaged_piece_is_refused_and_says_what_to_do(
     assert [path.name for path in tmp_path.iterdir()] == ["pieces"]
 
 
-def test_what_another_array_has_kept_is_refused(raw: Path, tmp_path: Path) -> None:
+def test_a_state_of_another_array_is_refused(raw: Path, tmp_path: Path) -> None:
     asked = request(models=("static",))
     estimate_next_chunk(raw, tmp_path, asked, chunk_frames=1, on_remark=ignored)
     with np.load(tmp_path / "0000.npz") as kept:

@@ -78,9 +78,7 @@ def rows_of(whole: dict[str, np.ndarray], start_s: float, end_s: float) -> dict[
     return {name: values[inside] for name, values in whole.items()}
 
 
-def test_of_models_that_forget_a_part_is_to_the_bit_what_it_is_in_the_whole(
-    raw: Path, tmp_path: Path
-) -> None:
+def test_a_part_has_the_bits_of_the_whole_if_its_models_forget(raw: Path, tmp_path: Path) -> None:
     estimated(raw, tmp_path / "whole.parquet", Slice())
     whole = columns_of(tmp_path / "whole.parquet")
     for begin_s, end_s in ((0.0, 2.0), (59.99, 60.01), (118.0, 125.0), (199.0, 500.0)):
@@ -91,9 +89,7 @@ def test_of_models_that_forget_a_part_is_to_the_bit_what_it_is_in_the_whole(
             np.testing.assert_array_equal(part[name], expected[name], err_msg=name)
 
 
-def test_of_models_that_remember_it_is_what_they_have_not_forgotten_by_then(
-    tmp_path: Path,
-) -> None:
+def test_a_part_differs_by_less_than_its_sigma_if_its_models_remember(tmp_path: Path) -> None:
     known = make_calibration(
         *(newton_tile(serial, effects=make_effects()) for serial in ("T01", "T02"))
     )
@@ -180,9 +176,7 @@ def test_a_part_that_is_not_there_is_refused_and_nothing_is_written(
     assert not out.exists()
 
 
-def test_without_an_unloaded_stretch_at_its_beginning_a_part_has_no_tare_either(
-    tmp_path: Path,
-) -> None:
+def test_a_part_has_no_tare_if_its_session_does_not_begin_unloaded(tmp_path: Path) -> None:
     path = tmp_path / "loaded.parquet"
     known = calibration().model_dump(mode="json")
     with SealedFileWriter(path, array(RATE_HZ), {"calibration": known}) as writer:

@@ -76,7 +76,7 @@ def test_estimated_again_from_its_own_file_a_session_has_the_same_content(
             assert rounded.content_sha256 == once.content_sha256
 
 
-def test_what_is_in_the_file_is_what_was_computed_rounded_to_the_steps_it_states(
+def test_the_file_has_the_computed_values_rounded_to_its_stated_steps(
     raw: Path, tmp_path: Path
 ) -> None:
     batch = frames(hopping(3000, loaded_from=300), lead=200)
