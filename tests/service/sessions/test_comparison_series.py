@@ -114,7 +114,7 @@ def test_a_zoom_costs_the_same_wherever_it_is_and_however_long_the_series(
     assert read == [1, 1, 1]
 
 
-def test_it_is_read_whole_once_and_again_when_it_is_another(
+def test_a_series_is_read_once_and_again_when_it_has_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read: list[Path] = []
@@ -141,7 +141,7 @@ def test_it_is_read_whole_once_and_again_when_it_is_another(
     assert len(series_kept._entries) == 4
 
 
-def test_what_is_asked_for_is_some_time_of_it_and_nothing_is_no_error(tmp_path: Path) -> None:
+def test_a_time_range_has_its_bins_and_an_empty_one_is_no_error(tmp_path: Path) -> None:
     table = kept(tmp_path, series(range(0, 100, 2), [1.0] * 50, [2.0] * 50))
     bins, size = table.get_bins(*Slice(start_s=0.01, end_s=0.02).compute_bounds_ns(BEGIN_NS), 100)
     assert size == 1

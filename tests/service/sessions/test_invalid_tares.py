@@ -10,18 +10,6 @@ import pytest
 from service.sessions.tares import TareHistory
 from tests.service.sessions.tares import INFO, history, rewrite
 
-
-def assert_lost(path: Path) -> None:
-    found = TareHistory(path)
-    assert found.all_tares_with_undone == []
-    assert found.tare_in_force_unless_lost(INFO) is None
-    assert found.is_tare_lost(INFO)
-    assert [tare.is_lost for tare in found.tares_in_force_or_lost_between(INFO, 0, 9)] == [True]
-    assert path.with_name("tares.json.damaged-1").exists()
-    assert found.problem is not None
-    assert "tares.json.damaged-1" in found.problem
-
-
 DAMAGES: dict[str, dict[str, Any]] = {
     "a baseline less": {"tare": {"baseline_kpa": [100.0]}},
     "a baseline that is not known": {"tare": {"baseline_kpa": [100.0, None]}},
@@ -45,29 +33,36 @@ DAMAGES: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("change", DAMAGES.values(), ids=DAMAGES.keys())
-def test_what_is_no_tare_of_its_tiles_is_lost(tmp_path: Path, change: dict[str, Any]) -> None:
+MISSING = (
+    "id",
+    "serials",
+    "undone",
+    "reason",
+    "chips",
+    "tare",
+    "baseline_kpa",
+    "t_ns",
+    "noise_lasting",
+)
+
+
+@pytest.mark.parametrize("damage", [*DAMAGES, *MISSING])
+def test_an_impossible_or_incomplete_tare_is_lost(tmp_path: Path, damage: str) -> None:
     history(tmp_path, 1)
     path = tmp_path / "node" / "tares.json"
 
     def changed(content: Any) -> None:
-        for name, value in change.items():
+        for name, value in DAMAGES.get(damage, {}).items():
             content[0][name] = content[0][name] | value if name == "tare" else value
+        if damage in MISSING:
+            del (content[0] if damage in content[0] else content[0]["tare"])[damage]
 
     rewrite(path, changed)
-    assert_lost(path)
-
-
-@pytest.mark.parametrize(
-    "missing",
-    ["id", "serials", "undone", "reason", "chips", "tare", "baseline_kpa", "t_ns", "noise_lasting"],
-)
-def test_a_tare_that_lacks_something_is_lost(tmp_path: Path, missing: str) -> None:
-    history(tmp_path, 1)
-    path = tmp_path / "node" / "tares.json"
-
-    def without(content: Any) -> None:
-        del (content[0] if missing in content[0] else content[0]["tare"])[missing]
-
-    rewrite(path, without)
-    assert_lost(path)
+    found = TareHistory(path)
+    assert found.all_tares_with_undone == []
+    assert found.tare_in_force_unless_lost(INFO) is None
+    assert found.is_tare_lost(INFO)
+    assert [tare.is_lost for tare in found.tares_in_force_or_lost_between(INFO, 0, 9)] == [True]
+    assert path.with_name("tares.json.damaged-1").exists()
+    assert found.problem is not None
+    assert "tares.json.damaged-1" in found.problem

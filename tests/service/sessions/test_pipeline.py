@@ -21,7 +21,7 @@ from service.estimation.pipeline.plan import make_plan
 from service.estimation.records import Estimates
 from service.estimation.tare.tare import Tare
 from service.sessions import pipeline
-from service.sessions.pipeline import EstimateStream, make_estimate_columns, make_estimate_metadata
+from service.sessions.pipeline import EstimateStream, make_estimate_metadata
 from storage.schema import ESTIMATE_COLUMNS
 from tests.builders.arrays import COUNT_KPA, UNLOADED_KPA
 from tests.service.sessions.pieces import (
@@ -94,35 +94,29 @@ def test_all_columns_of_the_schema_are_there_in_its_order_and_double_precision()
     assert columns["estimate_flags"].dtype == np.uint16
 
 
-def test_the_lead_is_taken_to_its_end_even_over_many_pieces() -> None:
-    batch = frames(hopping(300, loaded_from=120), lead=120)
-    stream, _, _ = run(cut(batch, range(1, 300)))
-    assert stream.plan is not None
-    assert (stream.plan.tare.source, stream.plan.tare.frames) == ("lead", 120)
-
-
-def test_a_recording_that_is_all_lead_is_estimated_too() -> None:
-    stream, out, _ = run(cut(frames(hopping(100, loaded_from=100), lead=100), [30, 60]))
-    assert stream.plan is not None
-    assert stream.plan.tare.frames == 100
-    assert len(out) == 100
-
-
-def test_a_named_interval_is_waited_for_and_reaches_back() -> None:
-    # unloaded from 0.4 to 0.5 s only; frames before it are estimated with that tare as well
-    forces_n = hopping(300, loaded_from=0)
+@pytest.mark.parametrize(
+    ("loaded_from", "lead", "cuts", "tare_s", "tare"),
+    [
+        pytest.param(120, 120, range(1, 300), None, ("lead", 120), id="the lead to its end"),
+        pytest.param(300, 300, [30, 60], None, ("lead", 300), id="all is lead"),
+        # Unloaded from 0.4 to 0.5 s only; frames before it are estimated with that tare as well.
+        pytest.param(0, 0, range(1, 300), (0.4, 0.5), ("interval", 51), id="an interval later on"),
+        pytest.param(300, 100, [10, 20], (0.3, 0.5), ("interval", 101), id="it wins over the lead"),
+    ],
+)
+def test_the_tare_is_the_named_interval_or_else_the_whole_lead_whatever_the_pieces(
+    loaded_from: int,
+    lead: int,
+    cuts: Sequence[int],
+    tare_s: tuple[float, float] | None,
+    tare: tuple[str, int],
+) -> None:
+    forces_n = hopping(300, loaded_from=loaded_from)
     forces_n[200:251] = np.random.default_rng(1).normal(0.0, 1.0, (51, 2))
-    stream, out, _ = run(cut(frames(forces_n), range(1, 300)), tare_s=(0.4, 0.5))
+    stream, out, _ = run(cut(frames(forces_n, lead=lead), cuts), tare_s=tare_s)
     assert stream.plan is not None
-    assert (stream.plan.tare.source, stream.plan.tare.frames) == ("interval", 51)
+    assert (stream.plan.tare.source, stream.plan.tare.frames) == tare
     assert len(out) == 300
-
-
-def test_a_named_interval_wins_over_the_lead() -> None:
-    batch = frames(hopping(300, loaded_from=300), lead=100)
-    stream, _, _ = run(cut(batch, [10, 20]), tare_s=(0.3, 0.5))
-    assert stream.plan is not None
-    assert (stream.plan.tare.source, stream.plan.tare.frames) == ("interval", 101)
 
 
 def a_minute_under_load(unloaded_from_s: float, seconds: float) -> FrameBatch:
@@ -163,19 +157,20 @@ def test_at_the_end_of_the_minute_too_it_does_not_depend_on_the_pieces(
     assert outcome(cut(batch, cuts)) == outcome(cut(batch, []))
 
 
-def test_a_recording_that_is_never_unloaded_is_refused() -> None:
-    with pytest.raises(TareError, match="no interval can be recognised"):
-        run([(frames(np.full((400, 2), 40.0)), {})])
-
-
-def test_a_recording_without_frames_is_refused() -> None:
-    with pytest.raises(TareError, match="no frames"):
-        list(EstimateStream(array(), options()).estimate_batches([]))
-
-
-def test_an_interval_after_the_end_is_refused() -> None:
-    with pytest.raises(TareError):
-        run([(frames(np.zeros((100, 2))), {})], tare_s=(10.0, 11.0))
+@pytest.mark.parametrize(
+    ("pieces", "tare_s", "says"),
+    [
+        ([(frames(np.full((400, 2), 40.0)), {})], None, "no interval can be recognised"),
+        ([], None, "no frames"),
+        ([(frames(np.zeros((100, 2))), {})], (10.0, 11.0), "0 readable frames in the interval"),
+    ],
+    ids=["never unloaded", "no frames", "an interval after the end"],
+)
+def test_a_recording_without_a_tare_is_refused(
+    pieces: list[Piece], tare_s: tuple[float, float] | None, says: str
+) -> None:
+    with pytest.raises(TareError, match=says):
+        list(EstimateStream(array(), options(tare_s=tare_s)).estimate_batches(pieces))
 
 
 @pytest.mark.parametrize(
@@ -217,18 +212,7 @@ def test_the_notes_are_enough_to_make_the_same_estimates_again() -> None:
     notes = json.loads(
         json.dumps(make_estimate_metadata(stream.plan, stream.rounding), allow_nan=False)
     )
-    kept = notes["tare"]
-    tare = Tare(
-        baseline_kpa=np.array(kept["baseline_kpa"]),
-        baseline_sigma_kpa=np.array(kept["baseline_sigma_kpa"]),
-        noise_kpa=np.array(kept["noise_kpa"]),
-        temperature_raw_counts=np.array(kept["temperature_raw_counts"]),
-        t_ns=kept["t_ns"],
-        begin_s=kept["begin_s"],
-        end_s=kept["end_s"],
-        frames=kept["frames"],
-        source=kept["source"],
-    )
+    tare = Tare.from_dict(notes["tare"], tiles=2)
     plan = make_plan(
         array(),
         Calibration.model_validate(notes["calibration"]),
@@ -260,33 +244,14 @@ def test_the_notes_say_what_was_used() -> None:
     assert (tare["source"], tare["frames"], tare["t_ns"]) == ("lead", 100, 10**18 + 198_000_000)
 
 
-def test_an_assumed_scale_is_said_in_the_notes() -> None:
-    assumed = calibration(absolute_scale="assumed")
-    stream, _, _ = run([(frames(hopping(99, loaded_from=50), lead=50), {})], calibration=assumed)
-    assert stream.plan is not None
-    assert make_estimate_metadata(stream.plan, stream.rounding)["absolute_scale"] == "assumed"
-
-
-def test_the_calibration_in_the_notes_is_the_one_that_they_name() -> None:
+def test_the_notes_have_the_calibration_that_they_name_and_say_if_its_scale_is_assumed() -> None:
     # A bench of eight tiles, a foot of two of them: what is kept must be found by the id stated.
-    many = calibration("T07", "T02", "T01", "T05")
+    many = calibration("T07", "T02", "T01", "T05", absolute_scale="assumed")
     stream, _, _ = run([(frames(hopping(99, loaded_from=50), lead=50), {})], calibration=many)
     assert stream.plan is not None
     notes = make_estimate_metadata(stream.plan, stream.rounding)
     assert Calibration.model_validate(notes["calibration"]).id == notes["calibration_id"]
-
-
-def test_estimate_columns_are_those_of_the_estimates_without_number_and_time() -> None:
-    plan = make_plan(
-        array(),
-        calibration(),
-        Tare(np.zeros(2), np.zeros(2), np.ones(2), np.zeros(2), 0, 0.0, 0.0, 0, "interval"),
-        models=("static",),
-    )
-    estimates = Estimator(plan).process_frames(frames(np.zeros((3, 2))))
-    columns = make_estimate_columns(estimates)
-    assert set(columns) == {f.name for f in fields(Estimates)} - {"seq", "t_ns"}
-    assert columns["grf_n"] is estimates.grf_n
+    assert notes["absolute_scale"] == "assumed"
 
 
 def test_faults_in_the_lead_leave_the_rest_of_it_as_tare() -> None:

@@ -17,16 +17,7 @@ from devices.frames import FrameBatch
 from service.estimation.tare.tare import Tare
 from service.sessions.pipeline import EstimateStream, make_estimate_metadata
 from tests.builders.arrays import COUNT_KPA, UNLOADED_KPA
-from tests.service.sessions.pieces import (
-    Piece,
-    array,
-    cut,
-    frames,
-    hopping,
-    options,
-    run,
-    same,
-)
+from tests.service.sessions.pieces import Piece, array, cut, frames, hopping, options, run, same
 
 
 def taken_at(t_ns: int, counts: float) -> Tare:
@@ -149,7 +140,7 @@ def test_a_recording_that_goes_on_after_a_restart_has_one_estimate_a_frame(
         np.testing.assert_allclose(columns["gauge_kpa"] / COUNT_KPA, gauge, atol=1e-9)
 
 
-def test_what_comes_after_a_restart_knows_nothing_of_what_was_before() -> None:
+def test_frames_after_a_restart_are_estimated_without_those_before() -> None:
     # The first part ends in contact; the second is estimated as if it were all there is.
     first = frames(np.full((60, 2), 30.0))
     second = later_part(frames(hopping(90, loaded_from=200)), 10**9)
@@ -167,7 +158,7 @@ def test_what_comes_after_a_restart_knows_nothing_of_what_was_before() -> None:
     instants=st.lists(st.integers(-10, 250), max_size=3).map(sorted),
     lag_ms=st.sampled_from([0.0, 10.0, 5000.0]),
 )
-def test_a_stream_that_goes_on_with_what_others_have_kept_gives_the_bits_of_one(
+def test_a_stream_that_continues_from_a_stored_state_gives_the_bits_of_one(
     cuts: set[int], handed: set[int], instants: list[int], lag_ms: float
 ) -> None:
     first, second = (
@@ -206,6 +197,6 @@ def through_a_file(kept: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         return dict(read)
 
 
-def test_what_nobody_has_begun_cannot_be_kept() -> None:
+def test_a_stream_without_frames_has_no_state() -> None:
     with pytest.raises(TareError, match="no frames"):
         EstimateStream(array(), options()).state_dict()

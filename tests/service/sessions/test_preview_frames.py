@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -215,14 +216,19 @@ def assert_the_overview_is_as_in_one_go(so_far: SessionPreview, sources: Session
 
 
 @pytest.fixture
-def long(tmp_path: Path) -> Iterator[Recorded]:
-    """Twenty seconds, of which everything was looked at."""
-    recorded = Recorded(tmp_path)
+def recorded(tmp_path: Path) -> Iterator[Recorded]:
+    """A session without a frame yet."""
+    with closing(Recorded(tmp_path)) as begun:
+        yield begun
+
+
+@pytest.fixture
+def long(recorded: Recorded) -> Recorded:
+    """Twenty seconds with a tare."""
     recorded.tares.append(taken_at(0, 0.0))
     for _ in range(100):
         recorded.come(100)
-    yield recorded
-    recorded.close()
+    return recorded
 
 
 def read_by(
@@ -242,7 +248,7 @@ def read_by(
     return read
 
 
-def test_what_a_slice_costs_does_not_depend_on_where_it_is(
+def test_the_cost_of_a_slice_does_not_depend_on_its_place(
     long: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     so_far = SessionPreviews(tmp_path).advance_preview_within_time_limit(long.sources())
@@ -255,11 +261,10 @@ def test_what_a_slice_costs_does_not_depend_on_where_it_is(
         assert 50 <= read < apart + 1200, begin_s  # the estimate goes on by a thousand
 
 
-def test_after_frames_that_came_late_only_what_is_behind_them_is_estimated_anew(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_late_frames_have_only_the_frames_behind_them_estimated_anew(
+    recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(service.sessions.preview, "CHECKPOINTS_MAX", 1000)
-    recorded = Recorded(tmp_path)
     recorded.tares.append(taken_at(0, 0.0))
     so_fars = SessionPreviews(tmp_path)
     recorded.come(4000)
@@ -276,7 +281,6 @@ def test_after_frames_that_came_late_only_what_is_behind_them_is_estimated_anew(
     assert so_far.checkpoints.checkpoints[: len(true) - 2] == before[: len(true) - 2]
     assert_the_overview_is_as_in_one_go(so_far, recorded.sources())
     so_it_is(so_far, recorded.sources(), Slice(8.1, 8.3))
-    recorded.close()
 
 
 @pytest.mark.parametrize("failing", ["put", "get"])
@@ -296,10 +300,8 @@ def test_a_disk_that_is_full_or_forgets_costs_time_and_no_frame(
     so_it_is(so_far, long.sources(), Slice(15.0, 15.1))
 
 
-def test_without_a_tare_there_are_raw_frames_and_once_there_is_one_estimates(
-    tmp_path: Path,
-) -> None:
-    recorded, so_fars = Recorded(tmp_path), SessionPreviews(tmp_path)
+def test_a_preview_has_raw_frames_until_there_is_a_tare(recorded: Recorded, tmp_path: Path) -> None:
+    so_fars = SessionPreviews(tmp_path)
     recorded.come(300)
     raw = so_fars.advance_preview_within_time_limit(recorded.sources())
     so_it_is(raw, recorded.sources(), Slice(0.3, 0.4))
@@ -309,14 +311,13 @@ def test_without_a_tare_there_are_raw_frames_and_once_there_is_one_estimates(
     estimated = so_fars.advance_preview_within_time_limit(recorded.sources())
     assert estimated.has_estimate_stream
     so_it_is(estimated, recorded.sources(), Slice(0.3, 0.4))
-    recorded.close()
 
 
 @pytest.mark.parametrize("looked", [100, 200, 260, 300])
 def test_a_clock_that_was_set_back_has_its_parts_one_behind_the_other(
-    tmp_path: Path, looked: int
+    recorded: Recorded, tmp_path: Path, looked: int
 ) -> None:
-    recorded, so_fars = Recorded(tmp_path), SessionPreviews(tmp_path)
+    so_fars = SessionPreviews(tmp_path)
     recorded.tares.append(taken_at(0, 0.0))
     so_far = SessionPreview(recorded.sources(), tmp_path)
     for come in range(300):
@@ -330,12 +331,9 @@ def test_a_clock_that_was_set_back_has_its_parts_one_behind_the_other(
         so_it_is(so_far, recorded.sources(), part)
         assert in_one_go(recorded.sources(), part).split()[1:] == [b"%d" % number] * 10
     so_it_is(so_far, recorded.sources(), Slice(0.39, 0.41))
-    recorded.close()
 
 
-def test_before_the_first_frame_there_is_nothing(tmp_path: Path) -> None:
-    recorded = Recorded(tmp_path)
+def test_a_preview_before_the_first_frame_is_refused(recorded: Recorded, tmp_path: Path) -> None:
     sources = recorded.sources()
     with pytest.raises(UsageError, match="no frames"):
         PreviewFrames(SessionPreview(sources, tmp_path), sources, Slice()).make_one_pass_source()
-    recorded.close()

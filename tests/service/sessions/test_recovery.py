@@ -41,6 +41,15 @@ from tests.service.sessions.crashed import (
 )
 from tests.storage.faulty_disk import refusing
 
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """A node's folder with a session of a hundred frames, whose end is known."""
+    stream(tmp_path, info_of(), (0, 99), next_seq=100)
+    session(tmp_path)
+    return tmp_path
+
+
 # --- a node alone ---------------------------------------------------------------------------------
 
 
@@ -80,7 +89,9 @@ def test_a_second_run_finds_nothing_and_changes_nothing(tmp_path: Path) -> None:
     assert state_of(tmp_path) == before
 
 
-def test_without_tare_or_calibration_raw_frames_are_kept_and_it_says_so(tmp_path: Path) -> None:
+def test_raw_frames_are_sealed_without_tare_or_calibration_and_the_session_says_so(
+    tmp_path: Path,
+) -> None:
     stream(tmp_path, info_of(), (0, 99))
     session(tmp_path)
     (one,) = recover_locked_folder(tmp_path).sessions
@@ -88,28 +99,20 @@ def test_without_tare_or_calibration_raw_frames_are_kept_and_it_says_so(tmp_path
     assert loaded(tmp_path).frames == 100
 
 
-def test_a_process_that_was_killed_on_a_machine_that_stayed_up_lost_nothing(tmp_path: Path) -> None:
-    folder = stream(tmp_path, info_of(), (0, 99), closed=False)
-    InFlightWriter(folder, info_of()).close()
-    session(tmp_path)
-    assert recover_locked_folder(tmp_path).sessions[0].ledger == loaded(tmp_path).ledger
-    ledger = loaded(tmp_path).ledger
-    assert ledger is not None
-    assert ledger.complete
-    assert find_verdict(verify_path(tmp_path)) == "complete"
-
-
-def test_after_another_start_of_the_machine_what_was_in_flight_is_gone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("has_restarted", [False, True])
+def test_frames_in_flight_are_lost_only_if_the_machine_has_started_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_restarted: bool
 ) -> None:
     folder = stream(tmp_path, info_of(), (0, 99), closed=False)
     InFlightWriter(folder, info_of()).close()
-    monkeypatch.setattr("storage.journal.node.in_flight.read_kernel_boot_id", lambda: "another")
     session(tmp_path)
-    assert recover_locked_folder(tmp_path).sessions[0].ledger == loaded(tmp_path).ledger
-    ledger = loaded(tmp_path).ledger
-    assert ledger is not None
-    assert ledger.parts[0].max_lost_tail_frames == TAIL
+    if has_restarted:
+        monkeypatch.setattr("storage.journal.node.in_flight.read_kernel_boot_id", lambda: "other")
+    _, ledger = recovered(tmp_path)
+    assert ledger == loaded(tmp_path).ledger
+    assert ledger.parts[0].max_lost_tail_frames == (TAIL if has_restarted else 0)
+    assert ledger.complete != has_restarted
+    assert find_verdict(verify_path(tmp_path)) == ("lossy" if has_restarted else "complete")
 
 
 def test_a_stream_whose_end_is_known_is_counted_to_it(tmp_path: Path) -> None:
@@ -156,7 +159,7 @@ def test_a_session_of_which_nothing_reached_the_disk_is_sealed_as_that(tmp_path:
 # --- a server -------------------------------------------------------------------------------------
 
 
-def test_what_a_node_may_still_bring_is_waited_for(tmp_path: Path) -> None:
+def test_frames_that_a_node_may_still_bring_are_waited_for(tmp_path: Path) -> None:
     stream(servers(tmp_path), info_of(), (0, 99), (120, 199))
     session(tmp_path)
     parts = (Part(stream_id=BOOT, seq_first=50, seq_last=150),)
@@ -239,7 +242,7 @@ def test_frames_of_no_session_become_one_if_asked(tmp_path: Path) -> None:
     assert find_verdict(verify_path(tmp_path)) == "complete"
 
 
-def test_what_was_deleted_is_not_brought_back(tmp_path: Path) -> None:
+def test_a_deleted_session_is_not_brought_back(tmp_path: Path) -> None:
     stream(tmp_path, info_of(), (0, 99), next_seq=100)
     session(tmp_path, state="sealed")
     (tmp_path / "trash").mkdir()
@@ -251,41 +254,35 @@ def test_what_was_deleted_is_not_brought_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.process
-def test_what_dead_processes_left_half_written_is_removed(tmp_path: Path) -> None:
-    stream(tmp_path, info_of(), (0, 99), next_seq=100)
-    session(tmp_path)
+def test_temporary_files_of_dead_processes_are_removed(data: Path) -> None:
     dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], stdout=-1)
-    stale = tmp_path / "sessions" / ID / f".frames.parquet.{int(dead.stdout)}.7.0123abcd.tmp"
+    stale = data / "sessions" / ID / f".frames.parquet.{int(dead.stdout)}.7.0123abcd.tmp"
     stale.write_bytes(b"PAR1")
-    assert recover_locked_folder(tmp_path).removed_temporaries == [stale]
+    assert recover_locked_folder(data).removed_temporaries == [stale]
     assert not stale.exists()
 
 
-def test_events_that_were_not_written_in_time_are_written_anew(tmp_path: Path) -> None:
-    stream(tmp_path, info_of(), (0, 99), next_seq=100)
-    session(tmp_path)
-    recover_locked_folder(tmp_path)
-    done = loaded(tmp_path)
+def test_events_that_were_not_written_in_time_are_written_anew(data: Path) -> None:
+    recover_locked_folder(data)
+    done = loaded(data)
     marked = done.model_copy(
         update={"markers": (*done.markers, Marker(id="e2", label="fall", t_ns=1))}
     )
-    SessionsFolder(tmp_path / "sessions").save_session_json(marked)
-    assert verify_path(tmp_path).to_json_dict()["problems"]
-    assert recover_locked_folder(tmp_path).rewritten_markers == [ID]
-    assert verify_path(tmp_path).to_json_dict()["problems"] == []
-    assert recover_locked_folder(tmp_path).is_empty_or_all_waiting
+    SessionsFolder(data / "sessions").save_session_json(marked)
+    assert verify_path(data).to_json_dict()["problems"]
+    assert recover_locked_folder(data).rewritten_markers == [ID]
+    assert verify_path(data).to_json_dict()["problems"] == []
+    assert recover_locked_folder(data).is_empty_or_all_waiting
 
 
-def test_what_cannot_be_read_is_named_and_holds_up_nothing_else(tmp_path: Path) -> None:
-    stream(tmp_path, info_of(), (0, 99), next_seq=100)
-    session(tmp_path)
-    bad = tmp_path / "sessions" / (ID[:-1] + "b")
+def test_unreadable_files_are_named_and_hold_up_nothing_else(data: Path) -> None:
+    bad = data / "sessions" / (ID[:-1] + "b")
     bad.mkdir()
     (bad / "session.json").write_bytes(b"{")
-    hopeless = tmp_path / "journal" / "bench" / OTHER_BOOT
+    hopeless = data / "journal" / "bench" / OTHER_BOOT
     hopeless.mkdir()
     (hopeless / f"{0:020d}.arrows").write_bytes(b"nothing of ours")
-    recovery = recover_locked_folder(tmp_path)
+    recovery = recover_locked_folder(data)
     assert outcomes(recovery) == ["sealed"]
     text = "; ".join(recovery.problems)
     assert bad.name in text
@@ -293,38 +290,34 @@ def test_what_cannot_be_read_is_named_and_holds_up_nothing_else(tmp_path: Path) 
 
 
 def test_a_file_that_does_not_prove_itself_is_not_called_recovered(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stream(tmp_path, info_of(), (0, 99), next_seq=100)
-    session(tmp_path)
 
     def careless(*arguments: Any) -> Session:
         done = seal_session(*arguments)
-        path = tmp_path / "sessions" / ID / "frames.parquet"
+        path = data / "sessions" / ID / "frames.parquet"
         content = bytearray(path.read_bytes())
         content[100] ^= 1
         path.write_bytes(content)
         return done
 
     monkeypatch.setattr(recover_module, "seal_session", careless)
-    (one,) = recover_locked_folder(tmp_path).sessions
+    (one,) = recover_locked_folder(data).sessions
     assert one.outcome == "failed"
     assert "changed since it was sealed" in one.problem
-    assert loaded(tmp_path).state == "sealing"
+    assert loaded(data).state == "sealing"
     monkeypatch.undo()
-    assert outcomes(recover_locked_folder(tmp_path)) == ["sealed"]
+    assert outcomes(recover_locked_folder(data)) == ["sealed"]
 
 
 def test_a_full_disk_leaves_the_session_for_the_next_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stream(tmp_path, info_of(), (0, 99), next_seq=100)
-    session(tmp_path)
     monkeypatch.setattr(recover_module, "seal_session", refusing(StorageError, "no space left"))
-    (one,) = recover_locked_folder(tmp_path).sessions
-    assert (one.outcome, loaded(tmp_path).state) == ("failed", "sealing")
+    (one,) = recover_locked_folder(data).sessions
+    assert (one.outcome, loaded(data).state) == ("failed", "sealing")
     monkeypatch.undo()
-    assert outcomes(recover_locked_folder(tmp_path)) == ["sealed"]
+    assert outcomes(recover_locked_folder(data)) == ["sealed"]
 
 
 class Killed(BaseException):

@@ -29,12 +29,17 @@ from tests.service.sessions.crashed import (
 )
 
 
-def test_frames_that_are_damaged_are_lost_and_the_others_kept(tmp_path: Path) -> None:
-    folder = stream(tmp_path, info_of(), (0, 99), next_seq=100)
+def flip_a_bit(folder: Path) -> None:
+    """Damage a batch in the middle of a journal."""
     (segment,) = folder.glob("*.arrows")
     content = bytearray(segment.read_bytes())
     content[len(content) // 2] ^= 1
     segment.write_bytes(content)
+
+
+def test_frames_that_are_damaged_are_lost_and_the_others_kept(tmp_path: Path) -> None:
+    folder = stream(tmp_path, info_of(), (0, 99), next_seq=100)
+    flip_a_bit(folder)
     session(tmp_path)
     _, ledger = recovered(tmp_path)
     assert ledger.parts[0].lost == {"corrupt": 10}
@@ -45,35 +50,24 @@ def test_frames_that_are_damaged_are_lost_and_the_others_kept(tmp_path: Path) ->
     assert find_verdict(verify_path(tmp_path / "sessions" / ID)) == "lossy"
 
 
-def test_damaged_frames_of_a_server_are_waited_for_until_abandoned(
-    tmp_path: Path,
-) -> None:
+def test_damaged_frames_of_a_server_are_waited_for_until_abandoned(tmp_path: Path) -> None:
     data, again = tmp_path / "data", tmp_path / "again"
     folder = stream(servers(data), info_of(), (0, 99))
-    (segment,) = folder.glob("*.arrows")
-    content = bytearray(segment.read_bytes())
-    content[len(content) // 2] ^= 1
-    segment.write_bytes(content)
+    flip_a_bit(folder)
     parts = (Part(stream_id=BOOT, seq_first=0, seq_last=99),)
     session(data, state="pending", stopped_t_ns=t_ns(99), parts=parts)
     shutil.copytree(data, again)
     (one,) = recover_locked_folder(data).sessions
     assert (one.outcome, one.problem) == ("waiting", "10 frames may still come from node bench")
     assert verify_journal(folder).to_json_dict()["lost"] == {"corrupt": 10}
-    (one,) = recover_locked_folder(data, abandon_missing=True).sessions  # they are cut off by now
-    assert one.ledger is not None
-    assert (one.outcome, one.ledger.parts[0].lost) == ("sealed", {"corrupt": 10})
-    (one,) = recover_locked_folder(again, abandon_missing=True).sessions
-    assert one.ledger is not None
-    assert (one.outcome, one.ledger.parts[0].lost) == ("sealed", {"corrupt": 10})
+    for folder in (data, again):  # in the first one they are cut off by now
+        one, ledger = recovered(folder, abandon_missing=True)
+        assert (one.outcome, ledger.parts[0].lost) == ("sealed", {"corrupt": 10})
 
 
 def test_a_damaged_batch_at_the_stop_is_lost_and_the_others_tell_the_end(tmp_path: Path) -> None:
     folder = stream(tmp_path, info_of(), (0, 99), next_seq=100)
-    (segment,) = folder.glob("*.arrows")
-    content = bytearray(segment.read_bytes())
-    content[len(content) // 2] ^= 1  # in the batch of frames 30 to 39
-    segment.write_bytes(content)
+    flip_a_bit(folder)  # in the batch of frames 30 to 39
     session(tmp_path, state="pending", stopped_t_ns=t_ns(35))
     session(tmp_path, ID[:-1] + "b", state="pending", stopped_t_ns=t_ns(20))
     here, other = recover_locked_folder(tmp_path).sessions

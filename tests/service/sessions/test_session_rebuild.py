@@ -52,7 +52,7 @@ def assert_made_again(data: Path, before: Session) -> Session:
 
 
 @pytest.mark.parametrize("by", ["server", "recover"])
-def test_of_a_sealed_session_it_is_made_again_from_the_files_beside_it(data: Path, by: str) -> None:
+def test_a_damaged_session_json_is_rebuilt_from_the_files_beside_it(data: Path, by: str) -> None:
     before, path = loaded(data), damage(data)
     damaged = path.read_bytes()
     if by == "server":
@@ -69,7 +69,7 @@ def test_of_a_sealed_session_it_is_made_again_from_the_files_beside_it(data: Pat
     assert (path.parent / "session.json.damaged-1").read_bytes() == damaged
 
 
-def test_one_in_the_trash_is_made_again_as_well(data: Path) -> None:
+def test_a_session_json_in_the_trash_is_rebuilt_as_well(data: Path) -> None:
     before = loaded(data)
     damage(data)
     (data / "trash").mkdir()
@@ -80,27 +80,29 @@ def test_one_in_the_trash_is_made_again_as_well(data: Path) -> None:
     assert_made_again(data, before)
 
 
-def test_one_that_is_gone_is_made_again_and_lost_marks_are_said(data: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "content", "lost", "verdict"),
+    [
+        ("markers", b"PAR1", "markers", "complete"),
+        ("clock", None, "clock measurements", "damaged"),
+    ],
+)
+def test_a_missing_session_json_is_rebuilt_and_other_losses_are_said(
+    data: Path, name: str, content: bytes | None, lost: str, verdict: str
+) -> None:
     folder = data / "sessions" / ID
     (folder / "session.json").unlink()
-    (folder / "markers.parquet").write_bytes(b"PAR1")
+    (folder / f"{name}.parquet").unlink()
+    if content is not None:
+        (folder / f"{name}.parquet").write_bytes(content)
     (one,) = book(data).iterate_newest_first()
-    assert one.markers == ()
-    assert str(one.problem).endswith("lost are subject, notes and tags, markers")
+    assert getattr(one, name) == ()
+    assert str(one.problem).endswith(f"lost are subject, notes and tags, {lost}")
     recover_locked_folder(data)
-    assert find_verdict(verify_path(data)) == "complete"
+    assert find_verdict(verify_path(data)) == verdict
 
 
-def test_a_lost_clock_is_said_as_well(data: Path) -> None:
-    folder = data / "sessions" / ID
-    (folder / "session.json").unlink()
-    (folder / "clock.parquet").unlink()
-    (one,) = book(data).iterate_newest_first()
-    assert one.clock == ()
-    assert str(one.problem).endswith("lost are subject, notes and tags, clock measurements")
-
-
-def test_one_that_nothing_proves_is_named_and_its_files_stay(data: Path) -> None:
+def test_a_session_that_nothing_proves_is_named_and_its_files_stay(data: Path) -> None:
     frames = data / "sessions" / ID / "frames.parquet"
     content = bytearray(frames.read_bytes())
     content[len(content) // 2] ^= 1
@@ -116,7 +118,7 @@ def test_one_that_nothing_proves_is_named_and_its_files_stay(data: Path) -> None
     assert path.read_bytes() == before
 
 
-def test_one_of_another_version_is_left_as_it_is(data: Path) -> None:
+def test_a_session_of_another_version_is_left_as_it_is(data: Path) -> None:
     path = data / "sessions" / ID / "session.json"
     text = verify_and_strip_json_checksum(path.read_bytes(), where="")
     text = text.replace(b'"walk"', b'"walk", "colour": "red"', 1)
@@ -126,7 +128,7 @@ def test_one_of_another_version_is_left_as_it_is(data: Path) -> None:
     assert path.read_bytes() == append_json_checksum(text)
 
 
-def test_of_one_that_is_not_sealed_all_frames_are_kept(tmp_path: Path) -> None:
+def test_all_frames_of_an_unsealed_damaged_session_are_kept(tmp_path: Path) -> None:
     stream(tmp_path, info_of(), (0, 99), next_seq=100)
     session(tmp_path, state="pending", stopped_t_ns=t_ns(99))
     path = damage(tmp_path)

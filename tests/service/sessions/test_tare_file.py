@@ -6,8 +6,8 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
+from random import Random
 
 import pytest
 from hypothesis import given, settings
@@ -17,17 +17,14 @@ from devices.frames import ArrayInfo
 from service.estimation.tare.tare import Tare, TareSource
 from service.sessions.tares import TareHistory
 from storage.checksummed_json import write_checksummed_json
-from tests.builders.arrays import make_array, make_tile
 from tests.builders.calibrations import make_tare
+from tests.hostile.damages import DAMAGES, NO_FILE
+from tests.service.sessions.tares import INFO, array
 
 END = 80
 
 
-def array(*serials: str) -> ArrayInfo:
-    return make_array([make_tile(i, serial=serial) for i, serial in enumerate(serials)])
-
-
-INFO, OTHER = array("T01", "T02"), array("T03", "T04")
+OTHER = array("T03", "T04")
 ARRAYS = (INFO, OTHER)
 TAKEN: tuple[tuple[int, ArrayInfo, TareSource, bool], ...] = (
     (10, INFO, "lead", False),
@@ -97,7 +94,7 @@ def play(folder: Path, text: bytes, whole: dict[str, str]) -> TareHistory:
     return assert_right_or_lost(folder / "tares.json", whole)
 
 
-def test_what_is_whole_is_read_as_it_was_written(
+def test_a_whole_file_is_read_as_it_was_written(
     tmp_path: Path, whole: tuple[bytes, dict[str, str]]
 ) -> None:
     text, used = whole
@@ -185,37 +182,9 @@ def test_a_tare_after_the_lost_one_puts_all_right_again_and_so_it_stays(tmp_path
         assert tares.is_tare_lost(OTHER)
         assert [
             (t.t_ns, t.is_lost) for t in tares.tares_in_force_or_lost_between(INFO, 75, 95)
-        ] == [
-            (75, True),
-            (90, False),
-        ]
+        ] == [(75, True), (90, False)]
     found.undo_tare(mine.id)
     assert found.is_tare_lost(INFO), "none that is older takes its place"
-
-
-def _folder(path: Path) -> None:
-    path.unlink()
-    path.mkdir()
-
-
-def _link(path: Path) -> None:
-    path.rename(path.with_name("elsewhere"))
-    path.symlink_to("elsewhere")
-
-
-def _nowhere(path: Path) -> None:
-    path.unlink()
-    path.symlink_to("nowhere")
-
-
-def _endless(path: Path) -> None:
-    path.unlink()
-    path.symlink_to("/dev/zero")
-
-
-def _pipe(path: Path) -> None:
-    path.unlink()
-    os.mkfifo(path)
 
 
 CONTENTS = (
@@ -224,13 +193,11 @@ CONTENTS = (
 )
 
 
-@pytest.mark.parametrize("damage", [_folder, _link, _nowhere, _endless, _pipe])
-def test_what_is_no_file_is_set_aside_and_all_is_lost(
-    tmp_path: Path, damage: Callable[[Path], None]
-) -> None:
+@pytest.mark.parametrize("damage", NO_FILE)
+def test_a_place_that_is_no_file_is_set_aside_and_all_is_lost(tmp_path: Path, damage: str) -> None:
     path = written(tmp_path / "n")
     whole = in_use(TareHistory(path))
-    damage(path)
+    DAMAGES[damage](path, Random())  # noqa: S311  # draws nothing for these
     found = assert_right_or_lost(path, whole)
     assert found.all_tares_with_undone == []
     assert os.path.lexists(path.with_name("tares.json.damaged-1"))
@@ -247,9 +214,7 @@ def test_a_foreign_text_is_set_aside_and_all_is_lost(tmp_path: Path, content: by
     assert str(path) in found.problem
 
 
-def test_if_it_was_set_aside_and_nothing_was_written_all_is_lost_and_not_none(
-    tmp_path: Path,
-) -> None:
+def test_a_file_that_was_set_aside_alone_means_lost_and_not_none(tmp_path: Path) -> None:
     path = written(tmp_path / "n")
     path.rename(path.with_name("tares.json.damaged-1"))
     assert TareHistory(path).is_tare_lost(INFO)

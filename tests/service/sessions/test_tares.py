@@ -11,15 +11,7 @@ from hypothesis import strategies as st
 
 from devices.errors import StorageError, UnknownError
 from service.sessions.tares import KEPT_MAX, TareHistory
-from tests.service.sessions.tares import (
-    INFO,
-    OTHERS,
-    array,
-    history,
-    instants,
-    same,
-    tare,
-)
+from tests.service.sessions.tares import INFO, OTHERS, array, history, instants, same, tare
 from tests.storage.faulty_disk import NO_SPACE, refusing
 
 # --- in force -------------------------------------------------------------------------------------
@@ -49,7 +41,7 @@ def test_the_newest_is_in_force_and_undone_the_one_before(tmp_path: Path) -> Non
     assert tares.tare_in_force_unless_lost(INFO) is again
 
 
-def test_only_what_is_there_and_in_force_can_be_undone(tmp_path: Path) -> None:
+def test_only_a_known_tare_that_was_not_undone_can_be_undone(tmp_path: Path) -> None:
     tares = history(tmp_path, 1)
     recorded = tares.all_tares_with_undone[0]
     tares.undo_tare(recorded.id)
@@ -85,7 +77,7 @@ def test_ids_are_all_different(tmp_path: Path) -> None:
     assert len({recorded.id for recorded in tares.all_tares_with_undone}) == 30
 
 
-def test_what_is_given_out_is_no_handle_on_the_history(tmp_path: Path) -> None:
+def test_the_list_of_tares_is_no_handle_on_the_history(tmp_path: Path) -> None:
     tares = history(tmp_path, 1)
     tares.all_tares_with_undone.clear()
     assert len(tares.all_tares_with_undone) == 1
@@ -100,11 +92,8 @@ def test_what_is_given_out_is_no_handle_on_the_history(tmp_path: Path) -> None:
     begin=st.integers(-1, 21),
     length=st.integers(0, 22),
 )
-def test_during_an_interval_are_those_that_were_in_force_at_some_time_of_it(
-    tmp_path_factory: pytest.TempPathFactory,
-    taken: list[tuple[int, bool]],
-    begin: int,
-    length: int,
+def test_an_interval_has_the_tares_that_were_in_force_at_some_time_of_it(
+    tmp_path_factory: pytest.TempPathFactory, taken: list[tuple[int, bool]], begin: int, length: int
 ) -> None:
     tares = history(tmp_path_factory.mktemp("during"), *(t for t, _ in taken))
     for recorded, (_, undone) in zip(tares.all_tares_with_undone, taken, strict=True):
