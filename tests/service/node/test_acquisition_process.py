@@ -179,7 +179,7 @@ def test_an_array_that_is_not_there_yet_is_waited_for(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("error", NEVER, ids=lambda error: f"{type(error).__name__} {error}")
-def test_what_waiting_does_not_help_ends_the_node(
+def test_an_error_that_waiting_does_not_mend_ends_the_node(
     error: FootTileError, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (failed,), _ = opened_after([error], monkeypatch)

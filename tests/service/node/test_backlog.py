@@ -50,7 +50,7 @@ def test_everything_that_lacks_is_given_once_in_pieces(
     assert backlog.frame_count == 0
 
 
-def test_what_comes_first_in_the_list_goes_first() -> None:
+def test_the_first_range_of_the_list_goes_first() -> None:
     """A server names what sessions need before what is only for pre-roll."""
     backlog = Backlog([("a", Intervals([(50, 59)])), ("b", Intervals([(0, 4)]))])
     backlog.add_frames("a", 0, 9)
@@ -77,7 +77,7 @@ class Meanwhile(Intervals):
         return left
 
 
-def test_what_is_added_while_a_thread_takes_off_what_is_done_is_not_forgotten() -> None:
+def test_frames_added_while_a_thread_removes_others_are_not_forgotten() -> None:
     backlog = Backlog([("a", Meanwhile([(0, 5)]))])
     Meanwhile.overtake = staticmethod(lambda: backlog.add_frames("a", 8, 9))
     backlog.remove_frames("a", 0, 3)

@@ -33,9 +33,7 @@ def test_a_stream_that_begins_while_a_node_greets_is_not_said_to_have_ended(tmp_
 
 
 @pytest.mark.parametrize("odd", ["\x1b[31mred", "\udcff", "two\nlines"])
-def test_whatever_its_files_are_called_a_server_can_be_told_of_them(
-    tmp_path: Path, odd: str
-) -> None:
+def test_a_server_can_be_told_of_files_with_odd_names(tmp_path: Path, odd: str) -> None:
     journal = NodeJournal(tmp_path, "leg")
     stream = journal.switch_to_new_stream(make_array())
     journal.end_streams_and_close()

@@ -97,7 +97,7 @@ def test_a_session_whose_calibration_cannot_be_read_is_sealed_and_says_so(
     assert sessions(tmp_path)["mud"].state == "sealed"
 
 
-def test_while_a_session_cannot_be_read_every_stream_is_kept(
+def test_every_stream_is_kept_while_a_session_cannot_be_read(
     tmp_path: Path, journal: NodeJournal, recording: Recording
 ) -> None:
     first = recording()

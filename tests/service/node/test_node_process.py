@@ -23,7 +23,7 @@ from storage.journal.journal import Journal
 from storage.journal.node.in_flight import read_in_flight_of_this_boot
 from storage.journal.stream_notes import StreamNotes
 from tests.service.cli.outcome import static_only
-from tests.service.process import Start
+from tests.service.process import Start, acquisition_of, has_ended
 from tests.service.running import Running
 from tests.waiting import until
 
@@ -37,19 +37,6 @@ def scene(tmp_path: Path) -> Path:
     path = tmp_path / "standing.toml"
     path.write_text('calibration = "paper-eq2-shape"\n' + static_only(text))
     return path
-
-
-def children(pid: int) -> list[int]:
-    text = Path(f"/proc/{pid}/task/{pid}/children").read_text()
-    return [int(word) for word in text.split()]
-
-
-def is_alive(pid: int) -> bool:
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-    return state != "Z"
 
 
 def test_an_emulated_node_streams_tares_and_ends_without_loss(
@@ -112,32 +99,15 @@ def test_a_tile_that_does_not_answer_is_named(
     assert not any("Traceback" in line for line in process.err)
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("--scene", "nothing"),
-        ("--scene", "standing", "--server", "nowhere"),
-        ("--scene", "standing", "--name", "../x"),
-    ],
-    ids=str,
-)
-def test_a_node_that_cannot_be_started_says_so(foottile: Start, arguments: tuple[str, ...]) -> None:
-    process = foottile("node", *arguments)
-    assert process.ended(20.0) == 2
-    assert process.err
-    assert not any("Traceback" in line for line in process.err)
-
-
 def test_acquisition_ends_when_its_node_is_killed(
     running: Running, foottile: Start, scene: Path
 ) -> None:
     process = foottile("node", "--scene", scene, "--server", running.url, "--name", "demo")
     process.said("connected to")
-    begun = children(process.pid)
-    assert begun
+    child = acquisition_of(process)
     os.kill(process.pid, signal.SIGKILL)
     # Its pipes stay open as long as a child has them: that they end is what is waited for.
-    until(lambda: not any(is_alive(pid) for pid in begun))
+    until(lambda: has_ended(child))
     assert process.ended(5.0) == -signal.SIGKILL
     until(lambda: not running.node("demo")["connected"])
 
@@ -247,7 +217,7 @@ def test_a_node_whose_own_files_are_damaged_starts_says_so_and_loses_no_more_tha
     assert again.ended(12.0) == 0, again.err
 
 
-def test_what_a_session_needs_waits_on_the_nodes_disk_until_both_are_back(
+def test_frames_of_a_session_wait_on_the_nodes_disk_until_both_are_back(
     running: Running, leg: Callable[..., Any], tmp_path: Path
 ) -> None:
     process = leg()

@@ -63,7 +63,7 @@ async def test_nothing_is_lost_when_the_server_is_away_for_a_while(
 
 
 @in_a_loop
-async def test_what_the_server_held_and_had_not_acknowledged_is_not_kept_for_ever(
+async def test_frames_stored_and_not_acknowledged_before_a_restart_are_not_kept_for_ever(
     running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async with Publishing(node, running.url) as publishing:
@@ -97,7 +97,7 @@ async def test_a_server_that_comes_later_is_found(running: Running, node: FakeNo
 
 
 @in_a_loop
-async def test_a_wrong_token_is_reported_once_and_it_keeps_trying(
+async def test_a_wrong_token_is_reported_once_and_a_right_one_is_taken(
     serve_with: ServeWith, node_of: NodeOf
 ) -> None:
     running = serve_with(token="right")  # noqa: S106  # of this test
@@ -108,12 +108,6 @@ async def test_a_wrong_token_is_reported_once_and_it_keeps_trying(
     [reason] = publishing.reports
     assert "FOOTTILE_TOKEN is not the server's token" in reason
     assert running.http.get("/nodes").json()["items"] == []
-
-
-@in_a_loop
-async def test_a_right_token_is_taken(serve_with: ServeWith, node_of: NodeOf) -> None:
-    running = serve_with(token="right")  # noqa: S106  # of this test
-    node = node_of(running)
     async with Publishing(node, running.url, token="right") as publishing:  # noqa: S106  # of this test
         publishing.take(20)
         await publishing.emptied()

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import threading
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -188,20 +186,15 @@ async def test_earlier_streams_are_named_before_their_frames(node: FakeNode) -> 
             await publishing.until(lambda: len(script.came) == 6)
             assert old.acked == Intervals([(10, 39)])
     came = [(("new", "old")[b == old_id], first, last) for b, first, last in script.came]
-    assert [c for c in came if c[0] == "old"] == [
-        ("old", 10, 19),
-        ("old", 20, 29),
-        ("old", 30, 39),
-    ]
-    assert sorted(c for c in came if c[0] == "new") == [
-        ("new", 0, 9),
-        ("new", 10, 19),
-        ("new", 20, 29),
-    ]
+    assert [c for c in came if c[0] == "old"] == [("old", 10, 19), ("old", 20, 29), ("old", 30, 39)]
+    new = sorted(c for c in came if c[0] == "new")
+    assert new == [("new", 0, 9), ("new", 10, 19), ("new", 20, 29)]
 
 
 @in_a_loop
-async def test_what_a_server_wants_is_told_with_the_streams_it_had_heard_of(node: FakeNode) -> None:
+async def test_a_retention_request_comes_with_the_streams_that_the_server_knew(
+    node: FakeNode,
+) -> None:
     async with played() as script:
         wanted = RetentionMessage(
             streams=(StreamNumbers(stream_id=node.stream_id, numbers=((5, None),)),), recording=True
@@ -268,7 +261,7 @@ async def test_a_link_that_is_half_open_is_noticed_and_dialled_again(
 
 
 @in_a_loop
-async def test_on_a_slow_link_the_newest_overtake_what_waits(node: FakeNode) -> None:
+async def test_the_newest_frames_overtake_waiting_ones_on_a_slow_link(node: FakeNode) -> None:
     """Half a second of frames may wait; what waits longer follows behind."""
     async with played() as script:
         script.reads.clear()
@@ -286,40 +279,32 @@ async def test_on_a_slow_link_the_newest_overtake_what_waits(node: FakeNode) -> 
     assert newest < len(first) - 20  # much of what had waited came after it
 
 
-@pytest.fixture
-def another_server(no_threads_left: None) -> Iterator[str]:
-    """A web server that is not ours."""
-
-    class Handler(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
-
-        def do_GET(self) -> None:
-            self.send_response(200)
-            self.send_header("Content-Length", "5")
-            self.end_headers()
-            self.wfile.write(b"hello")
-
-        def log_message(self, *_: Any) -> None:
-            pass
-
-    with HTTPServer(("127.0.0.1", 0), Handler) as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
-        thread.start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
-        thread.join(5.0)
+PORTAL = b"HTTP/1.1 302 Found\r\nLocation: http://login.example/\r\nContent-Length: 0\r\n\r\n"
+WEB_PAGE = b"HTTP/1.1 200 OK\r\nContent-Length: 5\r\n\r\nhello"
 
 
+@pytest.mark.parametrize(("answer", "reason"), [(WEB_PAGE, "200"), (PORTAL, "trying again")])
 @in_a_loop
-async def test_a_server_that_is_not_ours_is_reported_once(
-    another_server: str, node: FakeNode
+async def test_a_server_that_is_not_ours_is_said_once_and_asked_again(
+    node: FakeNode, answer: bytes, reason: str
 ) -> None:
-    async with Publishing(node, another_server) as publishing:
-        await publishing.until(lambda: publishing.reports)
-        await asyncio.sleep(0.5)
-    [reason] = publishing.reports
-    assert "not connected" in reason
-    assert "200" in reason
+    asked: list[int] = []
+
+    async def serve_foreign(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readuntil(b"\r\n\r\n")
+        writer.write(answer)
+        await writer.drain()
+        writer.close()
+        await writer.wait_closed()
+        asked.append(1)
+
+    async with await asyncio.start_server(serve_foreign, "127.0.0.1", 0) as foreign:
+        port = foreign.sockets[0].getsockname()[1]
+        async with Publishing(node, f"http://127.0.0.1:{port}") as publishing:
+            await publishing.until(lambda: len(asked) > 2)
+    (said,) = publishing.reports
+    assert said.startswith("not connected to")
+    assert reason in said
 
 
 @pytest.mark.parametrize(
@@ -349,28 +334,6 @@ def test_the_ingest_of_a_server_is_found_by_its_address(server: str, expected: s
         "http://[::1",
     ],
 )
-def test_what_is_no_address_is_refused(server: str) -> None:
+def test_a_text_that_is_no_address_is_refused(server: str) -> None:
     with pytest.raises(UsageError, match="no server address"):
         make_ingest_url(server)
-
-
-@in_a_loop
-async def test_a_redirect_is_no_end(node: FakeNode) -> None:
-    asked: list[int] = []
-
-    async def redirect(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        await reader.readuntil(b"\r\n\r\n")
-        location = b"Location: http://login.example/portal\r\n"
-        writer.write(b"HTTP/1.1 302 Found\r\n" + location + b"Content-Length: 0\r\n\r\n")
-        await writer.drain()
-        writer.close()
-        await writer.wait_closed()
-        asked.append(1)
-
-    portal = await asyncio.start_server(redirect, "127.0.0.1", 0)
-    port = portal.sockets[0].getsockname()[1]
-    async with Publishing(node, f"http://127.0.0.1:{port}") as publishing:
-        await publishing.until(lambda: len(asked) > 1)
-    portal.close()
-    await portal.wait_closed()
-    assert "trying again" in publishing.reports[0]

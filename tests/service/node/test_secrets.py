@@ -36,10 +36,7 @@ def test_each_server_has_a_secret_of_its_own_that_is_on_the_disk(
 
 
 def test_a_disk_that_takes_nothing_keeps_no_secret_and_none_is_shared(
-    tmp_path: Path,
-    secrets: ServerSecrets,
-    reports: list[str],
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, secrets: ServerSecrets, reports: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as full:
         full.setattr(os, "fsync", refusing(*NO_SPACE))
@@ -70,7 +67,7 @@ def test_a_damaged_file_is_set_aside_and_another_secret_is_made(
     assert "until a person accepts it" in " ".join(reports)
 
 
-def test_ever_new_servers_do_not_fill_the_disk_and_the_newest_are_kept(
+def test_the_secrets_of_the_newest_servers_only_are_kept(
     tmp_path: Path, secrets: ServerSecrets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("service.node.options._SERVERS_MAX", 3)

@@ -21,7 +21,7 @@ def listening() -> socket.socket:
     return server
 
 
-def test_where_somebody_listens_it_connects() -> None:
+def test_a_listening_server_is_connected_to() -> None:
     with listening() as server:
         port = server.getsockname()[1]
         found = asyncio.run(connect_tcp(f"ws://127.0.0.1:{port}"))
@@ -30,7 +30,7 @@ def test_where_somebody_listens_it_connects() -> None:
         found.close()
 
 
-def test_where_nobody_listens_it_says_so_at_once() -> None:
+def test_a_port_without_a_listener_is_refused_at_once() -> None:
     with listening() as server:
         port = server.getsockname()[1]
     with pytest.raises(ConnectionRefusedError):
@@ -67,7 +67,7 @@ async def test_a_link_that_returns_is_noticed_by_a_fresh_attempt_beside_those_th
 
 
 @in_a_loop
-async def test_nobody_who_answers_is_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_server_that_never_answers_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server_connection, "ATTEMPT_INTERVAL_S", 0.01)
     monkeypatch.setattr(server_connection, "CONNECT_TIMEOUT_S", 0.05)
 
