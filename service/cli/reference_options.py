@@ -83,7 +83,7 @@ def make_reference_options(stated: Mapping[str, object], rate_hz: float | None) 
     Raises:
         UsageError: an invalid value.
     """
-    from storage.formats.readers.text_options import TextOptions
+    from storage.formats.readers.text import TextOptions
     from storage.formats.reference import ReferenceOptions
 
     text = {name: None if value is None else str(value) for name, value in stated.items()}

@@ -24,7 +24,7 @@ from storage.formats.readers.table import (
     ForceTable,
     fit_constant_rate_if_times_repeat,
 )
-from storage.formats.readers.text_options import TextOptions
+from storage.formats.readers.text import TextOptions
 
 QUANTITIES = ("time_s", "grf_n", "cop_x_m", "cop_y_m")
 UNIT_FACTORS: Mapping[str, Mapping[str, float]] = {

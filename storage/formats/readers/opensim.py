@@ -39,11 +39,10 @@ def read_opensim_table(path: Path, is_needed: ColumnFilter, values_max: int) -> 
     Raises:
         FileFormatError: unreadable, header or names are missing, or numbers do not fit the names.
     """
-    where = str(path)
     text = read_decoded_text(path)
     end = _END.search(text)
     if end is None:
-        raise FileFormatError("there is no line endheader", where=where, expected=FORM)
+        raise FileFormatError("there is no line endheader")
     head, _, rows = text[end.end() :].lstrip().partition("\n")
     rows = rows.strip("\n")
     line = rows.partition("\n")[0]
@@ -58,20 +57,16 @@ def read_opensim_table(path: Path, is_needed: ColumnFilter, values_max: int) -> 
         vectors = (name if name.endswith(("_v", "_p", "_m")) else f"{name}_" for name in names[1:])
         names = [*names[:1], *(f"{name}{axis}" for name in vectors for axis in "xyz")]
     if len(names) < 2 or (first and len(first) != len(names)):
-        raise FileFormatError(
-            f"there are {len(names)} names for {len(first)} columns of numbers",
-            where=where,
-            expected=FORM,
-        )
+        raise FileFormatError(f"there are {len(names)} names for {len(first)} columns of numbers")
     times = {name for name in names if name.lower() == "time"}
     alone = _single_force_columns(names)
     wanted = set(alone.values()) if is_needed("grf_n") and "grf_n" not in names else set()
     needed = select_needed_names_or_empty(
-        names, lambda name: name in wanted | times or is_needed(name), where
+        names, lambda name: name in wanted | times or is_needed(name)
     )
     width = line.count("\t") + 1 if delimiter == "\t" else 0
     padded = (*names, *[""] * (width - len(names)))
-    columns = parse_columns(rows, TextLayout(padded, delimiter, 0, {}), needed, values_max, where)
+    columns = parse_columns(rows, TextLayout(padded, delimiter, 0, {}), needed, values_max)
     for ours, name in alone.items():
         if name in wanted:  # OpenSim's z points right, the foot's y points left
             columns[ours] = -columns[name] if ours == "cop_y_m" else columns[name]
@@ -79,7 +74,7 @@ def read_opensim_table(path: Path, is_needed: ColumnFilter, values_max: int) -> 
         columns["time_s"] = columns[name]
     units = {name: unit for name in names for ending, unit in _UNITS if ending.search(name)}
     table = make_table_with_lowercase_standard_names(
-        where, names, columns, units=units | dict.fromkeys(times, "s"), expected_form=FORM
+        names, columns, units=units | dict.fromkeys(times, "s"), expected_form=FORM
     )
     forces = {name for name, unit in units.items() if unit == "N"}
     return replace(table, positive_forces=table.positive_forces | forces)

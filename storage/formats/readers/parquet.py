@@ -37,35 +37,30 @@ def read_parquet_table(path: Path, is_needed: ColumnFilter, values_max: int) -> 
     """Read the needed columns of a Parquet file; verify the hash of a FootTile session.
 
     Raises:
-        FileFormatError: the file cannot be read, is too large, or a needed column is not numeric.
+        OSError, pa.ArrowException, UnicodeDecodeError: the file cannot be read.
+        FileFormatError: it is too large, or a needed column is not numeric.
         DamagedFileError: the file is a session whose bytes differ from the sealed ones.
     """
-    where = str(path)
-    try:
-        check_regular_file(path)
-        with pq.ParquetFile(path, page_checksum_verification=True) as file:
-            schema = file.schema_arrow
-            hashes = read_stated_and_actual_hash(path)
-            if hashes is not None or FORMAT_KEY in (schema.metadata or {}):
-                refuse_wrong_or_missing_file_hash(hashes, where=where)
-            needed = select_needed_names_or_empty(schema.names, is_needed, where)
-            check_table_size(file.metadata.num_rows, len(needed), values_max, where)
-            table = file.read(columns=needed)
-    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
-        raise FileFormatError(
-            f"cannot be read: {error}", where=where, expected="a Parquet file"
-        ) from error
-    columns = {name: _to_numbers(table[name], name, where) for name in needed}
-    return make_table_with_lowercase_standard_names(where, schema.names, columns, schema=schema)
+    check_regular_file(path)
+    with pq.ParquetFile(path, page_checksum_verification=True) as file:
+        schema = file.schema_arrow
+        hashes = read_stated_and_actual_hash(path)
+        if hashes is not None or FORMAT_KEY in (schema.metadata or {}):
+            refuse_wrong_or_missing_file_hash(hashes, where=str(path))
+        needed = select_needed_names_or_empty(schema.names, is_needed)
+        check_table_size(file.metadata.num_rows, len(needed), values_max)
+        table = file.read(columns=needed)
+    columns = {name: _to_numbers(table[name], name) for name in needed}
+    return make_table_with_lowercase_standard_names(schema.names, columns, schema=schema)
 
 
-def _to_numbers(cells: pa.ChunkedArray[Any], name: str, where: str) -> Column:
+def _to_numbers(cells: pa.ChunkedArray[Any], name: str) -> Column:
     if name.lower() == INSTANT_COLUMN and pa.types.is_integer(cells.type) and not cells.null_count:
         return np.asarray(cells.to_numpy(), dtype=np.int64)
     try:
         return arrow_to_floats(cells.cast(pa.float64()).combine_chunks())
     except pa.ArrowException as error:
-        raise FileFormatError(f"column {name} is not numeric: {error}", where=where) from error
+        raise FileFormatError(f"column {name} is not numeric: {error}") from error
 
 
 def read_sealed_session_table(path: Path, optional_names: Collection[str]) -> ForceTable | None:
@@ -74,7 +69,6 @@ def read_sealed_session_table(path: Path, optional_names: Collection[str]) -> Fo
     Raises:
         FileFormatError: the session is damaged, or has no frames.
     """
-    where = str(path)
     if not is_sealed_session_file(path):
         return None
     with SealedFileReader(path) as reader:
@@ -91,7 +85,7 @@ def read_sealed_session_table(path: Path, optional_names: Collection[str]) -> Fo
         pieces = list(reader.read_quantities(*dict.fromkeys(wanted)))
         axis = reader.time_axis
     if not pieces:
-        raise FileFormatError("the session has no frames", where=where)
+        raise FileFormatError("the session has no frames", where=str(path))
     joined = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
     t_ns = axis.shift_to_axis(joined.pop(INSTANT_COLUMN), joined.get("part"))
     if "part" not in optional_names:
@@ -104,7 +98,12 @@ def read_sealed_session_table(path: Path, optional_names: Collection[str]) -> Fo
         if (unit := STANDARD_UNITS.get(name) or COLUMNS_BY_NAME[name].unit)
     }
     return ForceTable(
-        where, tuple(single), columns, units, frozenset(columns), epoch_ns=int(t_ns[0])
+        tuple(single),
+        columns,
+        units,
+        frozenset(columns),
+        epoch_ns=int(t_ns[0]),
+        where=str(path),
     )
 
 

@@ -22,18 +22,21 @@ import numpy as np
 from devices.arrays import Floats
 from devices.errors import FileFormatError
 from devices.input_files import check_regular_file
-from storage.formats.readers.plate_signals import PlateSignals, make_table_of_separate_plates
 from storage.formats.readers.table import (
+    ColumnFilter,
     ForceTable,
+    PlateSignals,
     check_table_size,
+    make_table_of_separate_plates,
     make_table_with_lowercase_standard_names,
 )
 
+NPZ_FORM = "a file that numpy.savez wrote"
 _CELL_FACTORS = {"force_n": 1.0, "pressure_kpa": 1e3}
 """Factor of cells to newtons or to pascals, by name of the array."""
 
 
-def read_npz_pressure_plate(path: Path, values_max: int) -> ForceTable:
+def read_npz_pressure_plate(path: Path, is_needed: ColumnFilter, values_max: int) -> ForceTable:
     """Read a `.npz` file of cells as total force and centre of pressure; NaN if a cell is NaN.
 
     The centre of pressure is NaN without load.
@@ -41,13 +44,11 @@ def read_npz_pressure_plate(path: Path, values_max: int) -> ForceTable:
     Raises:
         FileFormatError: unreadable, too large, or arrays are missing or do not fit one another.
     """
-    where = str(path)
     arrays = _read_arrays(path, 8 * values_max)
     named = [name for name in _CELL_FACTORS if name in arrays]
     if len(named) != 1:
         raise FileFormatError(
             f"{' and '.join(named) or 'neither'} of {' and '.join(_CELL_FACTORS)} is there",
-            where=where,
             expected="one of them, (frames, cells along x, cells along y)",
         )
     cells = arrays[named[0]]
@@ -56,14 +57,12 @@ def read_npz_pressure_plate(path: Path, values_max: int) -> ForceTable:
     if cells.ndim != 3 or time_s.shape != cells.shape[:1]:
         raise FileFormatError(
             f"{named[0]} is {cells.shape} and time_s {time_s.shape}",
-            where=where,
             expected="(n, cells along x, cells along y) and (n,)",
         )
     is_placed = pitch_m is not None and pitch_m.shape == origin_m.shape == (2,)
     if pitch_m is None or not is_placed or not (np.isfinite(pitch_m) & (pitch_m > 0.0)).all():
         raise FileFormatError(
             "the positions of its cells are missing",
-            where=where,
             expected="pitch_m with two numbers above 0, and origin_m with two or not at all",
         )
     area_m2 = float(pitch_m.prod()) if named[0] == "pressure_kpa" else 1.0
@@ -72,7 +71,7 @@ def read_npz_pressure_plate(path: Path, values_max: int) -> ForceTable:
     grf_n, (cop_x_m, cop_y_m) = _compute_total_force_and_cop(force_n, x_m, y_m)
     columns = {"time_s": time_s, "grf_n": grf_n, "cop_x_m": cop_x_m, "cop_y_m": cop_y_m}
     notes = (f"a plate of {cells.shape[1]} by {cells.shape[2]} cells, added up",)
-    return make_table_with_lowercase_standard_names(where, columns, columns, notes=notes)
+    return make_table_with_lowercase_standard_names(columns, columns, notes=notes)
 
 
 class TotalForce(NamedTuple):
@@ -96,7 +95,6 @@ def _compute_total_force_and_cop(force_n: Floats, x_m: Floats, y_m: Floats) -> T
 
 
 def _read_arrays(path: Path, bytes_max: int) -> dict[str, Floats]:
-    where = str(path)
     try:
         check_regular_file(path)
         with zipfile.ZipFile(path) as archive:
@@ -104,7 +102,6 @@ def _read_arrays(path: Path, bytes_max: int) -> dict[str, Floats]:
         if size > bytes_max:
             raise FileFormatError(
                 f"{size} bytes are too many for memory",
-                where=where,
                 expected=f"up to {bytes_max}",
             )
         with np.load(path, allow_pickle=False) as file:
@@ -113,12 +110,10 @@ def _read_arrays(path: Path, bytes_max: int) -> dict[str, Floats]:
         *(OSError, ValueError, EOFError, KeyError, TypeError),
         *(zipfile.BadZipFile, MemoryError),  # a header that states more than the file has
     ) as error:
-        raise FileFormatError(
-            f"no arrays of numpy: {error}", where=where, expected="a file that numpy.savez wrote"
-        ) from error
+        raise FileFormatError(f"no arrays of numpy: {error}") from error
 
 
-FORM = "facts above ASCII_DATA @@, then frames of ROWS lines with COLS cells"
+TEKSCAN_FORM = "facts above ASCII_DATA @@, then frames of ROWS lines with COLS cells"
 _BEGIN = re.compile(r"^ASCII_DATA @@[\s,]*^Frame \d+\b", re.MULTILINE)
 _FACT = re.compile(r"^([A-Z_0-9]+) +(.*?)[ ,]*$", re.MULTILINE)
 _FRAME = re.compile(r"^Frame (\d+)\b.*\n", re.MULTILINE)
@@ -132,7 +127,7 @@ def is_tekscan(head: str) -> bool:
     return _BEGIN.search(head) is not None
 
 
-def parse_tekscan_force_and_cop(text: str, where: str, values_max: int) -> ForceTable:
+def parse_tekscan_force_and_cop(text: str, is_needed: ColumnFilter, values_max: int) -> ForceTable:
     """Parse the frames of cells to total force and centre of pressure, from the sensor's middle.
 
     Raises:
@@ -140,14 +135,13 @@ def parse_tekscan_force_and_cop(text: str, where: str, values_max: int) -> Force
     """
     head, _, body = text.partition("ASCII_DATA @@")
     facts = {match[1]: match[2] for match in _FACT.finditer(head)}
-    rows, columns = _parse_count(facts, "ROWS", where), _parse_count(facts, "COLS", where)
-    pitch_m = [_parse_metres(facts, name, 1, where) for name in ("ROW_SPACING", "COL_SPACING")]
-    area_m2 = _parse_metres(facts, "SENSEL_AREA", 2, where)
+    rows, columns = _parse_count(facts, "ROWS"), _parse_count(facts, "COLS")
+    pitch_m = [_parse_metres(facts, name, 1) for name in ("ROW_SPACING", "COL_SPACING")]
+    area_m2 = _parse_metres(facts, "SENSEL_AREA", 2)
     unit = facts.get("UNITS", "")
     if unit.lower() not in _PASCALS:
         raise FileFormatError(
             f"UNITS is {unit or 'not there'}",
-            where=where,
             expected="KPa, MPa or PSI, of a sensor that was calibrated",
             remedy="Save it again with a calibration, in one of these units",
         )
@@ -156,15 +150,11 @@ def parse_tekscan_force_and_cop(text: str, where: str, values_max: int) -> Force
     except ValueError:
         step_s = 0.0
     if not 0.0 < step_s < np.inf:
-        raise FileFormatError("SECONDS_PER_FRAME is no time", where=where, expected=FORM)
-    numbers, pressure = _parse_frames(body, rows, columns, values_max, where)
+        raise FileFormatError("SECONDS_PER_FRAME is no time")
+    numbers, pressure = _parse_frames(body, rows, columns, values_max)
     last = facts.get("END_FRAME", "")
     if last.isdecimal() and int(last) > numbers[-1]:
-        raise FileFormatError(
-            f"it is cut off: its last frame is {numbers[-1]:.0f} of {last}",
-            where=where,
-            expected=FORM,
-        )
+        raise FileFormatError(f"it is cut off: its last frame is {numbers[-1]:.0f} of {last}")
     x_m, y_m = (
         np.asarray(pitch * ((count - 1) / 2 - np.arange(count)), dtype=np.float64)
         for pitch, count in zip(pitch_m, (rows, columns), strict=True)
@@ -182,12 +172,10 @@ def parse_tekscan_force_and_cop(text: str, where: str, values_max: int) -> Force
     plate = PlateSignals(
         "sensor", force_n, None if is_mirrored else cop_m, "N", "m", is_positive_under_load=True
     )
-    return make_table_of_separate_plates(where, step_s * (numbers - numbers[0]), [plate], notes)
+    return make_table_of_separate_plates(step_s * (numbers - numbers[0]), [plate], notes)
 
 
-def _parse_frames(
-    body: str, rows: int, columns: int, values_max: int, where: str
-) -> tuple[Floats, Floats]:
+def _parse_frames(body: str, rows: int, columns: int, values_max: int) -> tuple[Floats, Floats]:
     """Return the numbers of the frames (n,), and their cells (n, rows, columns).
 
     Raises:
@@ -196,30 +184,24 @@ def _parse_frames(
     parts = _FRAME.split(body.partition("@@")[0].lstrip(" ,"))
     numbers = np.array([float(number) for number in parts[1::2]])
     if not len(numbers):
-        raise FileFormatError("there is no frame in it", where=where, expected=FORM)
-    check_table_size(len(numbers), rows * columns, values_max, where)
+        raise FileFormatError("there is no frame in it")
+    check_table_size(len(numbers), rows * columns, values_max)
     lines: list[str] = []
     for number, part in zip(parts[1::2], parts[2::2], strict=True):
         own = [line.strip(" ,") for line in part.split("\n") if line.strip(" ,")]
         if len(own) != rows or any(line.count(",") != columns - 1 for line in own):
-            raise FileFormatError(
-                f"frame {number} has not {rows} rows of {columns} cells",
-                where=where,
-                expected=FORM,
-            )
+            raise FileFormatError(f"frame {number} has not {rows} rows of {columns} cells")
         lines += own
     if not (np.diff(numbers) > 0.0).all():
-        raise FileFormatError("the numbers of its frames do not rise", where=where, expected=FORM)
+        raise FileFormatError("the numbers of its frames do not rise")
     try:
         cells = np.loadtxt(
             (line.upper().replace("B", "0") for line in lines), delimiter=",", ndmin=2
         )
     except ValueError as error:
-        raise FileFormatError(
-            f"a cell is no number: {error}", where=where, expected=FORM
-        ) from error
+        raise FileFormatError(f"a cell is no number: {error}") from error
     if not np.isfinite(cells).all():
-        raise FileFormatError("a cell is not finite", where=where, expected=FORM)
+        raise FileFormatError("a cell is not finite")
     return numbers, cells.reshape(len(numbers), rows, columns)
 
 
@@ -234,14 +216,14 @@ def _saturation_notes(facts: Mapping[str, str], unit: str, pressure: Floats) -> 
     return [f"in {frames} of {len(pressure)} frames a cell is saturated: their force is too small"]
 
 
-def _parse_count(facts: Mapping[str, str], name: str, where: str) -> int:
+def _parse_count(facts: Mapping[str, str], name: str) -> int:
     text = facts.get(name, "")
     if not (text.isdecimal() and 0 < int(text) < 10_000):
-        raise FileFormatError(f"{name} is {text or 'not there'}", where=where, expected=FORM)
+        raise FileFormatError(f"{name} is {text or 'not there'}")
     return int(text)
 
 
-def _parse_metres(facts: Mapping[str, str], name: str, power: int, where: str) -> float:
+def _parse_metres(facts: Mapping[str, str], name: str, power: int) -> float:
     """Return a length in m, or an area in m2."""
     match = _QUANTITY.match(facts.get(name, ""))
     unit = match[2].lower().removesuffix("2" if power == 2 else "") if match else ""
@@ -252,7 +234,6 @@ def _parse_metres(facts: Mapping[str, str], name: str, power: int, where: str) -
     if unit not in _METRES or not value > 0.0:
         raise FileFormatError(
             f"{name} is {facts.get(name) or 'not there'}",
-            where=where,
             expected=f"{'an area' if power == 2 else 'a length'} in mm, cm, m or inches",
         )
     return float(value * _METRES[unit] ** power)

@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from devices.errors import FileFormatError, UsageError
-from storage.formats.readers.bioware import is_bioware, parse_bioware_force_and_cop
-from storage.formats.readers.force_platform import read_c3d_force_platforms
-from storage.formats.readers.moticon import is_moticon, parse_moticon_force_and_cop
-from storage.formats.readers.netforce import is_netforce, parse_netforce_force_and_cop_without_time
-from storage.formats.readers.nexus import is_nexus, parse_nexus_force_and_cop
-from storage.formats.readers.novel import is_loadsol, is_pedar, parse_loadsol_forces, refuse_pedar
-from storage.formats.readers.opensim import read_opensim_table
-from storage.formats.readers.parquet import read_parquet_table
-from storage.formats.readers.pressure_plate import (
-    is_tekscan,
-    parse_tekscan_force_and_cop,
-    read_npz_pressure_plate,
+import pyarrow as pa
+
+from devices.errors import FileFormatError, FootTileError, UsageError
+from storage.formats.readers import (
+    c3d,
+    insoles,
+    opensim,
+    parquet,
+    plate_texts,
+    pressure_plate,
+    rosbag,
+    text,
 )
-from storage.formats.readers.rosbag import is_bag_folder, read_bag_wrenches
 from storage.formats.readers.table import VALUES_MAX, ColumnFilter, ForceTable
-from storage.formats.readers.text import HEAD_CHARACTERS, parse_text_table, read_decoded_text
-from storage.formats.readers.text_options import TextOptions
+from storage.formats.readers.text import TextOptions
 
 
 @dataclass(frozen=True)
@@ -32,22 +30,35 @@ class TextFormat:
 
     Attributes:
         matches_head: predicate of the first `HEAD_CHARACTERS` of a text.
-        read: function (text, path, limit of numbers) that returns the table, all its columns.
+        read: function (text, column filter, limit of numbers) that returns the table; it may have
+            columns that are not needed.
+        form: expected form of the text, for errors.
     """
 
     matches_head: Callable[[str], bool]
-    read: Callable[[str, str, int], ForceTable]
+    read: Callable[[str, ColumnFilter, int], ForceTable]
+    form: str
 
 
-TEXT_FORMATS: tuple[TextFormat, ...] = (
-    TextFormat(is_bioware, parse_bioware_force_and_cop),
-    TextFormat(is_nexus, parse_nexus_force_and_cop),
-    TextFormat(is_moticon, parse_moticon_force_and_cop),
-    TextFormat(is_tekscan, parse_tekscan_force_and_cop),
-    TextFormat(is_pedar, refuse_pedar),
+TEXT_FORMATS = (
+    TextFormat(insoles.is_loadsol, insoles.parse_loadsol_forces, insoles.LOADSOL_FORM),
     TextFormat(
-        is_netforce, parse_netforce_force_and_cop_without_time
-    ),  # last: the format has no head
+        plate_texts.is_bioware, plate_texts.parse_bioware_force_and_cop, plate_texts.BIOWARE_FORM
+    ),
+    TextFormat(plate_texts.is_nexus, plate_texts.parse_nexus_force_and_cop, plate_texts.NEXUS_FORM),
+    TextFormat(insoles.is_opengo, insoles.parse_opengo_force_and_cop, insoles.OPENGO_FORM),
+    TextFormat(
+        pressure_plate.is_tekscan,
+        pressure_plate.parse_tekscan_force_and_cop,
+        pressure_plate.TEKSCAN_FORM,
+    ),
+    TextFormat(insoles.is_pedar, insoles.refuse_pedar, ""),
+    # Last: the format has no head.
+    TextFormat(
+        plate_texts.is_netforce,
+        plate_texts.parse_netforce_force_and_cop_without_time,
+        text.FORM,
+    ),
 )
 
 
@@ -59,38 +70,58 @@ class TableFormat:
         endings: endings of its files, in lower case.
         read: function (path, column filter, limit of numbers) that returns the table; it may
             have columns that are not needed.
+        form: expected form of a file, for errors.
     """
 
     endings: tuple[str, ...]
     read: Callable[[Path, ColumnFilter, int], ForceTable]
+    form: str
 
 
 def _read_text(
     path: Path, is_needed: ColumnFilter, values_max: int, options: TextOptions | None = None
 ) -> ForceTable:
     options = options or TextOptions()
-    text = read_decoded_text(path, options.encoding)
-    head = text[:HEAD_CHARACTERS]
-    where = str(path)
-    if not options.has_layout_option:
-        if is_loadsol(head):  # each sole has times of its own, which must agree if both are needed
-            return parse_loadsol_forces(text, where, is_needed, values_max)
-        for one in TEXT_FORMATS:
-            if one.matches_head(head):
-                return one.read(text, where, values_max)
-    return parse_text_table(text, where, is_needed, values_max, options)
+    content = text.read_decoded_text(path, options.encoding)
+    head = content[: text.HEAD_CHARACTERS]
+    for one in () if options.has_layout_option else TEXT_FORMATS:
+        if one.matches_head(head):
+            with _complete_errors(path, one.form):
+                return one.read(content, is_needed, values_max)
+    return text.parse_text_table(content, is_needed, values_max, options)
 
 
-TEXT = TableFormat((".csv", ".txt", ".tsv"), _read_text)
-BAG = TableFormat((".bag", ".mcap", ".db3"), read_bag_wrenches)
+TEXT = TableFormat((".csv", ".txt", ".tsv"), _read_text, text.FORM)
+BAG = TableFormat((".bag", ".mcap", ".db3"), rosbag.read_bag_wrenches, rosbag.FORM)
 TABLE_FORMATS = (
     TEXT,
     BAG,
-    TableFormat((".parquet",), read_parquet_table),
-    TableFormat((".c3d",), lambda path, _, limit: read_c3d_force_platforms(path, limit)),
-    TableFormat((".mot", ".sto"), read_opensim_table),
-    TableFormat((".npz",), lambda path, _, limit: read_npz_pressure_plate(path, limit)),
+    TableFormat((".parquet",), parquet.read_parquet_table, "a Parquet file"),
+    TableFormat((".c3d",), c3d.read_c3d_force_platforms, c3d.FORM),
+    TableFormat((".mot", ".sto"), opensim.read_opensim_table, opensim.FORM),
+    TableFormat((".npz",), pressure_plate.read_npz_pressure_plate, pressure_plate.NPZ_FORM),
 )
+
+
+@contextmanager
+def _complete_errors(path: Path, form: str) -> Iterator[None]:
+    """Context manager: add the path and the expected form to errors that do not state them."""
+    try:
+        yield
+    except FileFormatError as error:
+        error.where = error.where or str(path)
+        error.expected = error.expected or form
+        raise
+    except FootTileError:
+        raise
+    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+        raise FileFormatError(f"cannot be read: {error}", where=str(path), expected=form) from error
+    except MemoryError as error:
+        raise FileFormatError(
+            "there is not enough memory to read it",
+            where=str(path),
+            remedy="Lift the limit (ulimit -v), or cut out the part that is needed",
+        ) from error
 
 
 def read_table(
@@ -107,22 +138,16 @@ def read_table(
     """
     ending = path.suffix.lower()
     chosen = next((one for one in TABLE_FORMATS if ending in one.endings), TEXT)
-    if is_bag_folder(path):
+    if rosbag.is_bag_folder(path):
         chosen = BAG
-    try:
+    with _complete_errors(path, chosen.form):
         if chosen is TEXT:
             table = _read_text(path, is_needed, values_max, text_options)
         else:
             refuse_any_text_options(path, text_options)
             table = chosen.read(path, is_needed, values_max)
-    except MemoryError as error:
-        raise FileFormatError(
-            "there is not enough memory to read it",
-            where=str(path),
-            remedy="Lift the limit (ulimit -v), or cut out the part that is needed",
-        ) from error
     columns = {name: column for name, column in table.columns.items() if is_needed(name)}
-    return replace(table, columns=columns)
+    return replace(table, columns=columns, where=str(path))
 
 
 def refuse_any_text_options(path: Path, text_options: TextOptions | None) -> None:

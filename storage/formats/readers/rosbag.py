@@ -19,12 +19,14 @@ import numpy as np
 from devices.arrays import Floats
 from devices.errors import FileFormatError, FootTileError, require_extra
 from devices.input_files import check_regular_file
-from storage.formats.readers.plate_signals import PlateSignals, make_table_of_separate_plates
+from storage.formats.readers.force_plate import compute_cop_from_moments
 from storage.formats.readers.table import (
     ColumnFilter,
     ForceTable,
+    PlateSignals,
     check_table_size,
     make_repeated_name_error,
+    make_table_of_separate_plates,
 )
 
 FORM = "a ROS bag or an MCAP file with topics of geometry_msgs/WrenchStamped"
@@ -60,34 +62,31 @@ def read_bag_wrenches(path: Path, is_needed: ColumnFilter, values_max: int) -> F
     Raises:
         FileFormatError: unreadable, no wrenches, or two needed topics differ in their times.
     """
-    where = str(path)
     try:
         for file in path.iterdir() if path.is_dir() else (path,):
             if not file.is_dir():
                 check_regular_file(file)  # the libraries would block on a pipe or a device
         bag = _open_mcap(path) if path.suffix.lower() == ".mcap" else _open_rosbag(path)
-        return _make_table(bag, where, is_needed, values_max)
+        return _make_table(bag, is_needed, values_max)
     except (FootTileError, ModuleNotFoundError):
         raise
     except Exception as error:  # libraries raise whatever damaged bytes lead to
         kind = type(error).__name__
-        raise FileFormatError(
-            f"cannot be read: {str(error)[:200] or kind}", where=where, expected=FORM
-        ) from error
+        raise FileFormatError(f"cannot be read: {str(error)[:200] or kind}") from error
 
 
-def _make_table(bag: _Bag, where: str, is_needed: ColumnFilter, values_max: int) -> ForceTable:
+def _make_table(bag: _Bag, is_needed: ColumnFilter, values_max: int) -> ForceTable:
     names = {topic: topic.strip("/").replace("/", "_") for topic in bag.topics}
     if not names:
-        raise FileFormatError("there is no wrench in it", where=where, expected=FORM)
+        raise FileFormatError("there is no wrench in it")
     if twice := sorted({name for name in names.values() if list(names.values()).count(name) > 1}):
-        raise make_repeated_name_error(twice, where)
+        raise make_repeated_name_error(twice)
     needed = [
         topic
         for topic, name in names.items()
         if len(names) == 1 or any(is_needed(f"{name}_{column}") for column in _COLUMNS)
     ]
-    found = _read_wrenches(bag, needed, where, values_max)
+    found = _read_wrenches(bag, needed, values_max)
     plates: list[PlateSignals] = []
     time_s, begin_ns = np.empty(0), 0
     forces: dict[str, Floats] = {}
@@ -97,21 +96,18 @@ def _make_table(bag: _Bag, where: str, is_needed: ColumnFilter, values_max: int)
         if plates and not np.array_equal(sensor.t_ns, found[needed[0]].t_ns):
             raise FileFormatError(
                 f"topics {needed[0]} and {topic} have stamps of their own",
-                where=where,
                 expected="the same stamps, to add sensors up",
                 remedy="Compare each sensor alone",
             )
         begin_ns = int(sensor.t_ns[0])
         time_s = (sensor.t_ns - begin_ns) * 1e-9
         force, torque = sensor.wrench[:3], sensor.wrench[3:]
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            cop = np.stack([-torque[1], torque[0]]) / force[2]
-        cop[:, ~np.isfinite(cop).all(axis=0)] = np.nan
+        cop = compute_cop_from_moments(force[2], torque[0], torque[1])
         plates.append(PlateSignals(name, force[2], cop, "N", "m", notes=sensor.notes))
         forces |= {f"{name}_fx": force[0], f"{name}_fy": force[1]}
     if len(names) > 1:
         notes.append(f"topics of wrenches are {', '.join(names)}: --map says which one")
-    table = make_table_of_separate_plates(where, time_s, plates, notes)
+    table = make_table_of_separate_plates(time_s, plates, notes)
     columns = {
         name: column
         for name, column in {**table.columns, **forces}.items()
@@ -136,9 +132,7 @@ class _WrenchSeries:
     notes: tuple[str, ...]
 
 
-def _read_wrenches(
-    bag: _Bag, topics: list[str], where: str, values_max: int
-) -> dict[str, _WrenchSeries]:
+def _read_wrenches(bag: _Bag, topics: list[str], values_max: int) -> dict[str, _WrenchSeries]:
     """Return stamps and wrenches by topic.
 
     Raises:
@@ -148,7 +142,7 @@ def _read_wrenches(
     stamps: dict[str, list[tuple[int, int]]] = {topic: [] for topic in topics}
     frames: dict[str, set[str]] = {topic: set() for topic in topics}
     for topic, logged_ns, message in bag.read_messages(topics) if topics else ():
-        check_table_size(len(rows[topic]), len(_COLUMNS) + 3, values_max, where)
+        check_table_size(len(rows[topic]), len(_COLUMNS) + 3, values_max)
         force, torque = message.wrench.force, message.wrench.torque
         rows[topic].append((force.x, force.y, force.z, torque.x, torque.y, torque.z))
         stamp = message.header.stamp
@@ -157,11 +151,10 @@ def _read_wrenches(
     found = {}
     for topic in topics:
         if not rows[topic]:
-            raise FileFormatError(f"topic {topic} has no messages", where=where, expected=FORM)
+            raise FileFormatError(f"topic {topic} has no messages")
         if len(frames[topic]) > 1:
             raise FileFormatError(
                 f"topic {topic} is in the frames {', '.join(sorted(frames[topic]))[:200]}",
-                where=where,
                 expected="wrenches in one frame",
             )
         (frame,) = frames[topic]
@@ -219,7 +212,6 @@ def _open_mcap(path: Path) -> _Bag:
         raise FileFormatError(
             "it is cut off: it has no summary",
             where=str(path),
-            expected=FORM,
             remedy="Repair it with `mcap recover`",
         )
     found = [

@@ -1,8 +1,8 @@
-"""Table of number columns of a file of any format, with the units that the file states."""
+"""Table of a file's columns of numbers, with the units that the file states, and of its plates."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -42,7 +42,6 @@ class ForceTable:
     """Table of a file's columns, in the units of the file.
 
     Attributes:
-        where: path of the file.
         names: names of all columns of the file.
         columns: the needed columns by name.
         units: unit of each column whose unit the file states.
@@ -52,9 +51,9 @@ class ForceTable:
         notes: remarks for the user.
         expected_form: expected form of the file, for errors; empty for binary formats.
         schema: Arrow schema of a Parquet file.
+        where: path of the file; `read_table` states it.
     """
 
-    where: str
     names: tuple[str, ...]
     columns: Mapping[str, Column]
     units: Mapping[str, str] = field(default_factory=dict)
@@ -64,10 +63,10 @@ class ForceTable:
     notes: tuple[str, ...] = ()
     expected_form: str = ""
     schema: pa.Schema | None = None
+    where: str = ""
 
 
 def make_table_with_lowercase_standard_names(
-    where: str,
     names: Iterable[str],
     columns: Mapping[str, Column],
     *,
@@ -87,7 +86,7 @@ def make_table_with_lowercase_standard_names(
     for name in columns:
         if name.lower() in STANDARD_UNITS and name.lower() != name:
             if name.lower() in found:
-                raise make_repeated_name_error([name.lower()], where)
+                raise make_repeated_name_error([name.lower()])
             found[name.lower()] = columns[name]
     if "fz_n" in found and "grf_n" not in found:
         found["grf_n"] = found["fz_n"]
@@ -97,7 +96,6 @@ def make_table_with_lowercase_standard_names(
     }
     forces = {name for name, unit in (cased | ours).items() if unit == "N"}
     return ForceTable(
-        where,
         tuple(names),
         found,
         {**(units or {}), **cased, **ours},
@@ -109,7 +107,7 @@ def make_table_with_lowercase_standard_names(
 
 
 def select_needed_names_or_empty(
-    column_names: Collection[str], is_needed: ColumnFilter, where: str
+    column_names: Collection[str], is_needed: ColumnFilter
 ) -> list[str]:
     """Return the names of the columns to read.
 
@@ -118,20 +116,19 @@ def select_needed_names_or_empty(
     """
     needed = [name for name in column_names if name and is_needed(name)]
     if twice := sorted({name for name in needed if needed.count(name) > 1}):
-        raise make_repeated_name_error(twice, where)
+        raise make_repeated_name_error(twice)
     return needed
 
 
-def make_repeated_name_error(repeated_names: Collection[str], where: str) -> FileFormatError:
+def make_repeated_name_error(repeated_names: Collection[str]) -> FileFormatError:
     """Return the error for names that two columns have."""
     return FileFormatError(
         f"column {', '.join(repeated_names)} is there twice",
-        where=where,
         expected="a name of its own for each column, whatever its case",
     )
 
 
-def check_table_size(row_count: int, column_count: int, values_max: int, where: str) -> None:
+def check_table_size(row_count: int, column_count: int, values_max: int) -> None:
     """Refuse a table that is too large for memory.
 
     Raises:
@@ -140,10 +137,78 @@ def check_table_size(row_count: int, column_count: int, values_max: int, where: 
     if row_count * column_count > values_max:
         raise FileFormatError(
             f"{row_count} rows of {column_count} columns are too many for memory",
-            where=where,
             expected=f"up to {values_max} numbers",
             remedy="Cut out the part that is needed",
         )
+
+
+@dataclass(frozen=True)
+class PlateSignals:
+    """Signals of one plate or sole in the units of the file; n samples.
+
+    Attributes:
+        name: prefix of its columns, such as `plate1` or `left`: `plate1_fz`, `plate1_cop_x`.
+        fz: (n,), force along the plate's normal.
+        cop: (2, n), centre of pressure, NaN where unknown; None if the file has none. Its values
+            without load are ignored.
+        force_unit: unit of the force; None if the file does not state it.
+        length_unit: unit of the centre of pressure, or `SOLE_FRACTION`; None if the file does not
+            state it.
+        is_positive_under_load: True if the force is positive under load; else the load tells its
+            sign.
+        notes: remarks for the user.
+    """
+
+    name: str
+    fz: Floats
+    cop: Floats | None
+    force_unit: str | None
+    length_unit: str | None
+    is_positive_under_load: bool = False
+    notes: tuple[str, ...] = ()
+
+
+def make_table_of_separate_plates(
+    time_s: Floats, plates: Sequence[PlateSignals], notes: Sequence[str] = ()
+) -> ForceTable:
+    """Return a table of plates; a single plate with units gets the standard names as well."""
+    columns: dict[str, Floats] = {}
+    units = {"time_s": "s"}
+    all_notes = [*notes]
+    for plate in plates:
+        all_notes += [f"{plate.name}: {note}" for note in plate.notes]
+        columns[f"{plate.name}_fz"] = plate.fz
+        if plate.force_unit is not None:
+            units[f"{plate.name}_fz"] = plate.force_unit
+        for axis, cop, part in zip(
+            "xy", () if plate.cop is None else plate.cop, SOLE_UNITS, strict=False
+        ):
+            columns[f"{plate.name}_cop_{axis}"] = np.where(plate.fz == 0.0, np.nan, cop)
+            if plate.length_unit is not None:
+                units[f"{plate.name}_cop_{axis}"] = (
+                    part if plate.length_unit == SOLE_FRACTION else plate.length_unit
+                )
+    positive = {f"{plate.name}_fz" for plate in plates if plate.is_positive_under_load}
+    signed_by_load = {f"{plate.name}_fz" for plate in plates if not plate.is_positive_under_load}
+    if len(plates) == 1:
+        (plate,) = plates
+        for ours, theirs in (("grf_n", "fz"), ("cop_x_m", "cop_x"), ("cop_y_m", "cop_y")):
+            found = f"{plate.name}_{theirs}"
+            if found in units and units[found] not in SOLE_UNITS:
+                columns[ours], units[ours] = columns[found], units[found]
+        (positive if plate.is_positive_under_load else signed_by_load).add("grf_n")
+    else:
+        names = ", ".join(plate.name for plate in plates)
+        all_notes.append(f"there are {len(plates)} plates or soles ({names}): --map says which one")
+    columns["time_s"] = time_s
+    return ForceTable(
+        tuple(columns),
+        columns,
+        units,
+        positive_forces=frozenset(positive),
+        plate_forces=frozenset(signed_by_load),
+        notes=tuple(all_notes),
+    )
 
 
 SAMPLES_MIN = 10

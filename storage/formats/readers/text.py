@@ -9,6 +9,7 @@ fails, the user states the layout (`TextOptions`). Columns without names are num
 
 from __future__ import annotations
 
+import codecs
 import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,7 +24,7 @@ import pyarrow.compute as pc
 import pyarrow.csv
 
 from devices.arrays import Floats
-from devices.errors import FileFormatError
+from devices.errors import FileFormatError, UsageError
 from devices.input_files import decode_text, read_bytes
 from storage.formats.readers.table import (
     INSTANT_COLUMN,
@@ -35,7 +36,6 @@ from storage.formats.readers.table import (
     make_table_with_lowercase_standard_names,
     select_needed_names_or_empty,
 )
-from storage.formats.readers.text_options import DECIMAL_PATTERNS, TextOptions
 
 FORM = (
     "a text with a line of names above lines of numbers, parted by commas, semicolons or tabs; or "
@@ -68,6 +68,53 @@ _AMBIGUOUS_COMMA = r"^[+-]?[1-9]\d{0,2},\d{3}$"
 DECIMAL_REMEDY = "State the mark of decimals: --decimal , or --decimal ."
 
 
+DECIMAL_PATTERNS = {
+    ",": re.compile(r"[+-]?([1-9]\d{0,2}(\.\d{3})+|\d*)(,\d*)?([eE][+-]?\d+)?"),
+    ".": re.compile(r"[+-]?([1-9]\d{0,2}(,\d{3})+|\d*)(\.\d*)?([eE][+-]?\d+)?"),
+}
+"""Patterns of numbers by decimal mark; the other mark may separate thousands."""
+
+
+@dataclass(frozen=True)
+class TextOptions:
+    """Layout of a text as stated by the user; None: detected.
+
+    Attributes:
+        skip_rows: number of lines above the line of names, or above the numbers without names.
+        units_row: number of the line of units; the first line of the file is 1.
+        decimal: decimal mark, "," or "."; the other mark may separate thousands.
+        encoding: Python's name of the encoding.
+    """
+
+    skip_rows: int | None = None
+    units_row: int | None = None
+    decimal: str | None = None
+    encoding: str | None = None
+
+    def __post_init__(self) -> None:
+        for option, value, least in (
+            ("--skip-rows", self.skip_rows, 0),
+            ("--units-row", self.units_row, 1),
+        ):
+            if value is not None and value < least:
+                raise UsageError(f"{option} {value}", expected=f"a whole number from {least} on")
+        if self.decimal is not None and self.decimal not in DECIMAL_PATTERNS:
+            raise UsageError(f"--decimal {self.decimal!r}", expected="a comma, or a point")
+        if self.encoding is not None:
+            try:
+                "".encode(self.encoding)
+                codecs.lookup(self.encoding)
+            except (LookupError, ValueError) as error:
+                raise UsageError(
+                    f"--encoding {self.encoding!r}", expected="a name such as utf-8, cp1252, cp932"
+                ) from error
+
+    @property
+    def has_layout_option(self) -> bool:
+        """True if an option other than the encoding is set; the head is then not inspected."""
+        return any(one is not None for one in (self.skip_rows, self.units_row, self.decimal))
+
+
 @dataclass(frozen=True)
 class TextLayout:
     """Layout of the columns of a text.
@@ -91,7 +138,6 @@ class TextLayout:
 
 def parse_text_table(
     text: str,
-    where: str,
     is_needed: ColumnFilter,
     values_max: int,
     options: TextOptions | None = None,
@@ -107,20 +153,20 @@ def parse_text_table(
     if options.units_row is not None:
         units, text = _cut_out_line(text, options.units_row - 1)
         if not units.strip():
-            raise FileFormatError(f"line {options.units_row}, of units, is empty", where=where)
+            raise FileFormatError(f"line {options.units_row}, of units, is empty")
         skip -= options.units_row <= skip
     text = text[_line_offset(text, skip) :]
     if skip and not text.strip():
-        raise FileFormatError(f"there is no text below {options.skip_rows} lines", where=where)
-    layout = _detect_layout(text, where, options)
+        raise FileFormatError(f"there is no text below {options.skip_rows} lines")
+    layout = _detect_layout(text, options)
     if units is not None:
         cells = split_trimmed_cells_without_empty_end(units, layout.delimiter)
         layout = replace(layout, units={**layout.units, **_units_by_name(layout.names, cells)})
-    needed = select_needed_names_or_empty(layout.names, is_needed, where)
-    columns = parse_columns(text, layout, needed, values_max, where, options.decimal)
+    needed = select_needed_names_or_empty(layout.names, is_needed)
+    columns = parse_columns(text, layout, needed, values_max, options.decimal)
     notes = () if layout.is_named else ("no line names its columns: they are numbered from 1 on",)
     return make_table_with_lowercase_standard_names(
-        where, layout.names, columns, units=layout.units, notes=notes, expected_form=FORM
+        layout.names, columns, units=layout.units, notes=notes, expected_form=FORM
     )
 
 
@@ -128,32 +174,28 @@ def read_decoded_text(path: Path, encoding: str | None = None) -> str:
     r"""Read and decode a text in the given or detected encoding; line ends become `\n`.
 
     Raises:
-        FileFormatError: the file cannot be read, is too large, or is no text.
+        OSError: the file cannot be read, or is too large.
+        FileFormatError: it is no text.
     """
-    try:
-        content = read_bytes(path, bytes_max=TEXT_BYTES_MAX)
-    except OSError as error:
-        raise FileFormatError(f"cannot be read: {error}", where=str(path), expected=FORM) from error
+    content = read_bytes(path, bytes_max=TEXT_BYTES_MAX)
     try:
         text = content.decode(encoding).removeprefix("\ufeff") if encoding else decode_text(content)
     except UnicodeError as error:
         if encoding is not None:
             raise FileFormatError(
-                f"it is no text in {encoding}", where=str(path), remedy="State another --encoding"
+                f"it is no text in {encoding}", remedy="State another --encoding"
             ) from error
         # Names and titles of older programs; numbers are equal in all such encodings.
         text = content.decode("cp1252", errors="replace")
     if "\0" in text[:HEAD_CHARACTERS]:
         raise FileFormatError(
             "cannot be read: it is no text",
-            where=str(path),
-            expected=FORM,
             remedy="" if encoding else "If it is one, state its encoding: --encoding NAME",
         )
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def _detect_layout(text: str, where: str, options: TextOptions | None = None) -> TextLayout:
+def _detect_layout(text: str, options: TextOptions | None = None) -> TextLayout:
     """Detect the line of names, if any, and the delimiter of columns.
 
     Raises:
@@ -173,7 +215,7 @@ def _detect_layout(text: str, where: str, options: TextOptions | None = None) ->
     if found:
         return max(found, key=lambda layout: layout.score)
     if not first:
-        raise FileFormatError("cannot be read: it is empty", where=where, expected=FORM)
+        raise FileFormatError("cannot be read: it is empty")
     found = [
         layout
         for delimiter in delimiters
@@ -183,16 +225,12 @@ def _detect_layout(text: str, where: str, options: TextOptions | None = None) ->
     if not found:
         raise FileFormatError(
             "no line of names precedes the numbers",
-            where=where,
-            expected=FORM,
             remedy="State the number of lines above it: --skip-rows N",
         )
     best = max(found, key=lambda layout: layout.score)
     if options.decimal is None and best.delimiter == "," and best.score > 1 and len(found) > 1:
         raise FileFormatError(
             f"{lines[best.first_data_line][:40]!r} may be two numbers, or one with a decimal comma",
-            where=where,
-            expected=FORM,
             remedy=DECIMAL_REMEDY,
         )
     return best
@@ -203,7 +241,6 @@ def parse_columns(
     layout: TextLayout,
     needed_names: Sequence[str],
     values_max: int,
-    where: str,
     decimal_mark: str | None = None,
 ) -> dict[str, Column]:
     """Return the numbers of the needed columns, without trailing empty lines.
@@ -211,45 +248,38 @@ def parse_columns(
     The decimal mark is detected if `decimal_mark` is None.
 
     Raises:
-        FileFormatError: lines differ in their number of cells, a cell is no number, or there are
-            too many numbers.
+        FileFormatError: a cell is no number, or there are too many numbers.
+        pa.ArrowException: lines differ in their number of cells.
     """
     body = _data_lines(text, layout)
-    check_table_size(body.count("\n"), len(needed_names), values_max, where)
+    check_table_size(body.count("\n"), len(needed_names), values_max)
     if not body or not needed_names:
         return {name: np.empty(0) for name in needed_names}
     source: Any = pa.BufferReader(body.encode())  # its stubs know no buffers
     indices = [str(layout.names.index(name)) for name in needed_names]
-    try:
-        table = pyarrow.csv.read_csv(
-            source,
-            read_options=pyarrow.csv.ReadOptions(
-                column_names=[str(i) for i in range(len(layout.names))]
-            ),
-            parse_options=pyarrow.csv.ParseOptions(
-                delimiter=layout.delimiter, newlines_in_values=True
-            ),
-            convert_options=pyarrow.csv.ConvertOptions(
-                include_columns=indices,
-                column_types=dict.fromkeys(indices, pa.string()),
-                strings_can_be_null=False,
-            ),
-        )
-    except pa.ArrowException as error:
-        raise FileFormatError(f"cannot be read: {error}", where=where, expected=FORM) from error
+    table = pyarrow.csv.read_csv(
+        source,
+        read_options=pyarrow.csv.ReadOptions(
+            column_names=[str(i) for i in range(len(layout.names))]
+        ),
+        parse_options=pyarrow.csv.ParseOptions(delimiter=layout.delimiter, newlines_in_values=True),
+        convert_options=pyarrow.csv.ConvertOptions(
+            include_columns=indices,
+            column_types=dict.fromkeys(indices, pa.string()),
+            strings_can_be_null=False,
+        ),
+    )
     cells = {
         name: pc.utf8_trim_whitespace(table[index]).combine_chunks()
         for name, index in zip(needed_names, indices, strict=True)
     }
     if decimal_mark is not None:
         cells = {
-            name: _to_decimal_points(column, name, decimal_mark, where)
-            for name, column in cells.items()
+            name: _to_decimal_points(column, name, decimal_mark) for name, column in cells.items()
         }
-    has_comma = decimal_mark is None and _has_decimal_comma(list(cells.values()), where)
+    has_comma = decimal_mark is None and _has_decimal_comma(list(cells.values()))
     columns = {
-        name: _parse_numbers(column, name, where, has_comma=has_comma)
-        for name, column in cells.items()
+        name: _parse_numbers(column, name, has_comma=has_comma) for name, column in cells.items()
     }
     filled = np.flatnonzero(np.any([~np.isnan(column) for column in columns.values()], axis=0))
     count = int(filled[-1]) + 1 if len(filled) else 0
@@ -391,7 +421,7 @@ def _data_lines(text: str, layout: TextLayout) -> str:
     return body + "\n"
 
 
-def _has_decimal_comma(columns: Sequence[pa.Array[Any]], where: str) -> bool:
+def _has_decimal_comma(columns: Sequence[pa.Array[Any]]) -> bool:
     """Return whether numbers have a decimal comma.
 
     Raises:
@@ -407,7 +437,6 @@ def _has_decimal_comma(columns: Sequence[pa.Array[Any]], where: str) -> bool:
         if pc.any(pc.match_substring_regex(cells, number)).as_py():
             raise FileFormatError(
                 f"some numbers have a decimal point, and {first!r} has a comma",
-                where=where,
                 expected=expected,
                 remedy=DECIMAL_REMEDY,
             )
@@ -417,14 +446,13 @@ def _has_decimal_comma(columns: Sequence[pa.Array[Any]], where: str) -> bool:
     ):
         raise FileFormatError(
             f"{first!r} may have a decimal comma, or a comma between thousands",
-            where=where,
             expected=expected,
             remedy=DECIMAL_REMEDY,
         )
     return True
 
 
-def _to_decimal_points(cells: pa.Array[Any], name: str, decimal: str, where: str) -> pa.Array[Any]:
+def _to_decimal_points(cells: pa.Array[Any], name: str, decimal: str) -> pa.Array[Any]:
     """Return numbers with the stated decimal mark as numbers with a decimal point.
 
     Raises:
@@ -438,14 +466,13 @@ def _to_decimal_points(cells: pa.Array[Any], name: str, decimal: str, where: str
         at = pc.index(bad, pa.scalar(True)).as_py()
         raise FileFormatError(
             f"column {name} has {cells[at].as_py()[:40]!r} in row {at + 1} of its numbers",
-            where=where,
             expected=f"{decimal!r} as the mark of decimals, and {other!r} between thousands only",
             remedy="State the other --decimal, or none",
         )
     return pc.replace_substring(pc.replace_substring(cells, other, ""), decimal, ".")
 
 
-def _parse_numbers(cells: pa.Array[Any], name: str, where: str, *, has_comma: bool) -> Column:
+def _parse_numbers(cells: pa.Array[Any], name: str, *, has_comma: bool) -> Column:
     cells = pc.if_else(pc.match_substring_regex(cells, MISSING_VALUE_PATTERN), None, cells)
     if name.lower() == INSTANT_COLUMN and not cells.null_count:
         try:
@@ -458,9 +485,7 @@ def _parse_numbers(cells: pa.Array[Any], name: str, where: str, *, has_comma: bo
     except pa.ArrowException as error:
         at, text = next((i, c) for i, c in enumerate(cells.to_pylist()) if c and not _is_float(c))
         raise FileFormatError(
-            f"column {name} is not numeric: {text[:40]!r} in row {at + 1} of its numbers",
-            where=where,
-            expected=FORM,
+            f"column {name} is not numeric: {text[:40]!r} in row {at + 1} of its numbers"
         ) from error
 
 

@@ -14,7 +14,7 @@ from devices.errors import FileFormatError, LoadTraceError, UsageError
 from storage.formats.load_trace import read_load_to_emulate
 from storage.formats.readers.registry import read_table
 from storage.formats.readers.table import ForceTable
-from storage.formats.readers.text_options import TextOptions
+from storage.formats.readers.text import TextOptions
 from storage.formats.reference import ReferenceOptions, read_reference
 
 PLAIN = "Time,Fz\n0.00,0.5\n0.01,-12.25\n0.02,1e3\n"

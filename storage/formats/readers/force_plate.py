@@ -1,92 +1,26 @@
-"""Signals of force plates and load cells, and the force and COP of a plate from its channels.
+"""Force plate of a motion laboratory: its pose, and force and centre of pressure from its channels.
 
 Plate types: C3D user guide, FORCE_PLATFORM:TYPE.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from devices.arrays import Floats
-from storage.formats.readers.table import SOLE_FRACTION, SOLE_UNITS, ForceTable
-
-
-@dataclass(frozen=True)
-class PlateSignals:
-    """Signals of one plate or sole in the units of the file; n samples.
-
-    Attributes:
-        name: prefix of its columns, such as `plate1` or `left`: `plate1_fz`, `plate1_cop_x`.
-        fz: (n,), force along the plate's normal.
-        cop: (2, n), centre of pressure, NaN where unknown; None if the file has none. Its values
-            without load are ignored.
-        force_unit: unit of the force; None if the file does not state it.
-        length_unit: unit of the centre of pressure, or `SOLE_FRACTION`; None if the file does not
-            state it.
-        is_positive_under_load: True if the force is positive under load; else the load tells its
-            sign.
-        notes: remarks for the user.
-    """
-
-    name: str
-    fz: Floats
-    cop: Floats | None
-    force_unit: str | None
-    length_unit: str | None
-    is_positive_under_load: bool = False
-    notes: tuple[str, ...] = ()
-
-
-def make_table_of_separate_plates(
-    where: str, time_s: Floats, plates: Sequence[PlateSignals], notes: Sequence[str] = ()
-) -> ForceTable:
-    """Return a table of plates; a single plate with units gets the standard names as well."""
-    columns: dict[str, Floats] = {}
-    units = {"time_s": "s"}
-    all_notes = [*notes]
-    for plate in plates:
-        all_notes += [f"{plate.name}: {note}" for note in plate.notes]
-        columns[f"{plate.name}_fz"] = plate.fz
-        if plate.force_unit is not None:
-            units[f"{plate.name}_fz"] = plate.force_unit
-        for axis, cop, part in zip(
-            "xy", () if plate.cop is None else plate.cop, SOLE_UNITS, strict=False
-        ):
-            columns[f"{plate.name}_cop_{axis}"] = np.where(plate.fz == 0.0, np.nan, cop)
-            if plate.length_unit is not None:
-                units[f"{plate.name}_cop_{axis}"] = (
-                    part if plate.length_unit == SOLE_FRACTION else plate.length_unit
-                )
-    positive = {f"{plate.name}_fz" for plate in plates if plate.is_positive_under_load}
-    signed_by_load = {f"{plate.name}_fz" for plate in plates if not plate.is_positive_under_load}
-    if len(plates) == 1:
-        (plate,) = plates
-        for ours, theirs in (("grf_n", "fz"), ("cop_x_m", "cop_x"), ("cop_y_m", "cop_y")):
-            found = f"{plate.name}_{theirs}"
-            if found in units and units[found] not in SOLE_UNITS:
-                columns[ours], units[ours] = columns[found], units[found]
-        (positive if plate.is_positive_under_load else signed_by_load).add("grf_n")
-    else:
-        names = ", ".join(plate.name for plate in plates)
-        all_notes.append(f"there are {len(plates)} plates or soles ({names}): --map says which one")
-    columns["time_s"] = time_s
-    return ForceTable(
-        where,
-        tuple(columns),
-        columns,
-        units,
-        positive_forces=frozenset(positive),
-        plate_forces=frozenset(signed_by_load),
-        notes=tuple(all_notes),
-    )
-
 
 LOADED_FRACTION = 0.2
 """Load threshold of a plate relative to its peak force."""
+WRONG_UNIT_ECCENTRICITY = 5.0
+"""Distance from the middle, relative to the edge, that means a wrong unit, not a wrong ORIGIN."""
+OFF_PLATE_FRACTION = 0.05
+"""Fraction of loaded samples off the plate from which a note is added."""
+CENTRED_ECCENTRICITY = 2e-3
+"""Distance from the middle, relative to the edge, that a foot's centre of pressure exceeds."""
 FLAT_COS_MIN = 0.9999
 """Cosine of the largest tilt of a flat plate against an axis of the laboratory, 0.8 degrees."""
 
@@ -158,9 +92,15 @@ def compute_fz_and_local_cop(
         # Moments about the middle of the surface: M + F x origin.
         mx = mx + fy * origin[2] - fz * origin[1]
         my = my + fz * origin[0] - fx * origin[2]
-        place = np.stack([-my, mx]) / fz
-    place[:, ~np.isfinite(place).all(axis=0)] = np.nan
-    return PlateForce(fz, place)
+    return PlateForce(fz, compute_cop_from_moments(fz, mx, my))
+
+
+def compute_cop_from_moments(fz: Floats, mx: Floats, my: Floats) -> Floats:
+    """Return the centre of pressure (2, n) in the plane of the moments' origin, or NaN."""
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        cop = np.stack([-my, mx]) / fz
+    cop[:, ~np.isfinite(cop).all(axis=0)] = np.nan
+    return cop
 
 
 def correct_cop_for_bending(cop_mm: Floats, polynomial: Floats) -> Floats:
@@ -179,14 +119,50 @@ def correct_cop_for_bending(cop_mm: Floats, polynomial: Floats) -> Floats:
         return np.asarray(cop_mm - np.stack(added))
 
 
-def compute_loaded_eccentricity(cop: Floats, fz: Floats, half_size: Floats) -> Floats:
+def _compute_loaded_eccentricity(cop: Floats, fz: Floats, half_size: Floats) -> Floats:
     """Return the relative distance from the middle of each centre of pressure under load.
 
-    1 is the edge of the plate; `half` is half its lengths along x and y.
+    1 is the edge of the plate; `half_size` is half its lengths along x and y.
     """
     size = np.where(np.isfinite(cop).all(axis=0) & np.isfinite(fz), np.abs(fz), 0.0)
     loaded = size > LOADED_FRACTION * np.max(size, initial=0.0)
     return np.asarray(np.max(np.abs(cop[:, loaded]) / half_size[:, None], axis=0))
+
+
+def is_cop_in_corner_unit(
+    fz: Floats, stated_cop: Floats, corner_cop: Floats, pose: PlatePose
+) -> bool:
+    """Return whether the centre of pressure is on the plate only in the unit of the corners.
+
+    Args:
+        fz: force, (n,).
+        stated_cop: centre of pressure in the unit that the file states.
+        corner_cop: centre of pressure in the unit of the corners. If this unit is the smaller one,
+            both are on the plate, one very near to its middle.
+        pose: pose of the plate.
+    """
+    off, off_other = (
+        float(np.median(far))
+        if len(far := _compute_loaded_eccentricity(place, fz, pose.half_size))
+        else 0.0
+        for place in (stated_cop, corner_cop)
+    )
+    return off_other <= 1.0 and (
+        off > WRONG_UNIT_ECCENTRICITY or off_other > WRONG_UNIT_ECCENTRICITY * off
+    )
+
+
+def describe_implausible_cop(local: Floats, fz: Floats, pose: PlatePose) -> Iterator[str]:
+    """Yield notes about a centre of pressure, from the middle, that the plate cannot have."""
+    off = _compute_loaded_eccentricity(local, fz, pose.half_size)
+    part = float((off > 1.0).mean()) if len(off) else 0.0
+    if part > OFF_PLATE_FRACTION:
+        yield (
+            f"COP is off the plate in {part:.0%} of the samples under load: its moments, ORIGIN or "
+            "CORNERS are not what the file states"
+        )
+    elif len(off) and float(np.quantile(off, 0.9)) < CENTRED_ECCENTRICITY:
+        yield "COP does not leave the middle of the plate: its moments may be in another unit"
 
 
 class PlacedCop(NamedTuple):
