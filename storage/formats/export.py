@@ -369,11 +369,23 @@ class Export:
         return plain.with_metadata(metadata)
 
     @property
+    def instant_columns(self) -> list[str]:
+        """Names of the columns of instants and parts: of each clock, of each part."""
+        parts = ["part"] if "part" in self.frame_source.quantity_names else []
+        return ["t_ns", *parts, *self._server_time_columns]
+
+    @property
+    def marker_columns(self) -> list[str]:
+        """Names of the columns of markers; empty without markers."""
+        return [column.name for column in MARKER_COLUMNS] if self.markers is not None else []
+
+    @property
+    def _server_time_columns(self) -> list[str]:
+        return [column.name for column in SERVER_TIME_COLUMNS] if self.clock is not None else []
+
+    @property
     def _derived_column_names(self) -> list[str]:
-        made = [column.name for column in SERVER_TIME_COLUMNS] if self.clock is not None else []
-        return made + (
-            [column.name for column in MARKER_COLUMNS] if self.markers is not None else []
-        )
+        return [*self._server_time_columns, *self.marker_columns]
 
 
 def _flatten_frames(frames: FrameBatch, extra: Mapping[str, Array]) -> dict[str, Array]:

@@ -9,12 +9,13 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 
 from devices.arrays import Times
 from devices.errors import Extra, UsageError, require_extra
 from storage.formats.export import Export
-from storage.schema import UNKNOWN_T_NS, Array
+from storage.schema import COLUMNS_BY_NAME, UNKNOWN_T_NS, Array
 
 TABLE_OPTIONS = ("names", "times")
 """Options of every format that writes `Export.read_tables`."""
@@ -165,6 +166,15 @@ def get_instants_on_export_clock_ns(export: Export, columns: Mapping[str, Array]
             remedy="Ask for the node's clock, or a slice of a part whose clock was compared",
         )
     return t_ns
+
+
+def to_floats_with_nan(quantity_name: str, values: Array) -> Array:
+    """Return a column of any type as float64, NaN where unknown."""
+    found = values.astype(np.float64)
+    missing = COLUMNS_BY_NAME[quantity_name].missing_value
+    if missing is not None:
+        found[values == missing] = np.nan
+    return found
 
 
 class DrainedBuffer(io.BytesIO):

@@ -1,13 +1,11 @@
 """MATLAB writer: .mat of version 5, a variable for each quantity; Octave and scipy read it too.
 
-scipy writes a struct at once. Here its fields are encoded one after the other, so that one field is
-in memory at a time. The head of the struct is scipy's head of a struct with empty fields, with the
-length replaced (MAT-File Format, "Level 5 MAT-File Format", mxSTRUCT_CLASS).
-
 Variables follow one another in the file: `load("session.mat", "t_ns", "grf_n")` reads only these.
 A matrix is written while it is read, a chunk of a column at a time; scipy writes all else. Several
-sessions are an array of structs, `sessions`, with the same names in each; one field is in memory at
-a time.
+sessions are an array of structs, `sessions`, with the same names in each. scipy writes a struct at
+once. Here its fields are encoded one after the other, in chunks. The head of the struct is scipy's
+head of a struct with empty fields, with the length replaced (MAT-File Format, "Level 5 MAT-File
+Format", mxSTRUCT_CLASS).
 
 A quantity of all tiles is a matrix of frames by tiles. Numbers that may be unknown are NaN, in a
 float class that holds all of their values. An unknown `t_server_ns`, which no float holds, is
@@ -102,41 +100,42 @@ def _encode_mat_matrix(
 
 
 @dataclass(frozen=True)
-class _StructField:
-    """Field of a struct.
+class _Variable:
+    """Variable of the file, or field of a struct.
 
     Attributes:
-        size_bytes: length of its element in bytes.
-        encode: function that encodes the element.
+        size_bytes: length of its element in a struct.
+        encode: function of its name, empty in a struct, that yields the encoded variable.
     """
 
     size_bytes: int
-    encode: Callable[[], bytes]
+    encode: Callable[[str], Iterable[bytes]]
 
     @classmethod
-    def from_value(cls, value: object) -> _StructField:
-        """Return a field whose small value is encoded now."""
-        content = _encode_element(value)
-        return cls(len(content), lambda: content)
+    def from_value(cls, value: object) -> _Variable:
+        """Return a variable with a small value, encoded now."""
+        element = _encode_element(value)
+        return cls(
+            len(element), lambda name: (_encode_mat_variable(name, value) if name else element,)
+        )
 
     @classmethod
-    def from_matrix_function(
+    def from_chunks(
         cls,
         shape: tuple[int, int],
         number_type: npt.DTypeLike,
-        compute_matrix: Callable[[], object],
-    ) -> _StructField:
-        """Return a field of numbers, computed by `compute_matrix` when written."""
+        read_chunks: Callable[[], Iterable[Array]],
+    ) -> _Variable:
+        """Return a variable of numbers, read in chunks when it is written."""
         size = shape[0] * shape[1] * np.dtype(number_type).itemsize
-        in_tag = size <= 4  # up to 4 bytes are stored in the tag of the numbers
         return cls(
-            _MATRIX_HEAD_BYTES + (0 if in_tag else -(-size // 8) * 8),
-            lambda: _encode_element(compute_matrix()),
+            _MATRIX_HEAD_BYTES + size + -size % 8,
+            lambda name: _encode_mat_matrix(name, shape, number_type, read_chunks()),
         )
 
 
 def _encode_mat_struct_array(
-    name: str, structs: Sequence[Mapping[str, _StructField]]
+    name: str, structs: Sequence[Mapping[str, _Variable]]
 ) -> Iterator[bytes]:
     """Yield an encoded array of structs; each has the fields of all, missing ones are empty.
 
@@ -151,20 +150,12 @@ def _encode_mat_struct_array(
             plain[key][0, i] = _EMPTY
     head = bytearray(_encode_mat_variable(name, plain))
     del head[len(head) - _MATRIX_HEAD_BYTES * plain.size * len(names) :]
-    nothing = _StructField.from_value(_EMPTY)
+    nothing = _Variable.from_value(_EMPTY)
     fields = [element.get(key, nothing) for element in structs for key in names]
     struct.pack_into("<I", head, 4, len(head) - 8 + sum(field.size_bytes for field in fields))
     yield bytes(head)
     for field in fields:
-        content = field.encode()
-        if len(content) != field.size_bytes:
-            raise RuntimeError(f"{len(content)} bytes of a field, and not {field.size_bytes}")
-        yield content
-
-
-def _estimate_struct_array_bytes(structs: Sequence[Mapping[str, _StructField]]) -> int:
-    """Return the approximate length of an array of these structs in bytes."""
-    return sum(field.size_bytes for element in structs for field in element.values())
+        yield from field.encode("")
 
 
 def _encode_element(value: object) -> bytes:
@@ -187,26 +178,23 @@ def _list_selected_columns_or_name(export: Export, quantity: Column) -> list[str
 
 
 def _choose_mat_number_type(quantity: Column) -> npt.DTypeLike:
-    """Return the class of a quantity's numbers; for a text, of the codes of its kinds."""
+    """Return the class of a quantity's numbers."""
     kind = quantity.type
-    if pa.types.is_string(kind):
-        return np.uint16
     plain = numpy_dtype_of(kind)
     if pa.types.is_floating(kind) or quantity.missing_value is None or kind.bit_width == 64:
         return plain
     return np.float32 if kind.bit_width <= 16 else np.float64
 
 
-def _read_mat_variables(export: Export, quantity: Column) -> Mapping[str, Array]:
-    """Read a quantity as a variable by name, (frames, columns); for a text with its kinds."""
-    names = _list_selected_columns_or_name(export, quantity)
-    pieces = list(_minimal_export(export, quantity).read_chunks(names))
-    flat = [np.concatenate([piece[name] for piece in pieces]) for name in names]
-    if pa.types.is_string(quantity.type):
-        kinds, codes = np.unique(flat[0].astype(str), return_inverse=True)
-        numbers = (codes + 1).astype(_choose_mat_number_type(quantity))[:, None]
-        return {quantity.name: numbers, f"{quantity.name}_kinds": np.array(kinds, dtype=object)}
-    return {quantity.name: np.stack([_to_number_type(quantity, values) for values in flat], axis=1)}
+def _read_text_variables(export: Export, quantity: Column) -> Mapping[str, Array]:
+    """Read a text as two variables by name: the number of its kind in each frame, and its kinds."""
+    pieces = _minimal_export(export, quantity).read_chunks([quantity.name])
+    texts = np.concatenate([piece[quantity.name] for piece in pieces])
+    kinds, codes = np.unique(texts.astype(str), return_inverse=True)
+    return {
+        quantity.name: (codes + 1).astype(np.uint16)[:, None],
+        f"{quantity.name}_kinds": np.array(kinds, dtype=object),
+    }
 
 
 def _read_chunks_column_by_column(export: Export, quantity: Column) -> Iterator[Array]:
@@ -290,79 +278,66 @@ _HEADER_TEXT_BYTES = 116
 def _encode(export: Export) -> Iterator[bytes]:
     quantities = _list_mat_quantities(export)
     # Refuses too many frames before the first chunk.
-    frames = len(_read_instants(export)["t_ns"])
-    yield _encode_header(export) + _encode_mat_variable("about", _make_about_struct(export))
+    variables = _make_variables(export, quantities, len(_read_instants(export)["t_ns"]))
+    about = variables.pop("about")
+    yield b"".join((_encode_header(export), *about.encode("about")))
     yield from _encode_meanings(quantities)
-    yield _encode_mat_variable("tiles", _make_tile_struct(export))
-    if export.markers is not None:
-        yield _encode_mat_variable("markers", _make_marker_struct(export))
-    for column in quantities:
-        if pa.types.is_string(column.type):
-            for name, values in _read_mat_variables(export, column).items():
-                yield _encode_mat_variable(name, values)
-            continue
-        shape = frames, len(_list_selected_columns_or_name(export, column))
-        yield from _encode_mat_matrix(
-            column.name,
-            shape,
-            _choose_mat_number_type(column),
-            _read_chunks_column_by_column(export, column),
-        )
+    for name, variable in variables.items():
+        yield from variable.encode(name)
 
 
 def _encode_together(exports: Sequence[Export]) -> Iterator[bytes]:
-    found = [_make_struct_fields(export) for export in exports]
-    if (size := _estimate_struct_array_bytes(found)) > BYTES_MAX:
+    # The server's time is always there, the sessions' common axis.
+    quantities = [
+        list(dict.fromkeys([*_list_mat_quantities(export), *SERVER_TIME_COLUMNS]))
+        for export in exports
+    ]
+    structs = [
+        {"node": _Variable.from_value(export.array_info.node)}
+        | _make_variables(
+            export, own, len(get_instants_on_export_clock_ns(export, _read_instants(export)))
+        )
+        for export, own in zip(exports, quantities, strict=True)
+    ]
+    size = sum(field.size_bytes for fields in structs for field in fields.values())
+    if size > BYTES_MAX:
         raise UsageError(
             f"there are {size} bytes in these sessions, and {BYTES_MAX} in a variable at most",
             expected="fewer columns, or a slice",
         )
     yield _encode_header(exports[0])
-    yield from _encode_meanings(
-        [column for export in exports for column in _quantities_with_server_time(export)]
-    )
-    yield from _encode_mat_struct_array("sessions", found)
+    yield from _encode_meanings([column for own in quantities for column in own])
+    yield from _encode_mat_struct_array("sessions", structs)
 
 
-def _make_struct_fields(export: Export) -> dict[str, _StructField]:
-    rows = len(get_instants_on_export_clock_ns(export, _read_instants(export)))
-    fields = {
-        "node": _StructField.from_value(export.array_info.node),
-        "about": _StructField.from_value(_make_about_struct(export)),
+def _make_variables(
+    export: Export, quantities: Sequence[Column], frames: int
+) -> dict[str, _Variable]:
+    """Return the variables of a session by name."""
+    values: dict[str, object] = {
+        "about": _make_about_struct(export),
+        "tiles": _make_tile_struct(export),
     }
-    fields["tiles"] = _StructField.from_value(_make_tile_struct(export))
     if export.markers is not None:
-        fields["markers"] = _StructField.from_value(_make_marker_struct(export))
-    for column in _quantities_with_server_time(export):
+        values["markers"] = _make_marker_struct(export)
+    variables = {name: _Variable.from_value(value) for name, value in values.items()}
+    for column in quantities:
         if pa.types.is_string(column.type):
-            fields |= {
-                name: _StructField.from_value(v)
-                for name, v in _read_mat_variables(export, column).items()
-            }
+            texts = _read_text_variables(export, column)
+            variables |= {name: _Variable.from_value(value) for name, value in texts.items()}
             continue
-        width = len(_list_selected_columns_or_name(export, column))
-        make = partial(_read_values, export, column)
-        fields[column.name] = _StructField.from_matrix_function(
-            (rows, width), _choose_mat_number_type(column), make
+        variables[column.name] = _Variable.from_chunks(
+            (frames, len(_list_selected_columns_or_name(export, column))),
+            _choose_mat_number_type(column),
+            partial(_read_chunks_column_by_column, export, column),
         )
-    return fields
-
-
-def _quantities_with_server_time(export: Export) -> list[Column]:
-    """Return the selected quantities, and always the server's time, the sessions' common axis."""
-    return list(dict.fromkeys([*_list_mat_quantities(export), *SERVER_TIME_COLUMNS]))
-
-
-def _read_values(export: Export, column: Column) -> Array:
-    return _read_mat_variables(export, column)[column.name]
+    return variables
 
 
 def _read_instants(export: Export) -> dict[str, Array]:
     """Return the instants of the frames by each requested clock."""
     limit = min(FRAMES_MAX, _VALUES_MAX // max(len(export.array_info.tiles), 1))
-    requested = ["t_ns", *(["part"] if "part" in export.frame_source.quantity_names else [])]
-    requested += [] if export.clock is None else ["t_server_ns"]
-    return export.read_all(requested, frames_max=limit)
+    return export.read_all(export.instant_columns, frames_max=limit)
 
 
 def _encode_meanings(quantities: Sequence[Column]) -> Iterator[bytes]:

@@ -11,7 +11,7 @@ from devices.errors import UsageError
 from storage.formats.writers.c3d import C3D
 from storage.formats.writers.format import ExportFormat
 from storage.formats.writers.matlab import MATLAB
-from storage.formats.writers.mcap.file import MCAP
+from storage.formats.writers.mcap import MCAP
 from storage.formats.writers.opensim import OPENSIM
 from storage.formats.writers.tables import ARROW, CSV, PARQUET
 from storage.formats.writers.xdf import XDF

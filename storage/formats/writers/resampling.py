@@ -24,7 +24,7 @@ from devices.flags import EstimateFlag
 from devices.frames import ArrayInfo
 from storage.formats.export import Export
 from storage.formats.writers.format import get_instants_on_export_clock_ns
-from storage.schema import SERVER_TIME_COLUMNS, Array
+from storage.schema import Array
 
 INTERPOLATED_PERIODS_MAX = 2.5
 """Longest interpolated interval, in periods: a frame may be late, or one may not be sampled."""
@@ -224,7 +224,6 @@ OPTIONAL_COLUMNS = (
 """Optional columns of a session."""
 FLAG_COLUMNS = ("contact", "estimate_flags", "grf_lower_bound_n")
 """Columns that are not interpolated between two frames."""
-SERVER_TIME_NAMES = [column.name for column in SERVER_TIME_COLUMNS]
 FOOT_STRIKE, FOOT_OFF = "Foot Strike", "Foot Off"
 """Labels of contact events, after the C3D manual."""
 
@@ -310,10 +309,8 @@ def _read_frames(
     """Return the instants of the frames on the export's clock, and their columns."""
     present = set(export.frame_source.quantity_names)
     names = [*REQUIRED_COLUMNS, *(name for name in optional_columns if name in present)]
-    names += SERVER_TIME_NAMES if export.clock is not None else []
-    names += ["marker"] if export.markers is not None else []
-    names += ["part"] if "part" in present else []
-    columns = export.read_all(list(dict.fromkeys(["seq", *names])), frames_max=frames_max)
+    names = ["seq", *names, *export.instant_columns, *export.marker_columns]
+    columns = export.read_all(list(dict.fromkeys(names)), frames_max=frames_max)
     t_ns = get_instants_on_export_clock_ns(export, columns)
     if not len(t_ns):
         raise UsageError(

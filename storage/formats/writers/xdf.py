@@ -26,6 +26,7 @@ from storage.formats.writers.format import (
     ExportFormat,
     get_instants_on_export_clock_ns,
     make_names_unique,
+    to_floats_with_nan,
 )
 from storage.formats.writers.resampling import make_resampling, make_sample_axis
 from storage.formats.writers.text_metadata import escape_xml_invalid_characters
@@ -141,10 +142,8 @@ class _SessionEncoder:
     def read_chunks(self, *, is_alone: bool) -> Iterator[Mapping[str, Array]]:
         """Read the frames in chunks; beside other sessions they need the server's time."""
         export = self._export
-        requested = [*self._channel_quantities, "t_ns"]
-        requested += ["part"] if "part" in export.frame_source.quantity_names else []
-        requested += ["t_server_ns"] if export.clock is not None else []
-        requested += ["marker"] if export.markers is not None else []
+        columns = [*self._channel_quantities, *export.instant_columns, *export.marker_columns]
+        requested = list(dict.fromkeys(columns))
         if export.options.rate is not None:
             yield self._read_resampled(requested, is_alone=is_alone)
             return
@@ -159,7 +158,7 @@ class _SessionEncoder:
         Numbers are interpolated; counts and flags are those of the nearer frame.
         """
         export = self._export
-        flat = export.read_all(list(dict.fromkeys([*requested, "seq"])), frames_max=_SAMPLES_MAX)
+        flat = export.read_all([*requested, "seq"], frames_max=_SAMPLES_MAX)
         if not is_alone:
             get_instants_on_export_clock_ns(export, flat)
         t_ns = export.to_session_axis_ns(flat)
@@ -176,7 +175,7 @@ class _SessionEncoder:
             "t_ns": axis.begin_ns + np.rint(placed.elapsed_s * 1e9).astype(np.int64)
         }
         for name, of in self._channel_quantities.items():
-            values = _to_floats(flat[name], of)
+            values = to_floats_with_nan(of, flat[name])
             is_whole = pa.types.is_integer(COLUMNS_BY_NAME[of].type) or pa.types.is_boolean(
                 COLUMNS_BY_NAME[of].type
             )
@@ -259,7 +258,7 @@ class _SessionEncoder:
         rows = np.zeros(len(at_s), dtype=row)
         rows["bytes"], rows["s"] = 8, at_s
         for i, name in enumerate(stream.columns):
-            rows["v"][:, i] = _to_floats(flat[name], self._channel_quantities[name])
+            rows["v"][:, i] = to_floats_with_nan(self._channel_quantities[name], flat[name])
         return struct.pack("<BI", 4, len(at_s)) + rows.tobytes()
 
     def _encode_clock_offsets(self, part: int, flat: Mapping[str, Array]) -> bytes:
@@ -322,15 +321,6 @@ class _SessionEncoder:
                 channel["serial"] = tile.serial
             _add_text_elements(SubElement(channels, "channel"), channel)
         return stream, stream.encode_chunk(_STREAM_HEADER, tostring(info, xml_declaration=True))
-
-
-def _to_floats(values: Array, column: str) -> Array:
-    """Return a column as float64, NaN where unknown."""
-    missing = COLUMNS_BY_NAME[column].missing_value
-    numbers = values.astype(np.float64)
-    if missing is not None:
-        numbers[values == missing] = np.nan
-    return numbers
 
 
 def _encode_chunk(tag: int, content: bytes) -> bytes:

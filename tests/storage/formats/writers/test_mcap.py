@@ -26,7 +26,7 @@ from storage.clock.table import ClockTable, StreamClockFacts
 from storage.formats.export import make_one_pass_frame_source
 from storage.formats.markers import PLACEMENT_COLUMNS, PlacedMarkers, place_markers
 from storage.formats.slice import NO_OPTIONS, FormatOptions, Slice
-from storage.formats.writers.mcap.ros2 import make_ros2_name
+from storage.formats.writers.mcap_messages import make_ros2_name
 from storage.schema import CONTACT_UNKNOWN, Array
 from storage.sessions.folder import Marker
 from tests.builders.arrays import make_array
@@ -221,7 +221,7 @@ def test_a_tiles_pressure_is_absolute_at_its_own_time(tmp_path: Path, every: int
 
 
 def test_an_unread_temperature_is_that_of_the_last_second(tmp_path: Path) -> None:
-    from storage.formats.writers.mcap.ros2 import _TemperatureHold
+    from storage.formats.writers.mcap_messages import _TemperatureHold
 
     held = _TemperatureHold(1)
     second_ns = 10**9

@@ -1,9 +1,6 @@
 """MCAP writer: messages in the order of their instants, then the metadata of each session.
 
 Metadata follow the messages because the largest bound of the server's time is known only then.
-
-Messages of equal length are copies of a template, which the format's library encodes; only numbers
-are replaced in them.
 """
 
 from __future__ import annotations
@@ -14,50 +11,30 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from operator import itemgetter
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from devices.errors import UsageError
-from devices.frames import ArrayInfo
 from storage.formats.export import Export
 from storage.formats.writers.format import (
     DrainedBuffer,
     ExportFormat,
     get_instants_on_export_clock_ns,
     make_names_unique,
+    to_floats_with_nan,
 )
-from storage.schema import COLUMNS_BY_NAME, SERVER_TIME_COLUMNS, Array
+from storage.schema import SERVER_TIME_COLUMNS, Array
+
+if TYPE_CHECKING:
+    from storage.formats.writers.mcap_messages import Message, MessageEncoder
 
 DRAWING_INTERVAL_NS = 50_000_000
 """Interval of drawings of the foot: enough for a screen, and drawings are most of the bytes."""
-TILE_RADIUS_M, TILE_HEIGHT_M = 0.008, 0.006
 ARROW_METRES_PER_NEWTON = 0.001
 """Length of the arrow of the GRF."""
 SATURATED_COLOUR_N = 30.0
 """Force at which a tile's colour saturates."""
-
-Message = tuple[int, int, bytes]
-"""Message: instant in ns, number of the channel, content."""
-
-
-class ChannelRegistry(Protocol):
-    """Registry of schemas and channels, as in `mcap.writer.Writer`."""
-
-    def register_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Register a type of message; return its number."""
-
-    def register_channel(
-        self, topic: str, message_encoding: str, schema_id: int, metadata: dict[str, str]
-    ) -> int:
-        """Register a topic; return its number."""
-
-
-class MessageEncoder(Protocol):
-    """Encoder of one session's messages."""
-
-    def encode_messages(self, frames: FrameChunk) -> Iterator[Message]:
-        """Yield the encoded messages of a chunk of frames, in order."""
 
 
 @dataclass(frozen=True)
@@ -87,13 +64,40 @@ class FrameChunk:
         return np.stack(columns, axis=1) if columns else np.empty((len(self.t_ns), 0))
 
 
-def to_floats_with_nan(quantity_name: str, values: Array) -> Array:
-    """Return a column of any type as float64, NaN where unknown."""
-    found = values.astype(np.float64)
-    missing = COLUMNS_BY_NAME[quantity_name].missing_value
-    if missing is not None:
-        found[values == missing] = np.nan
-    return found
+class MessageTemplate:
+    """Template of encoded messages whose numbers are replaced.
+
+    Args:
+        template: one encoded message.
+        fields: numpy type and byte offset of each replaced number, by name.
+    """
+
+    def __init__(self, template: bytes, fields: Mapping[str, tuple[str, int]]) -> None:
+        self._template = np.frombuffer(template, dtype=np.uint8)
+        self._dtype = np.dtype(
+            {
+                "names": list(fields),
+                "formats": [type_ for type_, _ in fields.values()],
+                "offsets": [place for _, place in fields.values()],
+                "itemsize": len(template),
+            }
+        )
+
+    def encode_messages(self, values: Mapping[str, Array]) -> list[bytes]:
+        """Return n encoded messages.
+
+        Args:
+            values: n numbers for each field, by name.
+        """
+        n, size = len(next(iter(values.values()))), len(self._template)
+        content = np.tile(self._template, (n, 1))
+        rows = content.view(self._dtype)[:, 0]
+        for name in self._dtype.names or ():
+            rows[name] = values[name]
+            if rows[name].dtype.kind == "f":  # its sign depends on numpy's version and on n
+                rows[name][np.isnan(rows[name])] = np.nan
+        data = content.tobytes()
+        return [data[begin : begin + size] for begin in range(0, n * size, size)]
 
 
 def _read_frame_chunks(export: Export, columns: list[str]) -> Iterator[FrameChunk]:
@@ -102,13 +106,7 @@ def _read_frame_chunks(export: Export, columns: list[str]) -> Iterator[FrameChun
     Raises:
         UsageError: as for `Export.read_chunks`; the server's time of a frame is unknown.
     """
-    requested = [
-        *columns,
-        "t_ns",
-        *(["part"] if "part" in export.frame_source.quantity_names else []),
-    ]
-    requested += [column.name for column in SERVER_TIME_COLUMNS] if export.clock is not None else []
-    requested += ["marker"] if export.markers is not None else []
+    requested = [*columns, *export.instant_columns, *export.marker_columns]
     last_shown = -1
     for piece in export.read_chunks(requested):
         t_ns = get_instants_on_export_clock_ns(export, piece)
@@ -120,19 +118,6 @@ def _read_frame_chunks(export: Export, columns: list[str]) -> Iterator[FrameChun
         bound_ns = piece.get(SERVER_TIME_COLUMNS[1].name)
         worst_ns = None if bound_ns is None else int(bound_ns.max(initial=0))
         yield FrameChunk(t_ns, piece, shown.tolist(), markers, worst_ns)
-
-
-def compute_tile_colour(force_n: float) -> tuple[float, float, float, float]:
-    """Return the colour of a tile: red, green, blue, opacity; grey for an unknown force."""
-    if np.isnan(force_n):
-        return 0.5, 0.5, 0.5, 0.5
-    share = min(max(force_n / SATURATED_COLOUR_N, 0.0), 1.0)
-    return 0.2 + 0.8 * share, 0.4 + 0.3 * share, 0.9 - 0.8 * share, 1.0
-
-
-def get_foot_frame_id(info: ArrayInfo) -> str:
-    """Return the name of the foot's coordinate frame."""
-    return f"{info.node}_foot"
 
 
 _CHUNK_BYTES = 1 << 20
@@ -147,7 +132,7 @@ def _encode(export: Export) -> Iterator[bytes]:
 def _encode_together(exports: Sequence[Export]) -> Iterator[bytes]:
     from mcap.writer import CompressionType, Writer
 
-    from storage.formats.writers.mcap import foxglove, ros2
+    from storage.formats.writers import mcap_messages
 
     is_ros2 = exports[0].options.messages == "ros2"
     if is_ros2 and exports[0].selection.columns:
@@ -155,19 +140,14 @@ def _encode_together(exports: Sequence[Export]) -> Iterator[bytes]:
             "messages of ROS 2 have fixed fields, and no columns can be selected",
             remedy="Leave columns out, or ask for messages=foxglove",
         )
-    needed = (
-        ros2.list_columns_to_read_for_ros2
-        if is_ros2
-        else foxglove.list_columns_to_read_for_foxglove
-    )
-    pieces = [_read_frame_chunks(export, needed(export)) for export in exports]
+    kind = mcap_messages.Ros2Encoder if is_ros2 else mcap_messages.FoxgloveEncoder
+    pieces = [_read_frame_chunks(export, kind.list_columns_to_read(export)) for export in exports]
     firsts = [next(frames) for frames in pieces]  # errors are raised before the first chunk
     sink = DrainedBuffer()
     writer = Writer(sink, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
     writer.start(profile="ros2" if is_ros2 else "", library=exports[0].array_info.software)
-    kind = ros2.Ros2Encoder if is_ros2 else foxglove.FoxgloveEncoder
     prefixes = make_names_unique(
-        [f"/{ros2.make_ros2_name(export.array_info.node)}" for export in exports]
+        [f"/{mcap_messages.make_ros2_name(export.array_info.node)}" for export in exports]
     )
     sessions = [
         _ExportedSession(prefix, export, kind(writer, export, prefix), chain((first,), frames))
@@ -248,39 +228,3 @@ MCAP = ExportFormat(
     extra="mcap",
     packages=("mcap", "mcap_protobuf", "foxglove_schemas_protobuf", "rosbags"),
 )
-
-
-class MessageTemplate:
-    """Template of encoded messages whose numbers are replaced.
-
-    Args:
-        template: one encoded message.
-        fields: numpy type and byte offset of each replaced number, by name.
-    """
-
-    def __init__(self, template: bytes, fields: Mapping[str, tuple[str, int]]) -> None:
-        self._template = np.frombuffer(template, dtype=np.uint8)
-        self._dtype = np.dtype(
-            {
-                "names": list(fields),
-                "formats": [type_ for type_, _ in fields.values()],
-                "offsets": [place for _, place in fields.values()],
-                "itemsize": len(template),
-            }
-        )
-
-    def encode_messages(self, values: Mapping[str, Array]) -> list[bytes]:
-        """Return n encoded messages.
-
-        Args:
-            values: n numbers for each field, by name.
-        """
-        n, size = len(next(iter(values.values()))), len(self._template)
-        content = np.tile(self._template, (n, 1))
-        rows = content.view(self._dtype)[:, 0]
-        for name in self._dtype.names or ():
-            rows[name] = values[name]
-            if rows[name].dtype.kind == "f":  # its sign depends on numpy's version and on n
-                rows[name][np.isnan(rows[name])] = np.nan
-        data = content.tobytes()
-        return [data[begin : begin + size] for begin in range(0, n * size, size)]

@@ -1,1 +1,0 @@
-"""MCAP writer: a session as messages of Foxglove or of ROS 2."""
