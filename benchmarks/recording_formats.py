@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from recording_data import Recording, batches
 
 from devices.frames import FrameBatch
-from storage.formats.sealed_export import make_sealed_export
+from storage.formats.export import make_sealed_export
 from storage.formats.slice import Slice
 from storage.formats.writers.tables import ARROW
 from storage.journal.journal import Journal

@@ -42,7 +42,7 @@ from service.estimation import OFFLINE_LAG_MS
 from service.offline.estimate.preparation import EstimateRequest
 from service.offline.estimate.session import EstimateResult, estimate_session
 from service.server.server import Server
-from storage.formats.sealed_export import make_sealed_export
+from storage.formats.export import make_sealed_export
 from storage.formats.slice import Slice
 from storage.formats.writers.tables import ARROW
 from storage.parquet_hash import compute_sha256

@@ -30,8 +30,8 @@ from storage.formats.writers.format import ExportFormat
 from storage.parquet_hash import compute_sha256, parse_hashed_table
 from storage.sessions.folder import FRAMES_NAME
 from storage.sessions.metadata import SESSION_NAME
-from storage.verify.export import RECOGNISED_FORMATS as PROVEN
-from storage.verify.export import recognise_export_and_check_not_cut_off
+from storage.verify.sealed_file import RECOGNISED_FORMATS as PROVEN
+from storage.verify.sealed_file import recognise_export_and_check_not_cut_off
 
 if TYPE_CHECKING:
     import httpx

@@ -85,9 +85,6 @@ def _rules(frames: FrameBatch, info: ArrayInfo) -> Iterator[tuple[str, Violation
     )
     yield "servo_age_us is negative", frames.servo_age_us < NO_SERVO_AGE
     yield "tile_flags has undefined bits", (frames.tile_flags & ~np.uint8(_TILE_BITS)) != 0
-    yield (
-        "frame_flags has undefined bits",
-        (frames.frame_flags & ~np.uint8(_FRAME_BITS)) != 0,
-    )
+    yield ("frame_flags has undefined bits", (frames.frame_flags & ~np.uint8(_FRAME_BITS)) != 0)
     force_n = frames.reference_force_n
     yield "reference_force_n is no force", ~np.isnan(force_n) & ~(np.abs(force_n) <= _FORCE_MAX_N)

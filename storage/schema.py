@@ -112,16 +112,8 @@ MEASURED_COLUMNS = (
     _frame_column("sample_offset_us", "us", "sample instant of the tile minus t_ns"),
     _frame_column("servo_counts", "counts", "newest servo position", NO_SERVO_COUNTS),
     _frame_column("servo_age_us", "us", "age of the servo position at t_ns", NO_SERVO_AGE),
-    _frame_column(
-        "tile_flags",
-        "bits",
-        list_bits(TileFlag),
-    ),
-    _frame_column(
-        "frame_flags",
-        "bits",
-        list_bits(FrameFlag),
-    ),
+    _frame_column("tile_flags", "bits", list_bits(TileFlag)),
+    _frame_column("frame_flags", "bits", list_bits(FrameFlag)),
     _frame_column("reference_force_n", "N", "force of the calibration rig's sensor"),
 )
 """Columns that a node measures: `devices.frames.FrameBatch`."""
@@ -147,12 +139,7 @@ ESTIMATE_COLUMNS = (
     Column("cop_ground_y_m", _F32, "m", "centre of pressure, ground frame"),
     Column("angle_rad", _F32, "rad", "angle of the foot segment from the servo"),
     Column("contact", pa.uint8(), "1", "1: the foot bears load", missing_value=CONTACT_UNKNOWN),
-    Column(
-        "estimate_flags",
-        pa.uint16(),
-        "bits",
-        list_bits(EstimateFlag),
-    ),
+    Column("estimate_flags", pa.uint16(), "bits", list_bits(EstimateFlag)),
 )
 """Columns that the estimator computes: `service.estimation.records.Estimates`."""
 
@@ -302,8 +289,7 @@ def read_array_info(schema: pa.Schema, *, where: str) -> ArrayInfo:
         )
     if metadata.get(ARRAY_HASH_KEY, _sha256_hex(text)) != _sha256_hex(text):
         raise DamagedFileError(
-            "its description of the tile array was changed: its checksum is wrong",
-            where=where,
+            "its description of the tile array was changed: its checksum is wrong", where=where
         )
     try:
         return ArrayInfo.model_validate_json(text)

@@ -114,8 +114,7 @@ class Decoder:
             raise FileFormatError(f"frame number {last}", expected="less than 2^53")
         if np.count_nonzero(t_mono_ns[1:] < t_mono_ns[:-1]):
             raise FileFormatError(
-                f"time runs backwards within frames {first} to {last}",
-                expected="t_mono_ns rising",
+                f"time runs backwards within frames {first} to {last}", expected="t_mono_ns rising"
             )
         return batch
 

@@ -44,9 +44,9 @@ from service.offline.compare.report import FIGURES_WITH_LOWER_LIMIT, format_comp
 from service.offline.compare.signals import ForceSignal
 from storage.checksummed_json import write_checksummed_json
 from storage.durable_files import write_atomically
+from storage.formats.markers import place_session_markers
 from storage.formats.readers.parquet import is_sealed_session_file
 from storage.formats.reference import ReferenceData, ReferenceOptions, read_reference
-from storage.formats.sealed_export import place_session_markers
 from storage.formats.slice import Slice
 from storage.schema import UNKNOWN_T_NS, numpy_dtype_of
 from storage.sessions.comparisons import (

@@ -9,9 +9,8 @@ from pathlib import Path
 
 from devices.errors import UsageError
 from storage.durable_files import open_for_atomic_write
-from storage.formats.export import ClockName, Export
-from storage.formats.markers import PlacedMarker
-from storage.formats.sealed_export import make_sealed_export, place_session_markers
+from storage.formats.export import ClockName, Export, make_sealed_export
+from storage.formats.markers import PlacedMarker, place_session_markers
 from storage.formats.slice import NO_OPTIONS, FormatOptions, Slice
 from storage.formats.writers.registry import get_format, get_multi_session_format
 from storage.sessions.metadata import MARKERS_NAME, read_existing_markers

@@ -1,4 +1,4 @@
-"""Readers and writers of other formats, one module each.
+"""Readers and writers of other formats.
 
 Exports use `storage.sessions`, `storage.clock` and `storage.schema`; load traces use
 `devices.emulation`. No module reads a journal.

@@ -18,7 +18,7 @@ import pyarrow as pa
 
 from devices.arrays import Times
 from devices.errors import UsageError
-from devices.frames import ArrayInfo, FrameBatch
+from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
 from storage.clock.table import ClockTable
 from storage.formats.markers import PlacedMarkers
 from storage.formats.slice import NO_OPTIONS, FormatOptions, Slice
@@ -33,6 +33,8 @@ from storage.schema import (
     to_flat_column,
 )
 from storage.sessions.footer import NOTES_KEY
+from storage.sessions.metadata import load_clock_table
+from storage.sessions.reader import SealedFileReader
 from storage.sessions.time_axis import NODE_AXIS, TIME_AXIS_NOTE, TimeAxis
 from storage.sessions.writer import EXPORT_KEY
 
@@ -55,28 +57,6 @@ _SERVER_TIME_BASE = (
     "The server's clock (t_server_ns), UTC since 1970, within t_server_uncertainty_ns; the node's "
     "own is t_ns."
 )
-
-
-def _describe_completeness_and_axes(
-    notes: Mapping[str, object], provenance: Mapping[str, object], *, has_server_time: bool
-) -> dict[str, object]:
-    """Return completeness, losses, time base and axes of an export of unmodified frames, as JSON.
-
-    Args:
-        notes: notes of the session, with its ledger if it is sealed.
-        provenance: session and hashes; has `state` if the session is not sealed.
-        has_server_time: True if the export has the server's time.
-    """
-    complete, lost = read_completeness_and_losses(notes, provenance)
-    return {
-        "complete": complete,
-        "lost": lost,
-        "time_base": _SERVER_TIME_BASE if has_server_time else _NODE_TIME_BASE,
-        "axes": AXES_TEXT,
-        "resampled": "nothing",
-        "filled": "nothing",
-        "masked": MASKED_TEXT,
-    }
 
 
 def read_completeness_and_losses(
@@ -197,20 +177,24 @@ class Export:
 
         A format that resamples or fills replaces the facts concerned.
         """
-        part = self.selection
-        chosen: dict[str, object] = {
+        part, axis = self.selection, self.frame_source.axis
+        complete, lost = read_completeness_and_losses(self.notes, self.provenance)
+        return {
+            **self.provenance,
+            "node": self.array_info.node,
             "start_s": part.start_s,
             "end_s": part.end_s,
             "columns": list(part.columns),
+            "clock": "node" if self.clock is None else "server",
+            **({TIME_AXIS_NOTE: axis.to_json_list()} if axis.is_shifted else {}),
+            "complete": complete,
+            "lost": lost,
+            "time_base": _NODE_TIME_BASE if self.clock is None else _SERVER_TIME_BASE,
+            "axes": AXES_TEXT,
+            "resampled": "nothing",
+            "filled": "nothing",
+            "masked": MASKED_TEXT,
         }
-        chosen["clock"] = "node" if self.clock is None else "server"
-        if self.frame_source.axis.is_shifted:
-            chosen[TIME_AXIS_NOTE] = self.frame_source.axis.to_json_list()
-        has_server_time = self.clock is not None
-        facts = _describe_completeness_and_axes(
-            self.notes, self.provenance, has_server_time=has_server_time
-        )
-        return {**self.provenance, "node": self.array_info.node, **chosen, **facts}
 
     @property
     def notes_with_clock_and_markers(self) -> dict[str, object]:
@@ -388,12 +372,49 @@ class Export:
         return [*self._server_time_columns, *self.marker_columns]
 
 
-def _flatten_frames(frames: FrameBatch, extra: Mapping[str, Array]) -> dict[str, Array]:
-    values = {column.name: getattr(frames, column.name) for column in MEASURED_COLUMNS} | dict(
-        extra
+def make_sealed_export(
+    reader: SealedFileReader,
+    selection: Slice,
+    *,
+    clock: ClockName = "node",
+    markers: PlacedMarkers | None = None,
+    options: FormatOptions = NO_OPTIONS,
+) -> Export:
+    """Return the export of a sealed file, which reads only the data that the slice needs.
+
+    Raises:
+        UsageError: the server's time is requested, and the clock table is missing.
+        FileFormatError: the file or its clock table is damaged.
+    """
+    extra = [
+        name for name in COLUMNS_BY_NAME if name not in FRAME_COLUMNS and reader.has_columns(name)
+    ]
+    table = load_clock_table(reader) if clock == "server" else None
+    begin_t_ns, end_t_ns = reader.read_span_on_axis_ns()
+    bounds_ns = selection.compute_bounds_ns(begin_t_ns)
+    names = [*(column.name for column in MEASURED_COLUMNS), *extra]
+    return Export(
+        FrameSource(
+            names,
+            lambda flat: reader.read_overlapping_row_groups(flat, *bounds_ns),
+            begin_t_ns,
+            end_t_ns,
+            reader.time_axis,
+        ),
+        reader.info,
+        reader.notes,
+        selection,
+        table,
+        markers,
+        reader.session_id_and_hashes,
+        options,
     )
+
+
+def _flatten_frames(frames: FrameBatch, extra: Mapping[str, Array]) -> dict[str, Array]:
+    measured = {column.name: getattr(frames, column.name) for column in MEASURED_COLUMNS}
     flat: dict[str, Array] = {}
-    for name, value in values.items():
+    for name, value in {**measured, **extra}.items():
         parts = value.T if COLUMNS_BY_NAME[name].per_tile else value[None]
         flat |= zip(COLUMNS_BY_NAME[name].flat_names(len(parts)), parts, strict=True)
     return flat

@@ -36,9 +36,7 @@ from storage.formats.reference import ReferenceOptions, table_to_reference
 from storage.schema import read_array_info
 from storage.sessions.time_axis import NODE_AXIS, TimeAxis
 
-_SESSION_COLUMN_PATTERN = re.compile(
-    r"t_ns|part|(true_)?(force_n_\d+|grf_n|cop_[xy]_m|angle_rad)",
-)
+_SESSION_COLUMN_PATTERN = re.compile(r"t_ns|part|(true_)?(force_n_\d+|grf_n|cop_[xy]_m|angle_rad)")
 """Pattern of the needed columns."""
 
 _TOTAL_FORCE_COLUMNS = ("grf_n", "cop_x_m", "cop_y_m")

@@ -13,10 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from devices.errors import FileFormatError, UsageError
 from storage.clock.table import ClockTable
 from storage.formats.slice import Slice
 from storage.schema import UNKNOWN_T_NS, Array
 from storage.sessions.folder import Marker
+from storage.sessions.metadata import load_clock_table
+from storage.sessions.reader import SealedFileReader
 from storage.sessions.time_axis import NODE_AXIS, TimeAxis
 
 DISTANCE_MAX_NS = 1_000_000_000
@@ -199,3 +202,71 @@ def _distance_ns(a_ns: Array, b_ns: Array) -> Array:
     """Return distances of int64 instants as uint64: an int64 might overflow."""
     a, b = a_ns.astype(np.uint64), b_ns.astype(np.uint64)
     return np.where(a_ns > b_ns, a - b, b - a)
+
+
+_SEARCH_DISTANCE_NS = DISTANCE_MAX_NS + 1_000_000
+"""Search distance with a margin: float64 sums of instants do not wrap, but are off by 2 us."""
+
+
+def place_session_markers(
+    reader: SealedFileReader, markers: Sequence[Marker], selection: Slice
+) -> PlacedMarkers:
+    """Place markers at frames of a sealed file; at none if its clock table is missing or damaged.
+
+    Raises:
+        FileFormatError: the file is damaged.
+    """
+    if not markers:
+        return PlacedMarkers(())
+    try:
+        clock = load_clock_table(reader)
+    except (UsageError, FileFormatError) as error:  # export the frames without markers
+        return PlacedMarkers(
+            [PlacedMarker(event, exclusion_reason=error.what) for event in markers]
+        )
+    names = (*PLACEMENT_COLUMNS, "part") if reader.has_columns("part") else PLACEMENT_COLUMNS
+    pieces = reader.read_quantities(
+        *names, row_groups=_row_groups_near_markers(reader, clock, markers)
+    )
+    return place_markers(
+        markers, pieces, clock, selection, reader.read_span_on_axis_ns()[0], reader.time_axis
+    )
+
+
+def _row_groups_near_markers(
+    reader: SealedFileReader, clock: ClockTable, markers: Sequence[Marker]
+) -> list[int]:
+    """Return the row groups that may have a marker's frame, by the times in the footer.
+
+    At least one row group with a compared clock is included, if there is one: a marker without a
+    frame is reported differently if no frame has the server's time.
+    """
+    names = (
+        (*PLACEMENT_COLUMNS[1:], "part") if reader.has_columns("part") else PLACEMENT_COLUMNS[1:]
+    )
+    extremes = zip(*(reader.read_min_max_by_row_group(name) for name in names), strict=True)
+    near: set[int] = set()
+    compared: list[int] = []
+    by_part: dict[int, list[tuple[int, ...]]] = {}
+    for group, (t_mono_ns, t_ns, *part) in enumerate(extremes):
+        of_part = part[0] if part else (0, 0)
+        if t_mono_ns is None or t_ns is None or of_part is None or of_part[0] != of_part[1]:
+            near.add(group)
+        else:
+            by_part.setdefault(of_part[0], []).append((group, *t_mono_ns, *t_ns))
+    marks_ns = np.sort(np.array([event.t_ns for event in markers], dtype=np.float64))
+    for number, rows in by_part.items():
+        groups, begins, ends, earliest, latest = np.array(rows, dtype=np.int64).T
+        reach = clock.bound_offset_in_ranges(begins, ends, number)
+        if reach is None:
+            continue
+        compared += groups.tolist()
+        least, greatest, sure = reach
+        first = np.searchsorted(marks_ns, earliest.astype(np.float64) + least - _SEARCH_DISTANCE_NS)
+        behind = np.searchsorted(
+            marks_ns, latest.astype(np.float64) + greatest + _SEARCH_DISTANCE_NS
+        )
+        near.update(groups[~sure | (first < behind)].tolist())
+    if near.isdisjoint(compared):
+        near.update(sorted(compared)[:1])
+    return sorted(near)

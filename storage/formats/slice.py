@@ -98,8 +98,7 @@ class FormatOptions(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     names: Literal["number", "serial"] | None = Field(
-        default=None,
-        description="Suffix of a tile's columns: its number, from 0, or its serial.",
+        default=None, description="Suffix of a tile's columns: its number, from 0, or its serial."
     )
     times: bool | None = Field(
         default=None,
@@ -112,8 +111,7 @@ class FormatOptions(BaseModel):
         "Default: included unless columns are chosen.",
     )
     decimal: Literal["point", "comma"] | None = Field(
-        default=None,
-        description="Decimal sign of CSV. With a comma, semicolons separate columns.",
+        default=None, description="Decimal sign of CSV. With a comma, semicolons separate columns."
     )
     body: str | None = Field(
         default=None,

@@ -18,12 +18,7 @@ from typing import Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from devices.errors import (
-    FileFormatError,
-    FootTileError,
-    StorageError,
-    UnknownError,
-)
+from devices.errors import FileFormatError, FootTileError, StorageError, UnknownError
 from storage.checksummed_json import read_checksummed_json, write_checksummed_json
 from storage.clock.log import ClockOffset
 from storage.durable_files import (

@@ -257,11 +257,7 @@ class OverviewReader:
         self._source.close()
 
     def estimate_bin_count(
-        self,
-        level: int,
-        begin_ns: int | None,
-        end_ns: int | None,
-        axis: TimeAxis = NODE_AXIS,
+        self, level: int, begin_ns: int | None, end_ns: int | None, axis: TimeAxis = NODE_AXIS
     ) -> int:
         """Return about how many bins of a level are in a time range: those of its pieces."""
         return sum(
@@ -269,11 +265,7 @@ class OverviewReader:
         )
 
     def read_bins(
-        self,
-        level: int,
-        begin_ns: int | None,
-        end_ns: int | None,
-        axis: TimeAxis = NODE_AXIS,
+        self, level: int, begin_ns: int | None, end_ns: int | None, axis: TimeAxis = NODE_AXIS
     ) -> Bins:
         """Read the bins of a level with frames in a time range, instants on the time axis.
 

@@ -26,18 +26,8 @@ import pyarrow.parquet as pq
 from devices.errors import FileFormatError
 from devices.frames import ArrayInfo, FrameBatch
 from storage.durable_files import make_temporary_path, sync_folder, translate_storage_errors
-from storage.parquet_hash import (
-    FORMAT,
-    FORMAT_KEY,
-    fill_hash_placeholders_and_sync,
-)
-from storage.schema import (
-    ARRAY_INFO_KEY,
-    COLUMNS_BY_NAME,
-    MEASURED_COLUMNS,
-    Array,
-    to_flat_columns,
-)
+from storage.parquet_hash import FORMAT, FORMAT_KEY, fill_hash_placeholders_and_sync
+from storage.schema import ARRAY_INFO_KEY, COLUMNS_BY_NAME, MEASURED_COLUMNS, Array, to_flat_columns
 from storage.sessions.footer import NOTES_KEY, ContentDigest
 
 EXPORT_KEY = b"foottile.export"

@@ -25,84 +25,9 @@ from storage.journal.stream_notes import NOTES_FILE
 from storage.server_id import SERVER_ID_NAME, read_existing_server_id
 from storage.sessions.folder import FRAMES_NAME, SESSION_ID, Ledger, SessionsFolder
 from storage.sessions.metadata import SESSION_NAME
-from storage.verify.export import ExportReport, recognise_export_and_check_not_cut_off
-from storage.verify.journal import StreamReport, verify_journal
-from storage.verify.segment import SegmentReport, verify_segment
+from storage.verify.journal import SegmentReport, StreamReport, verify_journal, verify_segment
+from storage.verify.sealed_file import ExportReport, recognise_export_and_check_not_cut_off
 from storage.verify.session import SessionReport, verify_lone_sealed_file, verify_session
-
-
-@dataclass
-class OtherFilesReport:
-    """Findings, each with its path in the data folder.
-
-    Attributes:
-        problems: messages of damage.
-        set_aside: files that were found damaged before, and wait for a person.
-    """
-
-    problems: list[str] = field(default_factory=list)
-    set_aside: list[str] = field(default_factory=list)
-
-
-def _verify_json_and_server_id(data_folder: Path, verified_folders: set[Path]) -> OtherFilesReport:
-    """Verify `server_id` and every JSON file of a data folder, except in folders done elsewhere.
-
-    Token, locks and other files have no checksum.
-
-    Args:
-        data_folder: the data folder.
-        verified_folders: folders of streams and sessions; of them only set-aside files are listed.
-    """
-    found = OtherFilesReport()
-
-    def unreadable(error: OSError) -> None:
-        found.problems.append(
-            f"{_relative_path(error.filename, data_folder)}: cannot be read: {error.strerror}"
-        )
-
-    for place, folders, files in os.walk(data_folder, onerror=unreadable):
-        here = Path(place)
-        folders.sort()
-        is_verified = here in verified_folders
-        for name in sorted([*folders, *files]):
-            path = here / name
-            if ASIDE_SUFFIX in name:
-                found.set_aside.append(_relative_path(path, data_folder))
-            elif path == data_folder / SERVER_ID_NAME:
-                _verify_with(path, name, read_existing_server_id, found)
-            elif name.endswith(".json") and not name.startswith(".") and not is_verified:
-                _verify_checksummed_json(path, _relative_path(path, data_folder), found)
-        # A folder that was set aside, or that has the name of a file, is skipped.
-        folders[:] = [
-            name for name in folders if ASIDE_SUFFIX not in name and not name.endswith(".json")
-        ]
-        if is_verified:
-            folders.clear()
-    return found
-
-
-def _verify_checksummed_json(path: Path, name: str, report: OtherFilesReport) -> None:
-    """Verify one JSON file, and add any finding under `name`."""
-    _verify_with(path, name, read_checksummed_json, report)
-
-
-def _verify_with(
-    path: Path,
-    name: str,
-    read: Callable[[Path], object],
-    found: OtherFilesReport,
-) -> None:
-    try:
-        read(path)
-    except FileNotFoundError:
-        return  # replaced or deleted meanwhile
-    except (DamagedFileError, StorageError) as error:
-        found.problems.append(f"{name}: {error.what}")
-
-
-def _relative_path(path: Path | str, data: Path) -> str:
-    return os.path.relpath(path, data)
-
 
 Verdict = Literal["complete", "unproven", "lossy", "pending", "damaged", "export"]
 
@@ -129,27 +54,18 @@ class DataFolderReport:
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the report for JSON (docs/formats.md)."""
-        sessions, streams = self.sessions, self.streams
-        everything = [
-            *self.problems,
-            *(
-                f"session {s.id or s.path.name}: {message}"
-                for s in sessions
-                for message in s.problems
-            ),
-            *(
-                f"journal {j.node}/{j.stream_id}: {message}"
-                for j in streams
-                for message in j.problems
-            ),
-        ]
-        unproven = [
-            f"session {s.id or s.path.name}: {message}" for s in sessions for message in s.unproven
-        ]
+        problems, unproven = [*self.problems], []
+        for session in self.sessions:
+            name = f"session {session.id or session.path.name}"
+            problems += [f"{name}: {message}" for message in session.problems]
+            unproven += [f"{name}: {message}" for message in session.unproven]
+        for stream in self.streams:
+            name = f"journal {stream.node}/{stream.stream_id}"
+            problems += [f"{name}: {message}" for message in stream.problems]
         return {
-            "sessions": [session.to_json_dict() for session in sessions],
-            "journals": [stream.to_json_dict() for stream in streams],
-            "problems": everything,
+            "sessions": [session.to_json_dict() for session in self.sessions],
+            "journals": [stream.to_json_dict() for stream in self.streams],
+            "problems": problems,
             "unproven": unproven,
             "set_aside": self.set_aside,
         }
@@ -177,9 +93,9 @@ def verify_path(path: Path, *, data_folder: Path | None = None) -> Report:
         if path.name == NOTES_FILE:
             return verify_journal(path.absolute().parent)
         if path.suffix == ".json":
-            others = OtherFilesReport()
-            _verify_checksummed_json(path, path.name, others)
-            return DataFolderReport(path, problems=others.problems)
+            report = DataFolderReport(path)
+            _verify_with(read_checksummed_json, path, path.name, report)
+            return report
         return recognise_export_and_check_not_cut_off(path) or verify_lone_sealed_file(path)
     if not path.exists():
         raise FileFormatError("no such file or folder", where=str(path))
@@ -233,10 +149,58 @@ def verify_data_folder(path: Path) -> DataFolderReport:
                 )
                 session.problems.append(f"{place}/{stray.name}: {stray.error.what}")
                 report.sessions.append(session)
-    others = _verify_json_and_server_id(data, proven)
-    report.problems += others.problems
-    report.set_aside = others.set_aside
+    _verify_json_and_server_id(data, proven, report)
     return report
+
+
+def _verify_json_and_server_id(
+    data_folder: Path, verified_folders: set[Path], report: DataFolderReport
+) -> None:
+    """Verify `server_id` and every JSON file of a data folder, except in folders done elsewhere.
+
+    Token, locks and other files have no checksum.
+
+    Args:
+        data_folder: the data folder.
+        verified_folders: folders of streams and sessions; of them only set-aside files are listed.
+        report: findings are added here.
+    """
+
+    def unreadable(error: OSError) -> None:
+        name = os.path.relpath(error.filename, data_folder)
+        report.problems.append(f"{name}: cannot be read: {error.strerror}")
+
+    for place, folders, files in os.walk(data_folder, onerror=unreadable):
+        here = Path(place)
+        folders.sort()
+        is_verified = here in verified_folders
+        for name in sorted([*folders, *files]):
+            path = here / name
+            if ASIDE_SUFFIX in name:
+                report.set_aside.append(os.path.relpath(path, data_folder))
+            elif path == data_folder / SERVER_ID_NAME:
+                _verify_with(read_existing_server_id, path, name, report)
+            elif name.endswith(".json") and not name.startswith(".") and not is_verified:
+                relative = os.path.relpath(path, data_folder)
+                _verify_with(read_checksummed_json, path, relative, report)
+        # A folder that was set aside, or that has the name of a file, is skipped.
+        folders[:] = [
+            name for name in folders if ASIDE_SUFFIX not in name and not name.endswith(".json")
+        ]
+        if is_verified:
+            folders.clear()
+
+
+def _verify_with(
+    read: Callable[[Path], object], path: Path, name: str, report: DataFolderReport
+) -> None:
+    """Read a file, and add any damage to the report, under `name`."""
+    try:
+        read(path)
+    except FileNotFoundError:
+        return  # replaced or deleted meanwhile
+    except (DamagedFileError, StorageError) as error:
+        report.problems.append(f"{name}: {error.what}")
 
 
 def _find_folders(

@@ -77,13 +77,10 @@ class SessionReport:
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return ledger and findings for JSON (docs/formats.md)."""
-        empty = Ledger(complete=False, lossy=False, parts=(), missed_slots=0)
-        ledger = self.ledger or empty
-        if self.problems:
-            ledger = ledger.model_copy(update={"complete": False})
-        content = ledger.model_dump(mode="json")
+        ledger = self.ledger or Ledger(complete=False, lossy=False, parts=(), missed_slots=0)
         return {
-            **content,
+            **ledger.model_dump(mode="json"),
+            "complete": ledger.complete and not self.problems,
             "id": self.id,
             "problems": self.problems,
             "sha256": self.sha256,
@@ -152,10 +149,8 @@ def _verify_once(
             _verify_frames(report, folder)
         return report
     report.id, report.name = str(metadata.content["id"]), str(metadata.content.get("name", ""))
-    report.node, report.state = (
-        str(metadata.content.get("node", "")),
-        str(metadata.content.get("state")),
-    )
+    report.node = str(metadata.content.get("node", ""))
+    report.state = str(metadata.content.get("state"))
     report.ledger = metadata.ledger
     if report.state == "sealed":
         _check_sealed(report, folder, metadata)
@@ -192,8 +187,9 @@ def _check_sealed(report: SessionReport, folder: Path, metadata: StoredMetadata)
     session = metadata.session
     _check_events(report, folder / MARKERS_NAME, session.markers if session is not None else None)
     _check_clock(report, folder / CLOCK_NAME, session)
-    _check_stances(report, folder / STANCES_NAME)
-    _check_overview(report, folder / OVERVIEW_NAME)
+    stances, overview = folder / STANCES_NAME, folder / OVERVIEW_NAME
+    _check_derived_file(report, stances, lambda path: read_stances(path).frames_sha256)
+    _check_derived_file(report, overview, _read_overview_frames_sha256)
 
 
 def _compare_metadata(
@@ -268,39 +264,34 @@ def _check_clock(report: SessionReport, path: Path, session: Session | None) -> 
         report.problems.append(f"{path.name} has other rows than {SESSION_NAME}")
 
 
-def _check_stances(report: SessionReport, path: Path) -> None:
-    """Verify the table of stances; a missing one is made again from the frames."""
+def _check_derived_file(
+    report: SessionReport, path: Path, read_frames_sha256: Callable[[Path], str]
+) -> None:
+    """Verify a file that is made again from the frames if it is missing.
+
+    Args:
+        report: findings are added here.
+        path: the file.
+        read_frames_sha256: reads all of it; returns the hash of the frames it was made from.
+    """
     try:
-        stored = read_stances(path)
+        frames_sha256 = read_frames_sha256(path)
     except FileNotFoundError:
         return
     except OtherVersionError as error:
         report.unproven.append(f"{path.name}: {error.what}; it is made again")
-        return
     except (FileFormatError, StorageError) as error:
         report.problems.append(f"{path.name}: {error.what}; deleted, it is made again")
-        return
-    if stored.frames_sha256 != report.sha256:
-        report.unproven.append(f"{path.name}: it is of other frames, and nobody reads it")
+    else:
+        if frames_sha256 != report.sha256:
+            report.unproven.append(f"{path.name}: it is of other frames, and nobody reads it")
 
 
-def _check_overview(report: SessionReport, path: Path) -> None:
-    """Verify every piece of the overview; a missing one is made again from the frames."""
-    try:
-        with open_overview(path) as overview:
-            for level in range(overview.index.level_count):
-                overview.read_bins(level, None, None)
-            frames_sha256 = overview.index.frames_sha256
-    except FileNotFoundError:
-        return
-    except OtherVersionError as error:
-        report.unproven.append(f"{path.name}: {error.what}; it is made again")
-        return
-    except (FileFormatError, StorageError) as error:
-        report.problems.append(f"{path.name}: {error.what}; deleted, it is made again")
-        return
-    if frames_sha256 != report.sha256:
-        report.unproven.append(f"{path.name}: it is of other frames, and nobody reads it")
+def _read_overview_frames_sha256(path: Path) -> str:
+    with open_overview(path) as overview:
+        for level in range(overview.index.level_count):
+            overview.read_bins(level, None, None)
+        return overview.index.frames_sha256
 
 
 def _read_sidecar(

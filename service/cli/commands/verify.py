@@ -28,8 +28,8 @@ from service.cli.options import (
 if TYPE_CHECKING:
     from storage.sessions.folder import Ledger
     from storage.verify.data_folder import Report, Verdict
-    from storage.verify.export import ExportReport
     from storage.verify.journal import StreamReport
+    from storage.verify.sealed_file import ExportReport
     from storage.verify.session import SessionReport
 
 _EXIT_CODES = {"complete": 0, "lossy": 3, "pending": 3, "damaged": 1, "unproven": 4, "export": 4}
@@ -146,8 +146,8 @@ def _find_path(target: str, data: Path | None) -> Path:
 
 def _print_report(report: Report, *, is_part: bool = False) -> None:
     from storage.verify.data_folder import DataFolderReport
-    from storage.verify.export import ExportReport
-    from storage.verify.segment import SegmentReport
+    from storage.verify.journal import SegmentReport
+    from storage.verify.sealed_file import ExportReport
     from storage.verify.session import SessionReport
 
     remarks: list[str] = []

@@ -1,1 +1,1 @@
-"""Readers of force tables of other programs: one module a format, one registry of all."""
+"""Readers of force tables of other programs: a module for each kind, one registry of all."""

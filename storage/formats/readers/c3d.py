@@ -412,7 +412,8 @@ def _read_plate(file: C3dFile, i: int, values_max: int) -> PlateSignals:
                 f"states, but in the unit of its corners, {length}: else they were off the plate"
             )
         if kind == 3:
-            local, note = _correct_bending(file, i, local, length)
+            polynomial = _plate_parameter(file, "FPCOPPOLY", i, (_POLYNOMIAL_COEFFICIENTS,))
+            local, note = correct_cop_for_bending(local, polynomial, length)
             notes.append(note)
         peak = np.max(np.abs(fz), initial=0.0, where=np.isfinite(fz))
         if force != "N" or peak >= CHECKED_PEAK_FORCE_N:
@@ -450,18 +451,6 @@ def _mask_unrecorded_samples(file: C3dFile, at: list[int], channels: Floats) -> 
     if filled.any() and np.abs(file.get_channel_offsets()[at]).max() >= UNSIGNED_OFFSET_MIN:
         channels[:, filled] = np.nan
         yield f"{int(filled.sum())} of its samples are stored as zeros and were not recorded"
-
-
-def _correct_bending(
-    file: C3dFile, i: int, local: Floats, length: str | None
-) -> tuple[Floats, str]:
-    """Correct the centre of pressure by the plate's polynomial, if any; return a note as well."""
-    polynomial = _plate_parameter(file, "FPCOPPOLY", i, (_POLYNOMIAL_COEFFICIENTS,))
-    if polynomial is None or not polynomial.any():
-        return local, ""
-    if length != "mm":
-        return local, "FPCOPPOLY is not applied: its positions are not in mm"
-    return correct_cop_for_bending(local, polynomial), "COP is corrected for bending (FPCOPPOLY)"
 
 
 def _common_unit(units: set[str | None]) -> str | None:

@@ -103,20 +103,27 @@ def compute_cop_from_moments(fz: Floats, mx: Floats, my: Floats) -> Floats:
     return cop
 
 
-def correct_cop_for_bending(cop_mm: Floats, polynomial: Floats) -> Floats:
-    """Return the centre of pressure in mm, corrected for bending of a plate with four sensors.
+def correct_cop_for_bending(
+    cop: Floats, polynomial: Floats | None, unit: str | None
+) -> tuple[Floats, str]:
+    """Correct a centre of pressure for bending of a plate with four sensors; return a note as well.
 
     Args:
-        cop_mm: (2, n), centre of pressure from the middle, in mm.
-        polynomial: (12,), Kistler's six coefficients for x, then for y (FPCOPPOLY).
+        cop: (2, n), centre of pressure from the middle; it stays as it is unless in mm.
+        polynomial: (12,), Kistler's six coefficients for x, then for y (FPCOPPOLY), if any.
+        unit: unit of the centre of pressure.
     """
-    x, y = cop_mm
+    if polynomial is None or not polynomial.any():
+        return cop, ""
+    if unit != "mm":
+        return cop, "FPCOPPOLY is not applied: its positions are not in mm"
+    x, y = cop
     with np.errstate(over="ignore", invalid="ignore"):
         added = [
             (p[0] * v**4 + p[1] * v**2 + p[2]) * u**3 + (p[3] * v**4 + p[4] * v**2 + p[5]) * u
             for u, v, p in ((x, y, polynomial[:6]), (y, x, polynomial[6:]))
         ]
-        return np.asarray(cop_mm - np.stack(added))
+    return cop - np.stack(added), "COP is corrected for bending (FPCOPPOLY)"
 
 
 def _compute_loaded_eccentricity(cop: Floats, fz: Floats, half_size: Floats) -> Floats:

@@ -98,12 +98,7 @@ def read_sealed_session_table(path: Path, optional_names: Collection[str]) -> Fo
         if (unit := STANDARD_UNITS.get(name) or COLUMNS_BY_NAME[name].unit)
     }
     return ForceTable(
-        tuple(single),
-        columns,
-        units,
-        frozenset(columns),
-        epoch_ns=int(t_ns[0]),
-        where=str(path),
+        tuple(single), columns, units, frozenset(columns), epoch_ns=int(t_ns[0]), where=str(path)
     )
 
 

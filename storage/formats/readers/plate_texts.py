@@ -1,4 +1,4 @@
-"""Readers of texts of force plates: Kistler BioWare, Vicon Nexus and AMTI NetForce.
+"""Readers of texts of force plates: Kistler BioWare, Vicon Nexus, AMTI NetForce, and OpenSim.
 
 BioWare: lines of facts, a line of names that begins with a time, lines of numbers. The line
 `Device:` has the device of each column. Forces act on the plate and are positive under load. `Ax`
@@ -12,6 +12,10 @@ load, as in C3D.
 
 NetForce: six numbers a line and plate, separated by commas, no head: Fx, Fy, Fz, Mx, My and Mz. The
 file states neither times nor units, nor the height of the surface above the origin of the moments.
+
+OpenSim's `.mot` and `.sto`: a header ends with the line `endheader`; a line of names and lines of
+numbers follow. Times are in s, forces in N, positions in m, and y points up. Cells of three numbers
+(`DataType=Vec3`) become three columns: `ground_force_v` becomes `ground_force_vx` and so on.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, pairwise
+from pathlib import Path
 
 import numpy as np
 
@@ -31,12 +36,16 @@ from storage.formats.readers.table import (
     ForceTable,
     PlateSignals,
     make_table_of_separate_plates,
+    make_table_with_lowercase_standard_names,
+    select_needed_names_or_empty,
 )
 from storage.formats.readers.text import (
+    BLANKS,
     TextLayout,
     is_number,
     parse_columns,
     parse_text_table,
+    read_decoded_text,
     split_csv_cells,
     split_trimmed_cells_without_empty_end,
 )
@@ -53,6 +62,13 @@ _NEXUS_COMBINED = "combined"
 _NETFORCE_CHANNELS = 6
 _NETFORCE_LINES = 20
 """Number of lines by which NetForce's format is recognised."""
+OPENSIM_FORM = "a header to the line endheader, a line of names, lines of numbers"
+_OPENSIM_END = re.compile(r"^[ \t]*endheader[ \t]*$", re.IGNORECASE | re.MULTILINE)
+_OPENSIM_VECTOR = re.compile(r"[^,]*,[^,]*,[^,]*")
+_OPENSIM_UNITS = (
+    (re.compile(r"_v[xyz]?(_\d+)?$"), "N"),
+    (re.compile(r"_p[xyz]?(_\d+)?$"), "m"),
+)
 _SECONDS = {"": 1.0, "s": 1.0, "ms": 1e-3}
 _FORCE_UNITS = {"n": "N", "kn": "kN"}
 _LENGTH_UNITS = frozenset(("m", "cm", "mm"))
@@ -274,6 +290,65 @@ def _make_netforce_plate(number: int, channels: list[Floats]) -> PlateSignals:
         "is above it the file does not state"
     )
     return PlateSignals(f"plate{number}", fz, cop, None, None, notes=(note,))
+
+
+def read_opensim_table(path: Path, is_needed: ColumnFilter, values_max: int) -> ForceTable:
+    """Read time and the needed columns of a `.mot` or `.sto` file.
+
+    Raises:
+        FileFormatError: unreadable, header or names are missing, or numbers do not fit the names.
+    """
+    text = read_decoded_text(path)
+    end = _OPENSIM_END.search(text)
+    if end is None:
+        raise FileFormatError("there is no line endheader")
+    head, _, rows = text[end.end() :].lstrip().partition("\n")
+    rows = rows.strip("\n")
+    line = rows.partition("\n")[0]
+    delimiter = "\t" if "\t" in head and "\t" in line else BLANKS
+    names, first = (
+        split_trimmed_cells_without_empty_end(head, delimiter),
+        split_trimmed_cells_without_empty_end(line, delimiter),
+    )
+    if len(first) > 1 and all(map(_OPENSIM_VECTOR.fullmatch, first[1:])):
+        rows = rows.replace(",", delimiter)
+        first = split_trimmed_cells_without_empty_end(rows.partition("\n")[0], delimiter)
+        vectors = (name if name.endswith(("_v", "_p", "_m")) else f"{name}_" for name in names[1:])
+        names = [*names[:1], *(f"{name}{axis}" for name in vectors for axis in "xyz")]
+    if len(names) < 2 or (first and len(first) != len(names)):
+        raise FileFormatError(f"there are {len(names)} names for {len(first)} columns of numbers")
+    times = {name for name in names if name.lower() == "time"}
+    alone = _single_force_columns(names)
+    wanted = set(alone.values()) if is_needed("grf_n") and "grf_n" not in names else set()
+    needed = select_needed_names_or_empty(
+        names, lambda name: name in wanted | times or is_needed(name)
+    )
+    width = line.count("\t") + 1 if delimiter == "\t" else 0
+    padded = (*names, *[""] * (width - len(names)))
+    columns = parse_columns(rows, TextLayout(padded, delimiter, 0, {}), needed, values_max)
+    for ours, name in alone.items():
+        if name in wanted:  # OpenSim's z points right, the foot's y points left
+            columns[ours] = -columns[name] if ours == "cop_y_m" else columns[name]
+    for name in times:
+        columns["time_s"] = columns[name]
+    units = {name: unit for name in names for ending, unit in _OPENSIM_UNITS if ending.search(name)}
+    table = make_table_with_lowercase_standard_names(
+        names, columns, units=units | dict.fromkeys(times, "s"), expected_form=OPENSIM_FORM
+    )
+    forces = {name for name, unit in units.items() if unit == "N"}
+    return replace(table, positive_forces=table.positive_forces | forces)
+
+
+def _single_force_columns(names: Sequence[str]) -> dict[str, str]:
+    """Return the columns of a file's only force by standard name; empty for several forces."""
+    forces = [name for name in names if name.endswith("_vy")]
+    if len(forces) != 1:
+        return {}
+    stem = forces[0].removesuffix("_vy")
+    found = {"grf_n": forces[0]}
+    if {f"{stem}_px", f"{stem}_pz"} <= set(names):
+        found |= {"cop_x_m": f"{stem}_px", "cop_y_m": f"{stem}_pz"}
+    return found
 
 
 @dataclass(frozen=True)

@@ -101,8 +101,7 @@ def _read_arrays(path: Path, bytes_max: int) -> dict[str, Floats]:
             size = sum(member.file_size for member in archive.infolist())
         if size > bytes_max:
             raise FileFormatError(
-                f"{size} bytes are too many for memory",
-                expected=f"up to {bytes_max}",
+                f"{size} bytes are too many for memory", expected=f"up to {bytes_max}"
             )
         with np.load(path, allow_pickle=False) as file:
             return {name: np.asarray(file[name], dtype=np.float64) for name in file.files}

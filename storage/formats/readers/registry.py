@@ -10,16 +10,7 @@ from pathlib import Path
 import pyarrow as pa
 
 from devices.errors import FileFormatError, FootTileError, UsageError
-from storage.formats.readers import (
-    c3d,
-    insoles,
-    opensim,
-    parquet,
-    plate_texts,
-    pressure_plate,
-    rosbag,
-    text,
-)
+from storage.formats.readers import c3d, insoles, parquet, plate_texts, pressure_plate, rosbag, text
 from storage.formats.readers.table import VALUES_MAX, ColumnFilter, ForceTable
 from storage.formats.readers.text import TextOptions
 
@@ -55,9 +46,7 @@ TEXT_FORMATS = (
     TextFormat(insoles.is_pedar, insoles.refuse_pedar, ""),
     # Last: the format has no head.
     TextFormat(
-        plate_texts.is_netforce,
-        plate_texts.parse_netforce_force_and_cop_without_time,
-        text.FORM,
+        plate_texts.is_netforce, plate_texts.parse_netforce_force_and_cop_without_time, text.FORM
     ),
 )
 
@@ -98,7 +87,7 @@ TABLE_FORMATS = (
     BAG,
     TableFormat((".parquet",), parquet.read_parquet_table, "a Parquet file"),
     TableFormat((".c3d",), c3d.read_c3d_force_platforms, c3d.FORM),
-    TableFormat((".mot", ".sto"), opensim.read_opensim_table, opensim.FORM),
+    TableFormat((".mot", ".sto"), plate_texts.read_opensim_table, plate_texts.OPENSIM_FORM),
     TableFormat((".npz",), pressure_plate.read_npz_pressure_plate, pressure_plate.NPZ_FORM),
 )
 

@@ -137,10 +137,7 @@ class TextLayout:
 
 
 def parse_text_table(
-    text: str,
-    is_needed: ColumnFilter,
-    values_max: int,
-    options: TextOptions | None = None,
+    text: str, is_needed: ColumnFilter, values_max: int, options: TextOptions | None = None
 ) -> ForceTable:
     """Parse the needed columns of a text.
 
@@ -195,33 +192,25 @@ def read_decoded_text(path: Path, encoding: str | None = None) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def _detect_layout(text: str, options: TextOptions | None = None) -> TextLayout:
+def _detect_layout(text: str, options: TextOptions) -> TextLayout:
     """Detect the line of names, if any, and the delimiter of columns.
 
     Raises:
         FileFormatError: there are no columns of numbers, or two delimiters are possible.
     """
-    options = options or TextOptions()
     lines = list(islice(_lines(text[:HEAD_CHARACTERS]), HEAD_LINES))
     first = next((line for line in lines if line.strip()), "")
     sep = re.fullmatch(r"(?i)\"?sep=(.)\"?", first)
-    delimiters = [sep[1]] if sep else DELIMITERS
+    delimiters = [sep[1]] if sep else [*DELIMITERS]
     is_first = options.skip_rows is not None
-    found = [
-        layout
-        for delimiter in delimiters
-        if (layout := _detect_named_layout(lines, delimiter, is_first=is_first)) is not None
-    ]
-    if found:
+    named = (_detect_named_layout(lines, one, is_first=is_first) for one in delimiters)
+    if found := [layout for layout in named if layout is not None]:
         return max(found, key=lambda layout: layout.score)
     if not first:
         raise FileFormatError("cannot be read: it is empty")
-    found = [
-        layout
-        for delimiter in delimiters
-        if (layout := _detect_nameless_layout(lines, delimiter, is_first=is_first)) is not None
-        and not (delimiter == "," == options.decimal)
-    ]
+    delimiters = [one for one in delimiters if (one, options.decimal) != (",", ",")]
+    nameless = (_detect_nameless_layout(lines, one, is_first=is_first) for one in delimiters)
+    found = [layout for layout in nameless if layout is not None]
     if not found:
         raise FileFormatError(
             "no line of names precedes the numbers",

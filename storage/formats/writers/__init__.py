@@ -1,8 +1,8 @@
 """Writers of export formats: one module a format, one registry of all.
 
-A module defines an `ExportFormat` (`storage.formats.writers.format`) with a generator that gets an
-`Export` and yields the file's bytes, and `storage.formats.writers.registry` lists it. REST,
-`foottile export`, `foottile pull` and the page's menu use the registry. The generator
+A module defines an `ExportFormat` (`storage.formats.writers.format`) with a generator that gets one
+`Export`, or several, and yields the file's bytes; `storage.formats.writers.registry` lists it.
+REST, `foottile export`, `foottile pull` and the page's menu use the registry. The generator
 
 - reads frames from `Export.read_chunks`, numpy columns of some thousand rows, or
   `Export.read_tables`, the same as Arrow, and yields the bytes of one chunk before it reads the

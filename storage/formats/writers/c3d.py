@@ -25,16 +25,16 @@ from devices.arrays import Floats
 from devices.errors import FootTileError, StorageError
 from devices.frames import TileInfo
 from storage.formats.export import Export
-from storage.formats.writers.format import ExportFormat
+from storage.formats.writers.format import (
+    ExportFormat,
+    format_largest_clock_bound,
+    format_metadata,
+    to_ascii_line,
+)
 from storage.formats.writers.resampling import (
     OPTIONAL_COLUMNS,
     GroundReaction,
     read_reactions_on_common_axis,
-)
-from storage.formats.writers.text_metadata import (
-    format_largest_clock_bound,
-    format_metadata,
-    to_ascii_line,
 )
 from storage.schema import COLUMNS_BY_NAME
 
@@ -70,11 +70,7 @@ Channel = tuple[str, str, str, Floats]
 """Label, unit, description, samples."""
 
 
-def _encode(export: Export) -> Iterator[bytes]:
-    return _encode_together([export])
-
-
-def _encode_together(exports: Sequence[Export]) -> Iterator[bytes]:
+def _encode(exports: Sequence[Export]) -> Iterator[bytes]:
     import ezc3d  # noqa: F401  # fails before anything is read if it is not installed
 
     try:
@@ -331,7 +327,7 @@ C3D = ExportFormat(
     "C3D programs (tried: ezc3d, c3d)",
     "application/octet-stream",
     _encode,
-    group_encoder=_encode_together,
+    group_encoder=_encode,
     takes_columns=False,
     needs_forces=True,
     frames_max=FRAMES_MAX,

@@ -275,7 +275,8 @@ _HEADER_TEXT_BYTES = 116
 """Length of the header's descriptive text in bytes."""
 
 
-def _encode(export: Export) -> Iterator[bytes]:
+def _encode(exports: Sequence[Export]) -> Iterator[bytes]:
+    (export,) = exports
     quantities = _list_mat_quantities(export)
     # Refuses too many frames before the first chunk.
     variables = _make_variables(export, quantities, len(_read_instants(export)["t_ns"]))

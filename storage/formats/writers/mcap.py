@@ -125,11 +125,7 @@ _DRAIN_EVERY = 1 << 10
 """Number of messages after which written bytes are yielded."""
 
 
-def _encode(export: Export) -> Iterator[bytes]:
-    return _encode_together([export])
-
-
-def _encode_together(exports: Sequence[Export]) -> Iterator[bytes]:
+def _encode(exports: Sequence[Export]) -> Iterator[bytes]:
     from mcap.writer import CompressionType, Writer
 
     from storage.formats.writers import mcap_messages
@@ -223,7 +219,7 @@ MCAP = ExportFormat(
     "Foxglove, PlotJuggler, ros2 bag play",
     "application/mcap",
     _encode,
-    group_encoder=_encode_together,
+    group_encoder=_encode,
     options=("messages",),
     extra="mcap",
     packages=("mcap", "mcap_protobuf", "foxglove_schemas_protobuf", "rosbags"),

@@ -31,15 +31,17 @@ import pyarrow.csv as pacsv
 from devices.arrays import Floats
 from devices.errors import UsageError
 from storage.formats.export import Export
-from storage.formats.writers.format import DrainedBuffer, ExportFormat, make_names_unique
-from storage.formats.writers.resampling import COP, GroundReaction, read_reactions_on_common_axis
-from storage.formats.writers.tables import write_spreadsheet_safe_csv
-from storage.formats.writers.text_metadata import (
+from storage.formats.writers.format import (
+    DrainedBuffer,
+    ExportFormat,
     escape_xml_invalid_characters,
     format_largest_clock_bound,
     format_metadata,
+    make_names_unique,
     to_ascii_line,
 )
+from storage.formats.writers.resampling import COP, GroundReaction, read_reactions_on_common_axis
+from storage.formats.writers.tables import write_spreadsheet_safe_csv
 
 INTERPOLATED_MAX_S = 0.02
 """Longest interpolated stretch of unknown GRF; longer stretches are 0."""
@@ -95,26 +97,16 @@ class FootLoads:
         is_filled = self.fill_code[begins] != _NOT_FILLED
         begins, ends = begins[is_filled], ends[is_filled]
         reasons = [_FILL_REASONS[int(self.fill_code[begin])] for begin in begins]
-        flags = [
-            _combined_flags(self.estimate_flags[a:b]) for a, b in zip(begins, ends, strict=True)
+        stretches = zip(begins, ends, strict=True)
+        columns = [
+            pa.array(self.time_s[begins]),
+            pa.array(self.time_s[ends - 1]),
+            pa.array(ends - begins, pa.int64()),
+            *(pa.array([reason[i] for reason in reasons], pa.string()) for i in range(3)),
+            pa.array([_combined_flags(self.estimate_flags[a:b]) for a, b in stretches], pa.int64()),
         ]
-        columns = {
-            "from_s": self.time_s[begins],
-            "to_s": self.time_s[ends - 1],
-            "rows": ends - begins,
-            "filled": [what for what, _, _ in reasons],
-            "with": [how for _, how, _ in reasons],
-            "because": [why for _, _, why in reasons],
-            "estimate_flags": flags,
-        }
-        types = [pa.float64(), pa.float64(), pa.int64(), *[pa.string()] * 3, pa.int64()]
-        return pa.table(
-            [
-                pa.array(values, type_)
-                for values, type_ in zip(columns.values(), types, strict=True)
-            ],
-            names=list(columns),
-        )
+        names = ["from_s", "to_s", "rows", "filled", "with", "because", "estimate_flags"]
+        return pa.table(columns, names=names)
 
 
 def _compute_gapless_foot_loads(
@@ -229,11 +221,7 @@ class ExportedFoot:
         return "ground" if self.loads.frame == "ground" else self.body
 
 
-def _encode(export: Export) -> Iterator[bytes]:
-    return _encode_together([export])
-
-
-def _encode_together(exports: Sequence[Export]) -> Iterator[bytes]:
+def _encode(exports: Sequence[Export]) -> Iterator[bytes]:
     feet = _make_feet(exports)
     named = to_ascii_line(str(exports[0].provenance_and_slice_metadata.get("session") or "session"))
     stem = _INVALID_IN_NAMES.sub(
@@ -246,15 +234,15 @@ def _encode_together(exports: Sequence[Export]) -> Iterator[bytes]:
     table = np.concatenate([time_s[:, None], *(foot.loads.table for foot in feet)], axis=1)
     sink = DrainedBuffer()
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
-        file.writestr(_make_zip_entry(f"{stem}.xml"), make_external_loads_xml(f"{stem}.mot", feet))
-        file.writestr(
-            _make_zip_entry(f"{stem}_filled.csv"), _encode_csv(_join_tables(filled, feet))
-        )
-        file.writestr(
-            _make_zip_entry(f"{stem}_events.csv"), _encode_csv(_join_tables(events, feet))
-        )
         notes = foot_notes[0] if len(foot_notes) == 1 else {"SESSIONS": foot_notes}
-        file.writestr(_make_zip_entry(f"{stem}_notes.json"), json.dumps(notes, indent=1))
+        entries: dict[str, str | bytes] = {
+            ".xml": make_external_loads_xml(f"{stem}.mot", feet),
+            "_filled.csv": _encode_csv(_join_tables(filled, feet)),
+            "_events.csv": _encode_csv(_join_tables(events, feet)),
+            "_notes.json": json.dumps(notes, indent=1),
+        }
+        for ending, content in entries.items():
+            file.writestr(_make_zip_entry(stem + ending), content)
         with file.open(_make_zip_entry(f"{stem}.mot"), "w", force_zip64=True) as entry:
             names = ["time", *(foot.column_prefix + name for foot in feet for name in LOAD_COLUMNS)]
             entry.write(_encode_mot_head(stem, len(table), names))
@@ -364,11 +352,10 @@ def _encode_mot_rows(rows: Floats, columns: Sequence[str]) -> bytes:
 
 
 def _make_event_table(reaction: GroundReaction) -> pa.Table:
+    count = reaction.marker_count
+    kinds = ["marker"] * count + ["contact"] * (len(reaction.events) - count)
     times = pa.array([at_s for at_s, _ in reaction.events], pa.float64())
     labels = pa.array([label for _, label in reaction.events], pa.string())
-    kinds = ["marker"] * reaction.marker_count + ["contact"] * (
-        len(reaction.events) - reaction.marker_count
-    )
     return pa.table([times, labels, pa.array(kinds, pa.string())], names=["time", "event", "kind"])
 
 
@@ -401,7 +388,7 @@ OPENSIM = ExportFormat(
     "OpenSim: .mot and ExternalLoads",
     "application/zip",
     _encode,
-    group_encoder=_encode_together,
+    group_encoder=_encode,
     suffix="opensim.zip",
     options=("body",),
     takes_columns=False,

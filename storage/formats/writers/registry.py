@@ -17,17 +17,7 @@ from storage.formats.writers.tables import ARROW, CSV, PARQUET
 from storage.formats.writers.xdf import XDF
 
 FORMATS: Mapping[str, ExportFormat] = {
-    known.name: known
-    for known in (
-        PARQUET,
-        ARROW,
-        CSV,
-        C3D,
-        OPENSIM,
-        MCAP,
-        MATLAB,
-        XDF,
-    )
+    known.name: known for known in (PARQUET, ARROW, CSV, C3D, OPENSIM, MCAP, MATLAB, XDF)
 }
 
 

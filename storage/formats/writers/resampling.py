@@ -202,19 +202,6 @@ def fill_cop_across_tile_row(columns: Mapping[str, Array], info: ArrayInfo) -> d
     return {**columns, **placed}
 
 
-def make_tile_row_metadata(info: ArrayInfo) -> dict[str, str]:
-    """Return the facts about the row's place for a file; empty for an array without a row."""
-    rows = [
-        f"{axis} = {1e3 * place_m:g} mm"
-        for axis, place_m in zip("xy", info.row_place_m, strict=True)
-        if place_m is not None
-    ]
-    if not rows:
-        return {}
-    text = f"COP not measured along {' and '.join(row[0] for row in rows)}: tiles in one row"
-    return {"ROW": f"{text}; points are at {', '.join(rows)} in the foot frame"}
-
-
 REQUIRED_COLUMNS = ("t_ns", "contact", *POINT_COLUMNS)
 """Required columns, which every session with estimates has."""
 OPTIONAL_COLUMNS = (

@@ -10,7 +10,7 @@ empty. Every reader of tables accepts this.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, BinaryIO
 
 import pyarrow as pa
@@ -23,8 +23,8 @@ from storage.formats.writers.format import TABLE_OPTIONS, ExportFormat, encode_t
 from storage.sessions.writer import EXPORT_COLUMN, parquet_options
 
 
-def _encode_arrow(export: Export) -> Iterator[bytes]:
-    return encode_tables(export.read_tables(), pa.ipc.new_file)
+def _encode_arrow(exports: Sequence[Export]) -> Iterator[bytes]:
+    return encode_tables(exports[0].read_tables(), pa.ipc.new_file)
 
 
 ARROW = ExportFormat(
@@ -37,15 +37,12 @@ ARROW = ExportFormat(
 )
 
 
-def _encode_parquet(export: Export) -> Iterator[bytes]:
-    return encode_tables(
-        export.read_tables(),
-        lambda sink, schema: pq.ParquetWriter(sink, schema, **_options(schema)),
-    )
+def _encode_parquet(exports: Sequence[Export]) -> Iterator[bytes]:
+    def open_writer(sink: BinaryIO, schema: pa.Schema) -> pq.ParquetWriter:
+        options: dict[str, Any] = {**parquet_options(schema), "column_encoding": None}
+        return pq.ParquetWriter(sink, schema, **options)
 
-
-def _options(schema: pa.Schema) -> dict[str, Any]:
-    return {**parquet_options(schema), "column_encoding": None}
+    return encode_tables(exports[0].read_tables(), open_writer)
 
 
 PARQUET = ExportFormat(
@@ -136,7 +133,8 @@ def _append_about_column(tables: Iterator[pa.Table], about: str) -> Iterator[pa.
         yield table.append_column(EXPORT_COLUMN, cells)
 
 
-def _encode_csv(export: Export) -> Iterator[bytes]:
+def _encode_csv(exports: Sequence[Export]) -> Iterator[bytes]:
+    (export,) = exports
     opened = _CommaWriter if export.options.decimal == "comma" else _EscapingWriter
     tables, has_about = export.read_tables(), export.options.about
     if has_about or (has_about is None and not export.selection.columns):

@@ -24,12 +24,12 @@ from devices.errors import UsageError
 from storage.formats.export import Export
 from storage.formats.writers.format import (
     ExportFormat,
+    escape_xml_invalid_characters,
     get_instants_on_export_clock_ns,
     make_names_unique,
     to_floats_with_nan,
 )
 from storage.formats.writers.resampling import make_resampling, make_sample_axis
-from storage.formats.writers.text_metadata import escape_xml_invalid_characters
 from storage.schema import COLUMNS_BY_NAME, SERVER_TIME_COLUMNS, UNKNOWN_T_NS, Array
 
 _MAGIC = b"XDF:"
@@ -82,11 +82,7 @@ class _Stream:
         return self.encode_chunk(_STREAM_FOOTER, tostring(info))
 
 
-def _encode(export: Export) -> Iterator[bytes]:
-    return _encode_together([export])
-
-
-def _encode_together(exports: Sequence[Export]) -> Iterator[bytes]:
+def _encode(exports: Sequence[Export]) -> Iterator[bytes]:
     numbers = count(1)
     names = make_names_unique([export.array_info.node for export in exports])
     sessions = [_SessionEncoder(*each, numbers) for each in zip(exports, names, strict=True)]
@@ -176,12 +172,9 @@ class _SessionEncoder:
         }
         for name, of in self._channel_quantities.items():
             values = to_floats_with_nan(of, flat[name])
-            is_whole = pa.types.is_integer(COLUMNS_BY_NAME[of].type) or pa.types.is_boolean(
-                COLUMNS_BY_NAME[of].type
-            )
-            samples[name] = (
-                placed.resample_nearest(values) if is_whole else placed.interpolate(values)
-            )
+            is_real = pa.types.is_floating(COLUMNS_BY_NAME[of].type)
+            resample = placed.interpolate if is_real else placed.resample_nearest
+            samples[name] = resample(values)
         if "t_server_ns" in flat:
             is_known = flat["t_server_ns"] != UNKNOWN_T_NS
             offset_ns = placed.resample_nearest(
@@ -224,17 +217,13 @@ class _SessionEncoder:
         content = bytearray()
         if part not in self._parts:
             self._parts[part] = []
-            counters = [
-                name for name, of in self._channel_quantities.items() if of in _FLOAT64_COLUMNS
-            ]
-            others = [
-                name for name, of in self._channel_quantities.items() if of not in _FLOAT64_COLUMNS
-            ]
             of_part = f" part {part}" if part else ""
-            for name, columns, format_ in (
-                ("frames", others, "float32"),
-                ("counters", counters, "double64"),
-            ):
+            for name, format_ in (("frames", "float32"), ("counters", "double64")):
+                columns = [
+                    column
+                    for column, of in self._channel_quantities.items()
+                    if (of in _FLOAT64_COLUMNS) == (name == "counters")
+                ]
                 if columns:
                     stream, header = self._add_stream(name + of_part, "Force", columns, format_)
                     self._parts[part].append(stream)
@@ -309,11 +298,7 @@ class _SessionEncoder:
         _add_text_elements(desc, {"nominal_rate_hz": repr(self._export.array_info.nominal_rate_hz)})
         channels = SubElement(desc, "channels")
         for column in columns:
-            of = (
-                COLUMNS_BY_NAME[self._channel_quantities[column]]
-                if column in self._channel_quantities
-                else None
-            )
+            of = COLUMNS_BY_NAME.get(self._channel_quantities.get(column, ""))
             unit, meaning = (of.unit, of.description) if of else ("1", "what people marked")
             channel = {"label": column, "unit": unit, "type": kind, "description": meaning}
             if of is not None and of.per_tile:
@@ -338,6 +323,6 @@ XDF = ExportFormat(
     "pyxdf, beside LabStreamingLayer",
     "application/x-xdf",
     _encode,
-    group_encoder=_encode_together,
+    group_encoder=_encode,
     options=("rate",),
 )

@@ -6,7 +6,7 @@ import hashlib
 import io
 import threading
 from base64 import b64encode
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -199,7 +199,7 @@ def test_an_aborted_download_ends_its_encoder(
 ) -> None:
     ended = threading.Event()
 
-    def encode_endlessly(_: Export) -> Iterator[bytes]:
+    def encode_endlessly(_: Sequence[Export]) -> Iterator[bytes]:
         try:
             while True:
                 yield bytes(1 << 20)

@@ -19,9 +19,8 @@ from devices.errors import FileFormatError, FootTileError, UsageError
 from devices.frames import FrameBatch
 from storage.clock.log import ClockOffset
 from storage.clock.table import StreamClockFacts, write_clock_file
-from storage.formats.export import ClockName, make_one_pass_frame_source
-from storage.formats.markers import PLACEMENT_COLUMNS, place_markers
-from storage.formats.sealed_export import make_sealed_export, place_session_markers
+from storage.formats.export import ClockName, make_one_pass_frame_source, make_sealed_export
+from storage.formats.markers import PLACEMENT_COLUMNS, place_markers, place_session_markers
 from storage.formats.slice import Slice
 from storage.formats.writers.tables import ARROW
 from storage.schema import Array

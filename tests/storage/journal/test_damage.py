@@ -19,7 +19,7 @@ from devices.errors import DamagedFramesError, FileFormatError, StorageError
 from storage.intervals import Intervals
 from storage.journal.segment import RECORD_DTYPE
 from storage.schema import wire_schema
-from storage.verify.segment import verify_segment
+from storage.verify.journal import verify_segment
 from storage.wire import encode_frames
 from tests.builders.arrays import make_array
 from tests.builders.frames import assert_same_bits

@@ -21,8 +21,7 @@ from storage.journal.segment import INDEX_SUFFIX, RECORD_DTYPE, read_schema_and_
 from storage.journal.segment_writer import SegmentWriter
 from storage.journal.stream_notes import NOTES_FILE, StreamNotes
 from storage.schema import read_array_info, wire_schema
-from storage.verify.journal import verify_journal
-from storage.verify.segment import verify_segment
+from storage.verify.journal import verify_journal, verify_segment
 from storage.wire import EncodedBatch, encode_frames
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.frames import make_frames

@@ -33,9 +33,13 @@ from service.server.server import Server
 from service.sessions.frames import SessionFrames
 from service.sessions.preview import SessionPreview
 from service.sessions.preview_frames import PreviewFrames
-from storage.formats.export import Export
-from storage.formats.markers import PLACEMENT_COLUMNS, PlacedMarkers, place_markers
-from storage.formats.sealed_export import make_sealed_export, place_session_markers
+from storage.formats.export import Export, make_sealed_export
+from storage.formats.markers import (
+    PLACEMENT_COLUMNS,
+    PlacedMarkers,
+    place_markers,
+    place_session_markers,
+)
 from storage.formats.slice import Slice
 from storage.formats.writers.registry import FORMATS
 from storage.formats.writers.tables import PARQUET

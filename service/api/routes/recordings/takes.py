@@ -34,8 +34,8 @@ from service.server.broadcast.views import SessionView, View
 from service.server.server import Server
 from service.server.takes import Take
 from service.user_folders import PublicText
-from storage.formats.markers import PlacedMarkers
-from storage.formats.sealed_export import make_sealed_export, place_session_markers
+from storage.formats.export import make_sealed_export
+from storage.formats.markers import PlacedMarkers, place_session_markers
 from storage.formats.writers.registry import FORMATS, MULTI_SESSION_FORMATS
 from storage.sessions.folder import Session
 

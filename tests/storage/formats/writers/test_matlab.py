@@ -14,7 +14,7 @@ import pytest
 from scipy.io import loadmat
 
 from devices.frames import NO_SERVO_COUNTS, NOT_READ
-from storage.formats.sealed_export import make_sealed_export
+from storage.formats.export import make_sealed_export
 from storage.formats.slice import NO_OPTIONS, Slice
 from storage.formats.writers.matlab import MATLAB
 from storage.schema import CONTACT_UNKNOWN
