@@ -31,7 +31,7 @@ from service.node.frame_sender import NodeCallbacks
 from service.node.publisher import Publisher
 from service.node_identity import generate_secret
 from service.offline.calibration_lookup import find_calibration
-from service.protocol import PROTOCOL, Hello, NodeStatus
+from service.protocol.link import PROTOCOL, Hello, NodeStatus
 from storage.intervals import EVICTED, Intervals
 from storage.journal.node.retention_requests import RetentionRequests
 from storage.journal.node.stream import NodeStream

@@ -12,7 +12,8 @@ import hashlib
 import hmac
 import secrets
 
-from service.protocol import PROTOCOL, SUBPROTOCOL, Challenge, Proof
+from service.protocol.codec import SUBPROTOCOL
+from service.protocol.link import PROTOCOL, Challenge, Proof
 
 _BYTES = 32
 _FINGERPRINT_GROUPS = 4

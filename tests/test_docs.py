@@ -42,7 +42,7 @@ from service.api.logins import Logins
 from service.api.settings import Settings
 from service.cli.main import SUMMARIES, load_command
 from service.estimation.calibration import TileCalibration
-from service.protocol import LinkCloseCode
+from service.protocol.codec import LinkCloseCode
 from service.server.broadcast.history import reduce_tiles, summarize_force
 from service.server.broadcast.summary import PendingUpdate, summarize_frames
 from service.server.server import Server

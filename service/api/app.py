@@ -25,7 +25,8 @@ from service.api.routes.recordings import comparisons, integrity, overview, sess
 from service.api.routes.sockets.ingest import serve_node
 from service.api.routes.sockets.live import serve_live
 from service.api.static_files import HeadFromGet, PageFiles
-from service.protocol import INGEST_PATH, LIVE_PATH
+from service.protocol.link import INGEST_PATH
+from service.protocol.live import LIVE_PATH
 from service.server.server import Server
 from service.version import SOFTWARE_VERSION
 

@@ -20,7 +20,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.api.logins import Credentials, Logins, Role
 from service.api.problems import problem_response
-from service.protocol import LIVE_PATH
+from service.protocol.live import LIVE_PATH
 from service.server.calibrations import CONTENT_BYTES_MAX
 
 BODY_BYTES_MAX = 64 << 10

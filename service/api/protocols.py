@@ -32,7 +32,8 @@ from websockets.http11 import Request
 
 from service.api.connection_limits import ConnectionLimiter
 from service.api.problems import problem_response
-from service.protocol import INGEST_PATH, SUBPROTOCOL, LinkCloseCode
+from service.protocol.codec import SUBPROTOCOL, LinkCloseCode
+from service.protocol.link import INGEST_PATH
 
 log = logging.getLogger("foottile.doors")
 

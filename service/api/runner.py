@@ -17,7 +17,7 @@ from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 from service.api.connection_limits import ConnectionLimiter, LimitSettings, open_files_max
 from service.api.protocols import LimitedConfig, LimitedHttp, LimitedWebSocket, accept_connections
 from service.estimation.compilation import compile_models, load_cached_code, mark_compiling
-from service.protocol import MESSAGE_BYTES_MAX
+from service.protocol.link import MESSAGE_BYTES_MAX
 from service.server.server import Server
 
 _GRACE_S = 3

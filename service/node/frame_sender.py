@@ -21,15 +21,8 @@ from itertools import count
 from websockets.asyncio.client import ClientConnection
 
 from devices.errors import DamagedFramesError, LinkError, StorageError
-from service.protocol import (
-    Hello,
-    NodeStatus,
-    RetentionMessage,
-    StreamSelect,
-    Welcome,
-    append_crc,
-    encode_message,
-)
+from service.protocol.codec import append_crc, encode_message
+from service.protocol.link import Hello, NodeStatus, RetentionMessage, StreamSelect, Welcome
 from storage.intervals import NO_END, Intervals, intervals_from_inclusive_pairs, union
 from storage.journal.node.stream import NodeStream
 from storage.wire import EncodedBatch

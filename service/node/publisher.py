@@ -28,18 +28,16 @@ from service.node.server_connection import (
     parse_server_message,
 )
 from service.node_identity import compute_fingerprint, make_proof
-from service.protocol import (
+from service.protocol.codec import SUBPROTOCOL, LinkCloseCode, encode_message
+from service.protocol.link import (
     LINK_TIMEOUT_S,
     MESSAGE_BYTES_MAX,
     PROTOCOL,
-    SUBPROTOCOL,
     Challenge,
     Identify,
-    LinkCloseCode,
+    LinkMessage,
     Proof,
-    ServerMessage,
     Welcome,
-    encode_message,
 )
 
 
@@ -177,7 +175,7 @@ _Kind = TypeVar("_Kind", Challenge, Welcome)
 async def _receive_message(socket: ClientConnection, kind: type[_Kind]) -> _Kind:
     """Receive the next message, which has to be of a kind."""
     async with asyncio.timeout(LINK_TIMEOUT_S):
-        answer: ServerMessage = parse_server_message(await socket.recv())
+        answer: LinkMessage = parse_server_message(await socket.recv())
     if not isinstance(answer, kind):
         expected = kind.model_fields["type"].default
         raise LinkError(f"the server sent {answer.type!r}", expected=expected)

@@ -25,7 +25,7 @@ from service.node.local_recording import LocalRecording
 from service.node.options import NodeOptions, ServerSecrets
 from service.node.publisher import Publisher
 from service.node.server_connection import make_hello
-from service.protocol import NodeStatus, RetentionMessage
+from service.protocol.link import NodeStatus, RetentionMessage
 from storage.journal.node.journal import NodeJournal
 from storage.journal.node.retention_requests import RetentionRequest
 from storage.journal.node.stream import NodeStream

@@ -29,27 +29,27 @@ from foottile.connection import UpgradeRejection, explain_foreign_response, expl
 from foottile.environment import decode_zone
 from service.node.frame_sender import EstablishedLink, FrameSender
 from service.node.options import NodeOptions
-from service.protocol import (
+from service.protocol.codec import (
+    SUBPROTOCOL,
+    CloseConnection,
+    LinkCloseCode,
+    decode_message,
+    encode_message,
+)
+from service.protocol.link import (
     INGEST_PATH,
+    LINK_MESSAGES,
     LINK_TIMEOUT_S,
     PROBES_PER_MEASUREMENT,
     PROTOCOL,
-    SERVER_MESSAGES,
-    SUBPROTOCOL,
     Ack,
-    Challenge,
     ClockProbe,
     ClockSample,
     EarlierStream,
     Hello,
-    LinkCloseCode,
+    LinkMessage,
     LossReport,
     RetentionMessage,
-    ServerMessage,
-    Welcome,
-    encode_message,
-    parse_message,
-    strip_text_crc,
 )
 from storage.journal.node.journal import NodeJournal
 from storage.journal.node.stream import NodeStream
@@ -103,8 +103,8 @@ class ServerConnection:
                     self._forward_retention_request(message)
                 case ClockProbe():
                     self._probes.add_answer(message)
-                case Challenge() | Welcome():
-                    raise LinkError(f"the server sent {message.type} a second time")
+                case _:
+                    raise LinkError(f"the server sent {message.type!r}, unexpected here")
 
     def _forward_retention_request(self, wanted: RetentionMessage) -> None:
         earlier = (stream.array_info.stream_id for stream in self._link.hello.earlier)
@@ -128,15 +128,15 @@ class ServerConnection:
             await asyncio.sleep(STATUS_EVERY_S)
 
 
-def parse_server_message(message: str | bytes) -> ServerMessage:
+def parse_server_message(message: str | bytes) -> LinkMessage:
     """Verify and parse a message of a server.
 
     Raises:
         LinkError: it is no valid message of the protocol.
     """
     try:
-        return parse_message(SERVER_MESSAGES, strip_text_crc(message))
-    except LinkError as error:
+        return decode_message(LINK_MESSAGES, message)
+    except CloseConnection as error:
         raise LinkError(
             f"the server sent an invalid message: {error}",
             expected=f"{SUBPROTOCOL} messages",

@@ -13,7 +13,8 @@ from typing import Literal
 
 from devices.errors import ChangedError, DamagedFileError, StateError, StorageError
 from service.node_identity import compute_fingerprint, generate_secret, is_proof_valid
-from service.protocol import PROTOCOL, Challenge, CloseConnection, LinkCloseCode, Proof
+from service.protocol.codec import CloseConnection, LinkCloseCode
+from service.protocol.link import PROTOCOL, Challenge, Proof
 from storage.durable_files import try_set_aside_and_describe
 from storage.permissions import SECRETS_NAME, read_secrets_or_empty, write_secrets
 

@@ -21,7 +21,7 @@ from devices.errors import (
     StorageError,
 )
 from devices.frames import ArrayInfo, FrameBatch
-from service.protocol import STREAM_ID_PATTERN, Hello, StreamNumbers
+from service.protocol.link import STREAM_ID_PATTERN, Hello, StreamNumbers
 from service.server.estimates.node_estimator import EstimatedBatch, NodeEstimator
 from service.server.streams import ServerStream
 from service.server_clock import server_utc_ns

@@ -19,7 +19,7 @@ from devices.errors import (
     UnknownError,
     escape_control_chars,
 )
-from service.protocol import PROTOCOL, Hello
+from service.protocol.link import PROTOCOL, Hello
 from service.server.node import BOOT_ID_PATTERN, HELLO_NAME, ServerNode
 from storage.checksummed_json import read_checksummed_json
 from storage.durable_files import translate_storage_errors, try_set_aside_and_describe

@@ -9,11 +9,8 @@ from __future__ import annotations
 import logging
 from typing import Literal
 
-from devices.errors import (
-    StateError,
-    StorageError,
-)
-from service.protocol import ClockSample, RetentionMessage, StreamNumbers
+from devices.errors import StateError, StorageError
+from service.protocol.link import ClockSample, RetentionMessage, StreamNumbers
 from service.server import session_parts
 from service.server.node import ServerNode
 from service.server.nodes import NodeRegistry

@@ -8,12 +8,19 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from devices.errors import FootTileError, StorageError
-from service.protocol import LinkCloseCode, RetentionMessage
+from service.protocol.codec import LinkCloseCode
+from service.protocol.link import RetentionMessage
+from service.protocol.live import Heartbeat, NodeChanged, NodeView, SessionChanged, SessionProgress
 from service.server.broadcast.broadcaster import Broadcaster
-from service.server.broadcast.views import NodeView, SessionProgress, SessionView
+from service.server.broadcast.views import (
+    make_node_counts,
+    make_node_view,
+    make_session_progress,
+    make_session_view,
+)
 from service.server.calibrations import CalibrationJobs, CalibrationStore
 from service.server.data_folder import DataFolder
 from service.server.identities import NodeIdentities
@@ -275,23 +282,21 @@ class Server:
 
     def make_node_view(self, node: ServerNode) -> NodeView:
         """Return a node's present state, for answers and subscribers."""
-        return NodeView.from_node(
-            node, self.recorder, self.identities.refused_machines.get(node.name)
-        )
+        return make_node_view(node, self.recorder, self.identities.refused_machines.get(node.name))
 
-    def try_make_node_json(self, node: ServerNode) -> dict[str, Any] | None:
-        """Return a node's present state as JSON; None on an error, which is logged."""
+    def try_make_node_view(self, node: ServerNode) -> NodeView | None:
+        """Return a node's present state; None on an error, which is logged."""
         with self._isolate_errors(f"node {node.name}, as JSON"):
-            return self.make_node_view(node).model_dump(mode="json")
+            return self.make_node_view(node)
         return None
 
     def notify_node_changed(self, node: ServerNode) -> None:
         """Send a node's present state to all subscribers."""
         if (
             self.broadcaster.subscriber_count
-            and (view := self.try_make_node_json(node)) is not None
+            and (view := self.try_make_node_view(node)) is not None
         ):
-            self.broadcaster.queue_droppable_notice({"type": "node", "node": view})
+            self.broadcaster.queue_droppable_notice(NodeChanged(node=view))
 
     def _update_retention(self, link: NodeLink) -> None:
         """Notify a node if its retention request has changed."""
@@ -307,11 +312,9 @@ class Server:
         counts: dict[str, SessionProgress] = {}
         for session in self.sessions.list_unsealed() if self.broadcaster.subscriber_count else ():
             if session.state in ("recording", "pending"):
-                counted = counts[session.id] = SessionProgress.from_session(session, self.recorder)
+                counted = counts[session.id] = make_session_progress(session, self.recorder)
                 if counted != self._last_progress.get(session.id):
-                    self.broadcaster.queue_progress(
-                        session.node, {session.id: counted.model_dump()}
-                    )
+                    self.broadcaster.queue_progress(session.node, {session.id: counted})
         self._last_progress = counts
 
     @contextmanager
@@ -339,30 +342,19 @@ class Server:
 
     def _notify_session_changed(self, session: Session) -> None:
         if self.broadcaster.subscriber_count:
-            view = SessionView.from_session(session, self.recorder).model_dump(mode="json")
-            self.broadcaster.queue_droppable_notice({"type": "session", "session": view})
+            view = make_session_view(session, self.recorder)
+            self.broadcaster.queue_droppable_notice(SessionChanged(session=view))
 
     def _send_heartbeat(self) -> None:
         if not self.broadcaster.subscriber_count:
             return
         last = [node.last_seq for node in self.nodes if node.last_seq is not None]
         self.broadcaster.queue_droppable_notice(
-            {
-                "type": "heartbeat",
-                "t_ns": server_utc_ns(),
-                "last_seq": max(last, default=None),
-                "nodes": {
-                    node.name: {
-                        "last_seq": node.last_seq,
-                        "rate_hz": node.rate_hz,
-                        "lost_frames": sum(node.present_stream_lost_by_reason.values()),
-                        "backlog_frames": node.present_stream_backlog_frames,
-                        "missed_slots": node.present_stream.missed_slots,
-                        "connected": node.is_connected,
-                    }
-                    for node in self.nodes
-                },
-            }
+            Heartbeat(
+                t_ns=server_utc_ns(),
+                last_seq=max(last, default=None),
+                nodes={node.name: make_node_counts(node) for node in self.nodes},
+            )
         )
         for session in self.sessions.list_unsealed():
             self._notify_session_changed(session)

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from devices.errors import FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
-from service.protocol import ClockSample, EarlierStream, Hello, SeqIntervalsByReason
+from service.protocol.link import ClockSample, EarlierStream, Hello, SeqIntervalsByReason
 from service.sessions.parts import SeqsAround, SessionStream, find_seqs_around_once_passed
 from storage.clock.bounds import DISCIPLINE_RATE_LIMIT
 from storage.clock.log import ClockLog, ClockOffset

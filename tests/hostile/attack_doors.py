@@ -10,7 +10,8 @@ import time
 from contextlib import ExitStack, suppress
 from random import Random
 
-from service.protocol import LIVE_PATH, LinkCloseCode
+from service.protocol.codec import LinkCloseCode
+from service.protocol.live import LIVE_PATH
 from tests.hostile.attack import Outcome, Play, attack
 from tests.hostile.stage import Served, asked, recording
 from tests.waiting import until

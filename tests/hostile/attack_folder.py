@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from devices.errors import FootTileError
-from service.server.broadcast.views import SessionView
+from service.server.broadcast.views import make_session_view
 from service.server.server import Server
 from storage.server_id import SERVER_ID_NAME
 from tests.hostile.attack import Outcome, Play, attack
@@ -38,7 +38,7 @@ def served(server: Server) -> Served:
                 frames = [f"damaged: {error}"]
             found[f"stream {stream_id}"] = (node.name, numbers, frames)
     for session in server.sessions.iterate_newest_first():
-        view = SessionView.from_session(session, server.recorder).model_dump_json()
+        view = make_session_view(session, server.recorder).model_dump_json()
         folder = server.sessions.folder.get_path(session.id)
         files = {p.name: sha(p) for p in sorted(folder.iterdir()) if p.suffix == ".parquet"}
         found[f"session {session.id}"] = (view, files)

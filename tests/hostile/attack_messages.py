@@ -20,12 +20,11 @@ from websockets.exceptions import ConnectionClosed
 from devices.frames import ArrayInfo
 from service.api.protocols import CLIENT_MESSAGE_BYTES_MAX
 from service.node_identity import make_proof
-from service.protocol import (
+from service.protocol.codec import SUBPROTOCOL, append_crc, strip_text_crc
+from service.protocol.link import (
     INGEST_PATH,
-    LIVE_PATH,
     MESSAGE_BYTES_MAX,
     PROTOCOL,
-    SUBPROTOCOL,
     Challenge,
     ClockProbe,
     ClockSample,
@@ -36,9 +35,8 @@ from service.protocol import (
     NodeStatus,
     Proof,
     StreamSelect,
-    append_crc,
-    strip_text_crc,
 )
+from service.protocol.live import LIVE_PATH
 from storage.wire import encode_as_messages
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.calibrations import make_calibration, make_effects, newton_tile

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from devices.flags import EstimateFlag
-from service.protocol import Hello
+from service.protocol.link import Hello
 from service.server.node import ServerNode
 from service.server.nodes import NodeRegistry
 from service.server.session_parts import current_inputs

@@ -12,7 +12,7 @@ import numpy as np
 from devices.errors import FootTileError
 from devices.frames import ArrayInfo
 from service.offline.calibration_lookup import read_calibration
-from service.protocol import PROTOCOL, Hello
+from service.protocol.link import PROTOCOL, Hello
 from service.sessions.calibration_file import write_calibration
 from service.sessions.recovery import recover_locked_folder
 from service.sessions.tares import TareHistory

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zlib
 from collections.abc import Callable
 from random import Random
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from devices.frames import ArrayInfo, FrameBatch
-from service.protocol import append_crc
+from service.protocol.codec import append_crc, append_text_crc
 from storage.schema import frames_to_record_batch, wire_schema
 from tests.builders.frames import make_frames, with_columns
 from tests.builders.odd_values import ODD_VALUES, places, with_value
@@ -23,8 +22,7 @@ DEEP = "[" * 2000 + "]" * 2000
 def checked_text(content: Any) -> str:
     """A message with the checksum that fits it; NaN and halves of pairs as Python writes them."""
     body = json.dumps(content)
-    body = body[:-1] if body.endswith("}") else '{"type":' + body
-    return f'{body},"crc32":"{zlib.crc32(body.encode()):08x}"}}'
+    return append_text_crc(body if body.endswith("}") else f'{{"type":{body}}}')
 
 
 def wrong_text(random: Random, content: dict[str, Any]) -> str:

@@ -7,7 +7,6 @@ import json
 import threading
 import time
 import uuid
-import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,10 +19,11 @@ from devices.flags import FrameFlag
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
 from service.node_identity import generate_secret, make_proof
-from service.protocol import (
+from service.protocol.codec import append_crc, append_text_crc, strip_text_crc
+from service.protocol.link import (
     INGEST_PATH,
+    LINK_MESSAGES,
     PROTOCOL,
-    SERVER_MESSAGES,
     Challenge,
     ClockSample,
     EarlierStream,
@@ -32,8 +32,6 @@ from service.protocol import (
     Proof,
     RetentionMessage,
     StreamSelect,
-    append_crc,
-    strip_text_crc,
 )
 from storage.intervals import Intervals
 from storage.schema import wire_schema
@@ -86,8 +84,7 @@ class Spoken:
         if isinstance(message, bytes):
             self.send_raw(append_crc(message))
         elif message.endswith("}"):
-            body = message[:-1]
-            self.send_raw(f'{body},"crc32":"{zlib.crc32(body.encode()):08x}"}}')
+            self.send_raw(append_text_crc(message))
         else:
             self.send_raw(message)
 
@@ -244,7 +241,7 @@ class FakeNode:
         """The next message of a kind; acknowledgements on the way are noted."""
         end_s = time.monotonic() + timeout_s
         while True:
-            message = SERVER_MESSAGES.validate_json(
+            message = LINK_MESSAGES.validate_json(
                 self.socket.recv(timeout=max(0.0, end_s - time.monotonic()))
             )
             if message.type == "ack":

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 import httpx
 import pytest
+from pydantic import TypeAdapter
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
@@ -25,13 +26,15 @@ from service.api.connection_limits import LimitSettings
 from service.api.logins import Logins, Role
 from service.api.routes.login import add_ticket
 from service.api.runner import serve_app
-from service.protocol import SUBPROTOCOL
+from service.protocol.codec import SUBPROTOCOL
+from service.protocol.live import PageMessage
 from service.server.server import Server
 from storage.journal.journal import Journal
 from tests.service.recording import Recording
 from tests.tokens import SHARED_BEARER, SHARED_TOKEN
 from tests.waiting import PATIENCE_S
 
+PAGE_MESSAGES: TypeAdapter[PageMessage] = TypeAdapter(PageMessage)
 T = TypeVar("T")
 
 _NO_TLS = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
@@ -51,6 +54,7 @@ def receive_live(socket: Any, is_wanted: Callable[[dict[str, Any]], bool]) -> di
     while True:
         text = socket.recv(timeout=max(0.0, end_s - time.monotonic()))
         message: dict[str, Any] = json.loads(text)
+        PAGE_MESSAGES.validate_json(text, strict=True)
         if is_wanted(message):
             return message
 

@@ -11,12 +11,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.errors import FileFormatError, LinkError
 from devices.types import OFFSET_NS_END, T_MONO_NS_END
-from service.protocol import (
-    NODE_MESSAGES,
+from service.protocol.codec import (
+    CloseConnection,
+    append_crc,
+    append_text_crc,
+    decode_message,
+    encode_message,
+    format_close_reason,
+    strip_binary_crc,
+    strip_text_crc,
+)
+from service.protocol.link import (
+    LINK_MESSAGES,
     PROTOCOL,
-    SERVER_MESSAGES,
     UNCERTAINTY_MAX_NS,
     Ack,
     Challenge,
@@ -25,6 +33,7 @@ from service.protocol import (
     EarlierStream,
     Hello,
     Identify,
+    LinkMessage,
     LossReport,
     NodeStatus,
     Proof,
@@ -32,12 +41,6 @@ from service.protocol import (
     StreamNumbers,
     StreamSelect,
     Welcome,
-    append_crc,
-    encode_message,
-    format_close_reason,
-    parse_message,
-    strip_binary_crc,
-    strip_text_crc,
 )
 from storage.clock.log import ClockOffset
 from storage.clock.table import ClockTable, StreamClockFacts, group_rows_by_stream_in_given_order
@@ -51,29 +54,30 @@ WANTED = RetentionMessage(
     streams=(StreamNumbers(stream_id="a" * 32, numbers=((5, 9), (0, 3), (20, None))),),
     recording=True,
 )
-FROM_NODE = (
-    Hello(
-        protocol=PROTOCOL,
-        array_info=make_array(servo=make_servo()),
-        stored=((0, 99), (200, 299)),
-        next_seq=300,
-        t_mono_ns=-5,
-        lost={"evicted": ((100, 199),)},
-        scene={"name": "test", "tile": [{"x_m": 0.5, "on": True, "note": None, "n": 7}]},
-        emulated=False,
-        calibration=make_calibration(newton_tile("T01", effects=make_effects()), "T02"),
-        calibration_problem=None,
-        earlier=(
-            EarlierStream(
-                array_info=make_array(stream_id="b" * 32),
-                stored=((0, 9),),
-                next_seq=10,
-                lost={"disk_full": ((3, 4),)},
-                max_lost_tail_frames=7,
-                t_ns_first=10**18,
-            ),
+HELLO = Hello(
+    protocol=PROTOCOL,
+    array_info=make_array(servo=make_servo()),
+    stored=((0, 99), (200, 299)),
+    next_seq=300,
+    t_mono_ns=-5,
+    lost={"evicted": ((100, 199),)},
+    scene={"name": "test", "tile": [{"x_m": 0.5, "on": True, "note": None, "n": 7}]},
+    emulated=False,
+    calibration=make_calibration(newton_tile("T01", effects=make_effects()), "T02"),
+    calibration_problem=None,
+    earlier=(
+        EarlierStream(
+            array_info=make_array(stream_id="b" * 32),
+            stored=((0, 9),),
+            next_seq=10,
+            lost={"disk_full": ((3, 4),)},
+            max_lost_tail_frames=7,
+            t_ns_first=10**18,
         ),
     ),
+)
+MESSAGES = (
+    HELLO,
     Identify(protocol=PROTOCOL, node="leg"),
     Proof(proof="0" * 64, secret="f" * 64),
     StreamSelect(stream_id="b" * 32),
@@ -81,8 +85,6 @@ FROM_NODE = (
     ClockSample(t_mono_ns=5, server_minus_node_ns=-77, uncertainty_ns=9),
     LossReport(stream_id="b" * 32, lost={"node_busy": ((0, 0), (5, 6))}),
     NodeStatus(missed_slots=3, warnings=("T01: does not answer",), counts={"T01": {"stale": 4}}),
-)
-FROM_SERVER = (
     ACK,
     WANTED,
     Challenge(protocol=PROTOCOL, server_id="e" * 32, nonce="0" * 64, is_known=True),
@@ -91,40 +93,41 @@ FROM_SERVER = (
 )
 
 
-def assert_taken_as_it_is_or_refused(messages: Any, text: str) -> None:
+def decode(content: Any) -> LinkMessage:
+    return decode_message(LINK_MESSAGES, append_text_crc(json.dumps(content)))
+
+
+def assert_taken_as_it_is_or_refused(content: Any) -> None:
     try:
-        taken = parse_message(messages, text)
-    except LinkError:
+        taken = decode(content)
+    except CloseConnection:
         return
-    written = taken.model_dump_json()
-    assert parse_message(messages, written) == taken
-    assert parse_message(messages, written).model_dump_json() == written
+    written = encode_message(taken)
+    assert decode_message(LINK_MESSAGES, written) == taken
+    assert encode_message(decode_message(LINK_MESSAGES, written)) == written
     json.loads(written, parse_constant=pytest.fail)  # no NaN, which JSON has not
-    assert messages.validate_python(taken.model_dump()) == taken
+    assert LINK_MESSAGES.validate_python(taken.model_dump()) == taken
     written.encode()
 
 
 def test_a_message_is_json_and_comes_back() -> None:
     assert json.loads(encode_message(ACK))["seq_last"] == 199
-    for message in FROM_NODE:
-        assert parse_message(NODE_MESSAGES, strip_text_crc(encode_message(message))) == message
-    for answer in FROM_SERVER:
-        assert parse_message(SERVER_MESSAGES, strip_text_crc(encode_message(answer))) == answer
+    for message in MESSAGES:
+        assert decode_message(LINK_MESSAGES, encode_message(message)) == message
 
 
 @settings(deadline=None, max_examples=1500)
 @given(data=st.data())
 def test_what_is_taken_can_be_written_down_and_read_back_as_the_same(data: st.DataObject) -> None:
     """Any one or two values of any message replaced by what JSON, and Python's JSON, can say."""
-    at = data.draw(st.integers(0, len(FROM_NODE) + len(FROM_SERVER) - 1))
-    messages: Any = NODE_MESSAGES if at < len(FROM_NODE) else SERVER_MESSAGES
-    content = json.loads((*FROM_NODE, *FROM_SERVER)[at].model_dump_json())
+    at = data.draw(st.integers(0, len(MESSAGES) - 1))
+    content = json.loads(MESSAGES[at].model_dump_json())
     for _ in range(data.draw(st.integers(1, 2))):
         found = list(places(content))
         place = found[data.draw(st.integers(0, len(found) - 1))]
         value = ODD_VALUES[data.draw(st.integers(0, len(ODD_VALUES) - 1))]
         content = with_value(content, place, value)
-    assert_taken_as_it_is_or_refused(messages, json.dumps(content))
+    assert_taken_as_it_is_or_refused(content)
 
 
 @pytest.mark.parametrize(
@@ -166,9 +169,9 @@ def test_what_is_taken_can_be_written_down_and_read_back_as_the_same(data: st.Da
 def test_a_hello_with_a_value_that_cannot_be_is_not_understood(
     place: tuple[Any, ...], value: Any
 ) -> None:
-    content = with_value(json.loads(FROM_NODE[0].model_dump_json()), place, value)
-    with pytest.raises(LinkError, match="not understood") as refused:
-        parse_message(NODE_MESSAGES, json.dumps(content))
+    content = with_value(json.loads(HELLO.model_dump_json()), place, value)
+    with pytest.raises(CloseConnection, match="not understood") as refused:
+        decode(content)
     assert str(place[0]) in str(refused.value)
 
 
@@ -182,15 +185,14 @@ def test_a_hello_with_a_value_that_cannot_be_is_not_understood(
     ids=["deep", "long", "key"],
 )
 def test_a_scene_beyond_all_bounds_is_not_understood(scene: Any) -> None:
-    content = json.loads(FROM_NODE[0].model_dump_json()) | {"scene": {"a": scene}}
-    with pytest.raises(LinkError, match="scene"):
-        parse_message(NODE_MESSAGES, json.dumps(content))
+    content = json.loads(HELLO.model_dump_json()) | {"scene": {"a": scene}}
+    with pytest.raises(CloseConnection, match="scene"):
+        decode(content)
 
 
 def test_half_a_surrogate_pair_is_not_understood() -> None:
-    text = json.dumps(json.loads(FROM_NODE[0].model_dump_json()) | {"scene": {"a": "\ud800"}})
-    with pytest.raises(LinkError):
-        parse_message(NODE_MESSAGES, text)
+    with pytest.raises(CloseConnection):
+        decode(json.loads(HELLO.model_dump_json()) | {"scene": {"a": "\ud800"}})
 
 
 @given(st.text())
@@ -205,7 +207,7 @@ def test_a_flipped_bit_of_a_text_is_noticed_wherever_it_is(at: int, bit: int) ->
     """A 1 that became a 9 would have the node forget frames that nobody has."""
     damaged = bytearray(encode_message(ACK).encode())
     damaged[at] ^= 1 << bit
-    with pytest.raises(LinkError, match="damaged"):
+    with pytest.raises(CloseConnection, match="damaged"):
         strip_text_crc(bytes(damaged))
 
 
@@ -216,13 +218,13 @@ def test_a_flipped_bit_of_frames_is_noticed_wherever_it_is(
     message = bytearray(append_crc(payload))
     assert strip_binary_crc(bytes(message)) == payload
     message[data.draw(st.integers(0, len(message) - 1))] ^= 1 << data.draw(st.integers(0, 7))
-    with pytest.raises(FileFormatError, match="damaged"):
+    with pytest.raises(CloseConnection, match="damaged"):
         strip_binary_crc(bytes(message))
 
 
 @pytest.mark.parametrize("message", [b"", b"abc", b"abcd"])
 def test_what_is_too_short_is_damaged(message: bytes) -> None:
-    with pytest.raises(FileFormatError):
+    with pytest.raises(CloseConnection):
         strip_binary_crc(message)
 
 

@@ -10,7 +10,7 @@ from playwright.sync_api import Page, expect
 
 import service.api.routes.sockets.ingest
 from service.estimation.compilation import mark_compiling
-from service.protocol import LINK_TIMEOUT_S
+from service.protocol.link import LINK_TIMEOUT_S
 from tests.service.fake_node import Play
 from tests.service.recording import Recording
 from tests.waiting import until

@@ -20,12 +20,8 @@ from service.api.routes.common import (
 )
 from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
-from service.server.broadcast.views import (
-    CalibrationSource,
-    CalibrationView,
-    Page,
-    View,
-)
+from service.protocol.live import CalibrationSource, CalibrationView, View
+from service.server.broadcast.views import Page
 from service.server.calibrations import JOB_SESSIONS_MAX, CalibrationJob, CalibrationSummary
 from service.server.node import ServerNode
 from service.server.session_store import check_revision

@@ -7,8 +7,9 @@ from pydantic import BaseModel, Field
 
 from service.api.openapi import list_operations
 from service.api.routes.common import ServerState, problem_responses
-from service.protocol import INGEST_PATH, LIVE_PATH, SUBPROTOCOL
-from service.server.broadcast.views import View
+from service.protocol.codec import SUBPROTOCOL
+from service.protocol.link import INGEST_PATH
+from service.protocol.live import LIVE_PATH, View
 from service.user_folders import PublicText
 from service.version import SOFTWARE_VERSION
 from storage.formats.writers.registry import FORMATS

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 from starlette.exceptions import HTTPException
 
 from service.api.logins import LOGIN_S, TICKET_S, Logins, Role, cookie_name
-from service.server.broadcast.views import View
+from service.protocol.live import View
 from service.server_clock import server_utc_ns
 
 router = APIRouter(tags=["login"])

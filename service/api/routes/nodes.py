@@ -11,9 +11,10 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from devices.types import check_user_name
 from service.api.routes.common import ServerState, parse_if_match, problem_responses
+from service.protocol.live import NodeView, TareView, View
 from service.server.broadcast.history import SECONDS_MAX, TILE_QUANTITIES, ForceSpan
 from service.server.broadcast.summary import round_values
-from service.server.broadcast.views import DriftView, NodeView, Page, TaresPage, TareView, View
+from service.server.broadcast.views import Page, TaresPage, make_drift_view, make_tare_view
 from service.server.node import ServerNode
 from service.server.server import Server
 from service.server.session_store import check_revision
@@ -211,7 +212,7 @@ async def tare_node(
     _check_tare_in_force(the_node, if_match)
     recorded = the_node.tare_now(request.reason.strip() if request is not None else "")
     server.notify_node_changed(the_node)
-    return TareView.from_recorded(recorded)
+    return make_tare_view(recorded)
 
 
 @router.get(
@@ -221,10 +222,9 @@ async def list_tares(node: str, server: ServerState) -> TaresPage:
     """Return the tares, newest first; the first valid one of the present tiles is in force."""
     the_node = server.nodes.get(node)
     items = [
-        TareView.from_recorded(t)
-        for t in reversed(the_node.estimator.tare_history.all_tares_with_undone)
+        make_tare_view(t) for t in reversed(the_node.estimator.tare_history.all_tares_with_undone)
     ]
-    return TaresPage(items=items, drift=DriftView.from_node(the_node))
+    return TaresPage(items=items, drift=make_drift_view(the_node))
 
 
 @router.delete(

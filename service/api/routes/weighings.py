@@ -14,7 +14,7 @@ from service.api.routes.calibrations import Line, check_fits
 from service.api.routes.common import FULL, ServerState, parse_if_match, problem_responses
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.dead_weights import TOLERANCE_PERCENT, check_and_label_weights
-from service.server.broadcast.views import View
+from service.protocol.live import View
 from service.server.node import ServerNode
 from service.server.weighing import Method, Repeatability
 from service.server.weighings import NodeWeighing, WeighingPlan, WeighingState

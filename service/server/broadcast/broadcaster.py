@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterable, Mapping
-from typing import Any, Protocol
+from typing import Protocol
 
 from websockets.frames import Frame, Opcode
 
-from service.protocol import CloseConnection, LinkCloseCode
+from service.protocol.codec import CloseConnection, LinkCloseCode, encode_message
+from service.protocol.live import PageMessage, SessionProgress
 from service.server.broadcast.history import StreamHistory, reduce_tiles, summarize_force
-from service.server.broadcast.summary import PendingUpdate, encode_json, summarize_frames
+from service.server.broadcast.summary import PendingUpdate, summarize_frames
 from service.server.estimates.node_estimator import EstimatedBatch
 from service.server.node import ServerNode
 from service.server_clock import server_utc_ns
@@ -168,16 +169,14 @@ class Broadcaster:
                 task.cancel()
                 del self._groups[key]
 
-    def queue_droppable_notice(self, message: Mapping[str, Any]) -> None:
+    def queue_droppable_notice(self, message: PageMessage) -> None:
         """Queue a message to all subscribers for the next update."""
         if self._groups:
-            text = encode_json(message)
+            text = encode_message(message)
             for summary in self._pending_updates():
                 summary.add_notice(text)
 
-    def queue_progress(
-        self, node: str, progress_by_session: Mapping[str, Mapping[str, Any]]
-    ) -> None:
+    def queue_progress(self, node: str, progress_by_session: Mapping[str, SessionProgress]) -> None:
         """Queue the progress of sessions, by id, for the subscribers of their node."""
         for summary in self._pending_updates():
             summary.add_progress(node, progress_by_session)

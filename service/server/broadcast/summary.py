@@ -6,7 +6,6 @@ than a fast one. Minimum and maximum of skipped frames are in every message, so 
 
 from __future__ import annotations
 
-import json
 import math
 from collections import deque
 from collections.abc import Mapping
@@ -19,6 +18,8 @@ import numpy.typing as npt
 from devices.arrays import Floats
 from devices.frames import FrameBatch
 from service.estimation.foot import CONTACT_UNKNOWN
+from service.protocol.codec import encode_message
+from service.protocol.live import FrameMessage, FramesDropped, SessionProgress, SessionsProgress
 from service.server.broadcast.history import ForceSpan, join_tiles
 from storage.intervals import Intervals
 
@@ -39,8 +40,6 @@ _PER_FRAME = (
     ("cop_sigma_y_m", "m"),
     ("angle_rad", "rad"),
 )
-# Created once: `json.dumps` would create one per message.
-_ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ class Update:
     """Content of one tick."""
 
     notices: tuple[str, ...]
-    progress_by_session: Mapping[str, Mapping[str, Any]]
+    progress_by_session: Mapping[str, SessionProgress]
     dropped: Mapping[str, Intervals]
     summaries: Mapping[str, FrameSummary]
 
@@ -86,16 +85,13 @@ class Update:
         """
         texts = []
         if self.progress_by_session:  # before the notice of a sealed session with its final numbers
-            texts.append(
-                encode_json({"type": "session_progress", "sessions": self.progress_by_session})
-            )
+            texts.append(encode_message(SessionsProgress(sessions={**self.progress_by_session})))
         texts += self.notices
         for node, dropped in self.dropped.items():
             for first, last in dropped:
-                message = {"type": "dropped", "node": node, "from_seq": first, "to_seq": last}
-                texts.append(encode_json(message))
+                texts.append(encode_message(FramesDropped(node=node, from_seq=first, to_seq=last)))
         for node, piece in self.summaries.items():
-            texts.append(encode_json(_frame_message(node, piece, ages_ms.get(node))))
+            texts.append(encode_message(_make_frame_message(node, piece, ages_ms.get(node))))
         return texts
 
 
@@ -112,7 +108,7 @@ class PendingUpdate:
         self._last_seq: dict[str, tuple[str, int]] = {}
         self._dropped: dict[str, Intervals] = {}
         self._notices: deque[str] = deque(maxlen=_NOTICES_MAX)
-        self._progress_by_session: dict[str, Mapping[str, Any]] = {}
+        self._progress_by_session: dict[str, SessionProgress] = {}
 
     def __bool__(self) -> bool:
         """Return whether there is anything to send."""
@@ -140,7 +136,7 @@ class PendingUpdate:
                 self._add_dropped(node, before.span.seq_first, before.span.seq)
         self._summaries[node] = summary
 
-    def add_progress(self, node: str, progress_by_session: Mapping[str, Mapping[str, Any]]) -> None:
+    def add_progress(self, node: str, progress_by_session: Mapping[str, SessionProgress]) -> None:
         """Add the progress of sessions of a node, unless it is filtered out; the newest is sent."""
         if self._node_filter in (None, node):
             self._progress_by_session |= progress_by_session
@@ -169,25 +165,24 @@ class PendingUpdate:
         self._dropped.setdefault(node, Intervals()).add(seq_first, seq_last)
 
 
-def _frame_message(node: str, summary: FrameSummary, age_ms: float | None) -> dict[str, Any]:
+def _make_frame_message(node: str, summary: FrameSummary, age_ms: float | None) -> FrameMessage:
     (force_min_n, gauge_min_kpa), (force_max_n, gauge_max_kpa) = summary.tiles
-    return {
-        "type": "frame",
-        "node": node,
-        "seq_first": summary.span.seq_first,
-        "seq": summary.span.seq,
-        "t_ns": summary.span.t_ns,
-        "n": summary.span.n,
+    return FrameMessage(
+        node=node,
+        seq_first=summary.span.seq_first,
+        seq=summary.span.seq,
+        t_ns=summary.span.t_ns,
+        n=summary.span.n,
         **summary.newest,
-        "gauge_min_kpa": round_values(gauge_min_kpa, "kpa"),
-        "gauge_max_kpa": round_values(gauge_max_kpa, "kpa"),
-        "force_min_n": round_values(force_min_n, "n"),
-        "force_max_n": round_values(force_max_n, "n"),
-        "grf_min_n": round_value(summary.span.grf_min_n, "n"),
-        "grf_max_n": round_value(summary.span.grf_max_n, "n"),
-        "grf_lower_bound_max_n": round_value(summary.span.grf_lower_bound_max_n, "n"),
-        "age_ms": None if age_ms is None else round(age_ms, 1),
-    }
+        gauge_min_kpa=round_values(gauge_min_kpa, "kpa"),
+        gauge_max_kpa=round_values(gauge_max_kpa, "kpa"),
+        force_min_n=round_values(force_min_n, "n"),
+        force_max_n=round_values(force_max_n, "n"),
+        grf_min_n=round_value(summary.span.grf_min_n, "n"),
+        grf_max_n=round_value(summary.span.grf_max_n, "n"),
+        grf_lower_bound_max_n=round_value(summary.span.grf_lower_bound_max_n, "n"),
+        age_ms=None if age_ms is None else round(age_ms, 1),
+    )
 
 
 def summarize_frames(
@@ -238,8 +233,3 @@ def round_values(values: npt.NDArray[Any], unit: str) -> list[float | None]:
 def round_value(value: float, unit: str) -> float | None:
     """Round a number for JSON; a non-finite value becomes None."""
     return round(value, _DIGITS[unit]) if math.isfinite(value) else None
-
-
-def encode_json(message: Mapping[str, Any]) -> str:
-    """Encode compact JSON; NaN is an error."""
-    return _ENCODER.encode(message)

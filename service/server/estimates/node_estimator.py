@@ -19,7 +19,7 @@ from typing import Any, Literal
 from devices.errors import CalibrationError, DamagedFileError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
-from service.protocol import Hello
+from service.protocol.link import Hello
 from service.server.estimates.live_estimator import EstimateEpoch, LiveEstimator
 from service.server.estimates.tare_controller import TareController
 from service.sessions.pipeline import Columns

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import takewhile
-from typing import Literal
 
 import numpy as np
 
@@ -27,6 +26,7 @@ from service.estimation.tare.tare import (
     compute_warming_k,
     has_temperature_changed,
 )
+from service.protocol.live import AutoTareState
 from service.server.estimates.live_estimator import LiveEstimator
 from service.sessions.tares import RecordedTare, TareHistory
 from storage.intervals import Intervals
@@ -37,8 +37,6 @@ FLIGHT_CHECK_PERIOD_NS = 5_000_000_000
 LEAD_TIMEOUT_NS = 10_000_000_000
 """Timeout for missing frames of a lead after its end."""
 _BY_HAND = "lift the foot, hold it still, and tare"
-
-AutoTareState = Literal["on", "paused", "off"]
 
 
 class TareController:

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from service.protocol import CloseConnection, LinkCloseCode
+from service.protocol.codec import CloseConnection, LinkCloseCode
 from service.server.live_feed.buffer import FeedBatch, FeedBuffer, StreamView
 from service.server.live_feed.events import (
     FeedEvent,

@@ -17,7 +17,6 @@ import logging
 from collections import deque
 from collections.abc import AsyncGenerator, Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import numpy as np
 
@@ -28,7 +27,8 @@ from service.estimation.calibration import Calibration
 from service.estimation.compilation import is_compiling
 from service.estimation.pipeline.plan import compute_settling_time_s, make_plan
 from service.estimation.tare.tare import Tare
-from service.protocol import CloseConnection, LinkCloseCode
+from service.protocol.codec import CloseConnection, LinkCloseCode
+from service.protocol.live import Policy
 from service.server.estimates.node_estimator import EstimatedBatch
 from service.server.live_feed.buffer import (
     FeedBuffer,
@@ -235,9 +235,6 @@ def _list_changes(
 
 
 log = logging.getLogger("foottile.live")
-
-Policy = Literal["lossless", "drop_oldest", "latest"]
-POLICIES: tuple[Policy, ...] = get_args(Policy)
 
 
 def check_stream_and_get_requested_position(

@@ -18,7 +18,8 @@ from websockets.sync.client import connect
 from websockets.typing import Origin
 
 from service.api.connection_limits import LimitSettings
-from service.protocol import INGEST_PATH, LIVE_PATH
+from service.protocol.link import INGEST_PATH
+from service.protocol.live import LIVE_PATH
 from tests.service.fake_node import NodeOf
 from tests.service.running import Running, ServeWith, assert_refused
 from tests.tokens import SHARED_BEARER

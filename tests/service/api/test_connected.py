@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from websockets.sync.client import ClientConnection
 
-from service.protocol import LINK_TIMEOUT_S
+from service.protocol.link import LINK_TIMEOUT_S
 from tests.faults.proxy import Proxy
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running, assert_refused

@@ -18,7 +18,9 @@ from websockets.exceptions import ConnectionClosed
 
 from service.api.connection_limits import OWN_FILES, RESERVE, ConnectionLimiter, LimitSettings
 from service.api.protocols import accept_connections
-from service.protocol import INGEST_PATH, LIVE_PATH, PROTOCOL, Identify, LinkCloseCode
+from service.protocol.codec import LinkCloseCode
+from service.protocol.link import INGEST_PATH, PROTOCOL, Identify
+from service.protocol.live import LIVE_PATH
 from tests.service.fake_node import NodeOf, Play, Spoken
 from tests.service.running import Running, ServeWith, assert_refused, closed
 from tests.tokens import SHARED_TOKEN

@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 from websockets.exceptions import InvalidStatus
 
-from service.protocol import INGEST_PATH, LIVE_PATH
+from service.protocol.link import INGEST_PATH
+from service.protocol.live import LIVE_PATH
 from tests.service.api.access import BEARER, CHANGES, TOKEN
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running, ServeWith, assert_refused

@@ -15,7 +15,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 
 from devices.frames import FrameBatch
-from service.protocol import INGEST_PATH, MESSAGE_BYTES_MAX, PROTOCOL
+from service.protocol.link import INGEST_PATH, MESSAGE_BYTES_MAX, PROTOCOL
 from storage.verify.journal import verify_journal
 from tests.builders.frames import assert_same_bits, with_columns
 from tests.builders.odd_values import with_value
@@ -113,7 +113,7 @@ def test_each_step_of_the_handshake_is_needed_once(healthy: FakeNode, odd: FakeN
     assert wait_for_close(odd, healthy) == (4001, "hello was expected, in text")
     odd.connect()
     odd.socket.send(odd.hello().model_dump_json())
-    assert wait_for_close(odd, healthy) == (4001, "hello was sent before")
+    assert wait_for_close(odd, healthy) == (4001, "hello is not expected here")
 
 
 @pytest.mark.parametrize(

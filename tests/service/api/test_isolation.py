@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from devices.frames import FrameBatch
-from service.server.broadcast.views import NodeView
+from service.protocol.live import NodeView
 from service.server.estimates.live_estimator import LiveEstimator
 from service.server.node import ServerNode
 from tests.service.fake_node import FakeNode, NodeOf
@@ -107,15 +107,15 @@ def test_a_bug_in_a_nodes_summary_hides_only_this_node(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    from_node = NodeView.from_node
+    make_node_view = running.server.make_node_view
 
-    def view_or_fail(known: ServerNode, *rest: Any) -> NodeView:
+    def view_or_fail(known: ServerNode) -> NodeView:
         if known.name == "bench":
             raise ArithmeticError("a bug")
-        return from_node(known, *rest)
+        return make_node_view(known)
 
     node.connect()
-    monkeypatch.setattr(NodeView, "from_node", view_or_fail)
+    monkeypatch.setattr(running.server, "make_node_view", view_or_fail)
     with caplog.at_level(logging.ERROR), running.socket(LIVE) as live:
         hello = json.loads(live.recv(timeout=PATIENCE_S))
         assert [shown["node"] for shown in hello["nodes"]] == ["other"]

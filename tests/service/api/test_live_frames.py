@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
+from pydantic import TypeAdapter
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection
 
 import service.api.routes.sockets.live
+from service.protocol.live import FeedMessage
 from tests.service.api.sealed import Sealed
 from tests.service.api.test_calibrations import assign, stiffer
 from tests.service.fake_node import FakeNode, NodeOf
@@ -22,6 +24,8 @@ from tests.service.running import Running, closed
 from tests.waiting import PATIENCE_S, until
 
 LIVE = "/api/v1/live?format=arrow"
+
+FEED_MESSAGES: TypeAdapter[FeedMessage] = TypeAdapter(FeedMessage)
 
 
 @dataclass
@@ -39,6 +43,7 @@ class Received:
         message = self.socket.recv(timeout=PATIENCE_S)
         if isinstance(message, str):
             self.texts.append(json.loads(message))
+            FEED_MESSAGES.validate_json(message, strict=True)
             if self.texts[-1]["type"] == "stream":
                 self.stream_id, self.schema = self.texts[-1]["stream_id"], None
             return self.texts[-1]
@@ -151,16 +156,16 @@ def test_a_stream_has_the_requested_columns_and_is_an_arrow_stream(
     [
         ("columns=grf_n,colour", "'colour'"),
         ("columns=force_n_2", "'force_n_2'"),
-        ("policy=all", "policy='all'"),
-        ("policy=", "policy=''"),
-        ("stream_id=x", "32 hex digits"),
+        ("policy=all", "'drop_oldest'"),
+        ("policy=", "policy: "),
+        ("stream_id=x", "stream_id: "),
         ("stream_id=" + "0" * 32, "no stream"),
-        ("from_seq=-1", "from_seq='-1'"),
-        ("from_seq=1e3", "from_seq='1e3'"),
-        ("from_seq=" + "9" * 400, "from_seq="),
+        ("from_seq=-1", "from_seq: "),
+        ("from_seq=1e3", "from_seq: "),
+        ("from_seq=" + "9" * 400, "from_seq: "),
         ("node=nobody", "'nobody'"),
-        ("rate_hz=30", "'rate_hz'"),
-        ("colour=red", "'colour'"),
+        ("rate_hz=30", "rate_hz: "),
+        ("colour=red", "colour: "),
     ],
 )
 def test_a_wrong_query_closes_with_a_reason(sealed: Sealed, query: str, word: str) -> None:

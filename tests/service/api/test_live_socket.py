@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 import service.server.broadcast.broadcaster
+from service.protocol.live import SessionDeleted
 from tests.service.fake_node import FakeNode, NodeOf, Play
 from tests.service.running import Running, closed, receive_live
 from tests.waiting import PATIENCE_S, until
@@ -125,13 +126,13 @@ def test_any_message_but_a_ping_closes(shared: Running, message: str | bytes) ->
 @pytest.mark.parametrize(
     ("query", "word"),
     [
-        ("speed=3", "'speed'"),
-        ("format=xml", "format='xml'"),
-        ("policy=all", "policy='all'"),
-        *[(f"rate_hz={value}", "1 to 60") for value in ("0", "61", "nan", "fast", "")],
+        ("speed=3", "speed: "),
+        ("format=xml", "'json'"),
+        ("policy=all", "'latest'"),
+        *[(f"rate_hz={value}", "rate_hz: ") for value in ("0", "61", "nan", "fast", "")],
         ("node=nobody", "'nobody'"),
         ("node=" + "x" * 500, "no node"),
-        ("%F0%9F%98%80" * 60 + "=1", "unknown parameter"),
+        ("%F0%9F%98%80" * 60 + "=1", "\N{GRINNING FACE}"),
     ],
 )
 def test_a_wrong_query_closes_with_a_reason(shared: Running, query: str, word: str) -> None:
@@ -173,7 +174,7 @@ def test_a_subscriber_that_does_not_read_is_disconnected_and_delays_no_other(
     with slow, running.socket(f"{LIVE}?rate_hz=60") as live, Play(tared, 10.0) as playing:
         until(lambda: running.server.broadcaster.subscriber_count == 2)
         # The buffers of kernel and server have to fill.
-        notice = {"type": "node", "node": {"padding": "x" * 200_000}}
+        notice = SessionDeleted(session_id="x" * 200_000)
         end_s = time.monotonic() + 15.0
         received_s = []
         while running.server.broadcaster.subscriber_count == 2:

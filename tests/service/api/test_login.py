@@ -12,7 +12,8 @@ import pytest
 from websockets.exceptions import InvalidStatus
 
 from service.api.logins import LOGINS_MAX, TICKET_S, TICKETS_MAX, Logins, Role, SecretStore
-from service.protocol import INGEST_PATH, LIVE_PATH
+from service.protocol.link import INGEST_PATH
+from service.protocol.live import LIVE_PATH
 from tests.service.api.access import BEARER, CHANGES, TOKEN
 from tests.service.patient import patient_server
 from tests.service.running import Running, assert_refused

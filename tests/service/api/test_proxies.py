@@ -11,7 +11,7 @@ from websockets.exceptions import ConnectionClosed
 
 from service.api.connection_limits import LimitSettings
 from service.api.settings import load_settings
-from service.protocol import LIVE_PATH
+from service.protocol.live import LIVE_PATH
 from tests.service.patient import patient_server
 from tests.service.running import Running, assert_refused
 from tests.tokens import SHARED_BEARER

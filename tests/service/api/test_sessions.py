@@ -20,7 +20,7 @@ import pytest
 from devices.errors import FootTileError
 from service.api.address import load_or_create_token
 from service.estimation import LIVE_LAG_MS, OFFLINE_LAG_MS
-from service.protocol import format_close_reason
+from service.protocol.codec import format_close_reason
 from service.user_folders import register_private_folder, strip_private_folders
 from storage.durable_files import set_aside_damaged
 from storage.intervals import NO_END, Intervals

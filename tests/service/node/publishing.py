@@ -11,7 +11,7 @@ import numpy as np
 
 from service.node.frame_sender import NodeCallbacks
 from service.node.publisher import Publisher
-from service.protocol import EarlierStream, Hello, NodeStatus, RetentionMessage
+from service.protocol.link import EarlierStream, Hello, NodeStatus, RetentionMessage
 from storage.intervals import Intervals
 from storage.journal.node.stream import NodeStream
 from storage.journal.stream_notes import StreamNotes

@@ -9,7 +9,7 @@ import pytest
 from devices.errors import CalibrationError
 from service.node.options import NodeOptions
 from service.node.server_connection import make_hello
-from service.protocol import NodeStatus
+from service.protocol.link import NodeStatus
 from service.rig.emulated_foot import RigOptions
 from storage.journal.node.journal import NodeJournal
 from tests.builders.arrays import make_array

@@ -16,24 +16,26 @@ import service.server
 from devices.errors import UsageError
 from service.node.server_connection import make_ingest_url
 from service.node_identity import compute_fingerprint, make_proof
-from service.protocol import (
-    NODE_MESSAGES,
-    PROTOCOL,
+from service.protocol.codec import (
     SUBPROTOCOL,
+    LinkCloseCode,
+    encode_message,
+    strip_binary_crc,
+    strip_text_crc,
+)
+from service.protocol.link import (
+    LINK_MESSAGES,
+    PROTOCOL,
     Ack,
     Challenge,
     Hello,
     Identify,
-    LinkCloseCode,
     LossReport,
     Proof,
     RetentionMessage,
     StreamNumbers,
     StreamSelect,
     Welcome,
-    encode_message,
-    strip_binary_crc,
-    strip_text_crc,
 )
 from storage.intervals import Intervals
 from storage.journal.node.retention_requests import RetentionRequests as NodeWanted
@@ -73,16 +75,16 @@ class Script:
     async def serve(self, connection: ServerConnection) -> None:
         self.connection = connection
         assert isinstance(
-            NODE_MESSAGES.validate_json(strip_text_crc(await connection.recv())), Identify
+            LINK_MESSAGES.validate_json(strip_text_crc(await connection.recv())), Identify
         )
         challenge = Challenge(
             protocol=PROTOCOL, server_id="played", nonce="0" * 64, is_known=self.is_known
         )
         await connection.send(encode_message(challenge))
-        proof = NODE_MESSAGES.validate_json(strip_text_crc(await connection.recv()))
+        proof = LINK_MESSAGES.validate_json(strip_text_crc(await connection.recv()))
         assert isinstance(proof, Proof)
         self.proofs.append(proof)
-        hello = NODE_MESSAGES.validate_json(strip_text_crc(await connection.recv()))
+        hello = LINK_MESSAGES.validate_json(strip_text_crc(await connection.recv()))
         assert isinstance(hello, Hello)
         self.hellos.append(hello)
         lacks = self.lacks or (
@@ -102,7 +104,7 @@ class Script:
                     ack = Ack(stream_id=stream_id, seq_first=first, seq_last=last)
                     await connection.send(encode_message(ack))
                 continue
-            said = NODE_MESSAGES.validate_json(strip_text_crc(message))
+            said = LINK_MESSAGES.validate_json(strip_text_crc(message))
             self.said.append(said)
             if isinstance(said, StreamSelect):
                 stream_id = said.stream_id

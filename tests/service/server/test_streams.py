@@ -12,11 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.frames import (
-    FRAME_COLUMNS,
-    FrameBatch,
-)
-from service.protocol import PROTOCOL, EarlierStream, Hello
+from devices.frames import FRAME_COLUMNS, FrameBatch
+from service.protocol.link import PROTOCOL, EarlierStream, Hello
 from service.server.node import ServerNode
 from storage.intervals import NO_END, Intervals
 from storage.schema import wire_schema

@@ -13,7 +13,7 @@ import pytest
 from devices.errors import StorageError, TareError
 from devices.flags import FrameFlag, TileFlag
 from devices.frames import FrameBatch
-from service.protocol import PROTOCOL, Hello
+from service.protocol.link import PROTOCOL, Hello
 from service.server.node import ServerNode
 from storage.intervals import Intervals
 from storage.schema import wire_schema

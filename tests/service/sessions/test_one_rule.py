@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.node.local_recording import LocalRecording
-from service.protocol import PROTOCOL, Hello
+from service.protocol.link import PROTOCOL, Hello
 from service.server import session_parts
 from service.server.node import ServerNode
 from service.server.nodes import NodeRegistry

@@ -21,12 +21,8 @@ from service.api.routes.common import (
 from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
 from service.estimation.tare.tare import TareSource
-from service.server.broadcast.views import (
-    CalibrationView,
-    TileView,
-    View,
-    make_tile_views,
-)
+from service.protocol.live import CalibrationView, TileView, View
+from service.server.broadcast.views import make_tile_views
 from service.server.estimates.live_estimator import TileRanges
 from service.server.server import Server
 from service.user_folders import PublicText

@@ -22,7 +22,8 @@ from service.api.routes.common import (
     problem_responses,
     stored_table_response,
 )
-from service.server.broadcast.views import MarkerView, Page, SessionView, View
+from service.protocol.live import SessionDeleted, SessionView, View
+from service.server.broadcast.views import MarkerView, Page, make_marker_view, make_session_view
 from service.user_folders import PublicText
 from storage.formats.writers.tables import PARQUET
 from storage.sessions.folder import Ledger
@@ -158,7 +159,7 @@ async def start_session(
         )
         server.notify_node_changed(server.nodes.get(body.node))
     response.headers["Location"] = f"/api/v1/sessions/{session.id}"
-    return SessionView.from_session(session, server.recorder)
+    return make_session_view(session, server.recorder)
 
 
 @router.post(
@@ -179,7 +180,7 @@ async def stop_session(session_id: str, server: ServerState) -> SessionView:
         server.notify_node_changed(node)
     if node is not None and node.is_connected:
         session = await server.sealer.wait_until_sealed_or_timeout(session_id, SEAL_TIMEOUT_S)
-    return SessionView.from_session(session, server.recorder)
+    return make_session_view(session, server.recorder)
 
 
 @router.post(
@@ -195,7 +196,7 @@ async def abandon_missing(session_id: str, server: ServerState) -> SessionView:
     """
     server.recorder.abandon_missing(session_id)
     session = await server.sealer.wait_until_sealed_or_timeout(session_id, SEAL_TIMEOUT_S)
-    return SessionView.from_session(session, server.recorder)
+    return make_session_view(session, server.recorder)
 
 
 @router.get("", operation_id="listSessions", summary="Sessions, newest first")
@@ -256,7 +257,7 @@ async def list_sessions(
     page = list(islice(found, limit))
     more = next(found, None) is not None
     return SessionPage(
-        items=[SessionView.from_session(session, server.recorder) for session in page],
+        items=[make_session_view(session, server.recorder) for session in page],
         unreadable=server.sessions.unreadable,
         next_cursor=f"{page[-1].started_t_ns}.{page[-1].id}" if more else None,
     )
@@ -270,7 +271,7 @@ async def list_sessions(
 )
 async def get_session(session_id: str, server: ServerState) -> SessionView:
     """Return the present state of a session."""
-    return SessionView.from_session(server.sessions.get_session(session_id), server.recorder)
+    return make_session_view(server.sessions.get_session(session_id), server.recorder)
 
 
 @router.patch(
@@ -287,7 +288,7 @@ async def change_session(
     session = server.sessions.edit_user_fields(
         session_id, if_revision=parse_if_match(if_match), **changes
     )
-    return SessionView.from_session(session, server.recorder)
+    return make_session_view(session, server.recorder)
 
 
 @router.delete(
@@ -309,7 +310,7 @@ async def delete_session(session_id: str, server: ServerState, if_match: IfMatch
     Only emptying the trash frees its space.
     """
     server.recorder.move_to_trash(session_id, if_revision=parse_if_match(if_match))
-    server.broadcaster.queue_droppable_notice({"type": "deleted", "session_id": session_id})
+    server.broadcaster.queue_droppable_notice(SessionDeleted(session_id=session_id))
 
 
 @router.post(
@@ -322,7 +323,7 @@ async def delete_session(session_id: str, server: ServerState, if_match: IfMatch
 async def add_marker(session_id: str, body: AddMarker, server: ServerState) -> MarkerView:
     """Add a marker, now or at a given time."""
     event = server.sessions.add_marker(session_id, body.label, body.t_ns, body.id)
-    return MarkerView.from_marker(event)
+    return make_marker_view(event)
 
 
 @router.patch(
@@ -341,7 +342,7 @@ async def change_marker(
     """Change a marker's label or time."""
     changes = {n: v for n, v in body.model_dump(exclude_unset=True).items() if v is not None}
     only_if = parse_if_match(if_match)
-    return MarkerView.from_marker(
+    return make_marker_view(
         server.sessions.edit_marker(session_id, marker_id, if_revision=only_if, **changes)
     )
 
@@ -389,7 +390,7 @@ async def list_markers(
             session, server.sessions.folder.get_path(session_id) / MARKERS_NAME
         )
     marked = sorted(session.markers, key=lambda event: event.t_ns)
-    return Page(items=[MarkerView.from_marker(event) for event in marked])
+    return Page(items=[make_marker_view(event) for event in marked])
 
 
 @router.get("/{session_id}/ledger", operation_id="getLedger", summary="Ledger", responses=_UNKNOWN)
@@ -418,7 +419,7 @@ class Emptied(View):
 async def list_trash(server: ServerState) -> Page[SessionView]:
     """Return deleted sessions, newest first; each can be restored."""
     deleted = server.sessions.trash.list_sessions()
-    return Page(items=[SessionView.from_session(session, server.recorder) for session in deleted])
+    return Page(items=[make_session_view(session, server.recorder) for session in deleted])
 
 
 @trash_router.post(
@@ -429,7 +430,7 @@ async def list_trash(server: ServerState) -> Page[SessionView]:
 )
 async def restore_session(session_id: str, server: ServerState) -> SessionView:
     """Restore a session; a pending one completes when its node is back."""
-    return SessionView.from_session(server.recorder.restore_session(session_id), server.recorder)
+    return make_session_view(server.recorder.restore_session(session_id), server.recorder)
 
 
 @trash_router.delete(

@@ -30,7 +30,8 @@ from service.api.routes.downloads.exports import (
     require_frames,
 )
 from service.api.routes.recordings import sessions as one
-from service.server.broadcast.views import SessionView, View
+from service.protocol.live import SessionView, View
+from service.server.broadcast.views import make_session_view
 from service.server.server import Server
 from service.server.takes import Take
 from service.user_folders import PublicText
@@ -69,7 +70,7 @@ class TakeView(View):
     @classmethod
     def from_take(cls, take: Take, server: Server) -> TakeView:
         """Return the present state of a take."""
-        views = [SessionView.from_session(session, server.recorder) for session in take.sessions]
+        views = [make_session_view(session, server.recorder) for session in take.sessions]
         return cls(id=take.id, sessions=views, failed=take.errors_by_node)
 
 

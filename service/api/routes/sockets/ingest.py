@@ -11,32 +11,32 @@ from typing import TypeVar
 
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
-from devices.errors import FileFormatError, LinkError, StorageError, escape_control_chars
+from devices.errors import LinkError, StorageError, escape_control_chars
 from service.api.protocols import send_message
-from service.protocol import (
+from service.protocol.codec import (
+    SUBPROTOCOL,
+    CloseConnection,
+    LinkCloseCode,
+    decode_message,
+    encode_message,
+    format_close_reason,
+    strip_binary_crc,
+)
+from service.protocol.link import (
+    LINK_MESSAGES,
     LINK_TIMEOUT_S,
     MESSAGE_BYTES_MAX,
-    NODE_MESSAGES,
     PROTOCOL,
-    SUBPROTOCOL,
     Ack,
     ClockProbe,
     ClockSample,
-    CloseConnection,
     Hello,
     Identify,
-    LinkCloseCode,
     LossReport,
-    NodeMessage,
     NodeStatus,
     Proof,
     StreamSelect,
     Welcome,
-    encode_message,
-    format_close_reason,
-    parse_message,
-    strip_binary_crc,
-    strip_text_crc,
 )
 from service.server.identities import IdentityClaim, ProvenOrFirstContact
 from service.server.node import ServerNode
@@ -114,7 +114,7 @@ def _require_message(kind: type[_Message], message: str | bytes) -> _Message:
     name = kind.model_fields["type"].default
     if isinstance(message, bytes):
         raise CloseConnection(LinkCloseCode.REFUSED, f"{name} was expected, in text")
-    parsed = _parse_message(message)
+    parsed = decode_message(LINK_MESSAGES, message)
     if not isinstance(parsed, kind):
         raise CloseConnection(LinkCloseCode.REFUSED, f"{name} was expected, not {parsed.type}")
     return parsed
@@ -226,7 +226,7 @@ async def _receive_messages(socket: WebSocket, server: Server, link: NodeLink) -
         if isinstance(message, bytes):
             tare_before = node.estimator.live.tare_in_use_unless_lost
             try:
-                due = node.receive_frames(link.stream, _verify_frames(message), server_utc_ns())
+                due = node.receive_frames(link.stream, strip_binary_crc(message), server_utc_ns())
             except LinkError as error:
                 raise CloseConnection(LinkCloseCode.REFUSED, str(error)) from error
             server.broadcaster.add_to_history_and_updates(node, due)
@@ -235,7 +235,7 @@ async def _receive_messages(socket: WebSocket, server: Server, link: NodeLink) -
             if node.estimator.live.tare_in_use_unless_lost is not tare_before:
                 server.notify_node_changed(node)
             continue
-        parsed = _parse_message(message)
+        parsed = decode_message(LINK_MESSAGES, message)
         match parsed:
             case ClockProbe(id=number):
                 await _answer_probe(socket, ClockProbe(id=number, server_t_ns=server_utc_ns()))
@@ -249,8 +249,8 @@ async def _receive_messages(socket: WebSocket, server: Server, link: NodeLink) -
                 server.notify_node_changed(node)
             case LossReport():
                 _find_announced_stream(node, parsed.stream_id).set_node_losses(parsed.lost)
-            case Identify() | Proof() | Hello():
-                raise CloseConnection(LinkCloseCode.REFUSED, f"{parsed.type} was sent before")
+            case _:
+                raise CloseConnection(LinkCloseCode.REFUSED, f"{parsed.type} is not expected here")
 
 
 def _find_announced_stream(node: ServerNode, stream_id: str) -> ServerStream:
@@ -301,24 +301,6 @@ async def _receive_message(socket: WebSocket) -> str | bytes:
     if len(data) > MESSAGE_BYTES_MAX:
         raise CloseConnection(LinkCloseCode.TOO_BIG, f"a message of {len(data)} bytes")
     return data
-
-
-def _parse_message(message: str) -> NodeMessage:
-    try:
-        text = strip_text_crc(message)
-    except LinkError as error:
-        raise CloseConnection(LinkCloseCode.MALFORMED, str(error)) from error
-    try:
-        return parse_message(NODE_MESSAGES, text)
-    except LinkError as error:
-        raise CloseConnection(LinkCloseCode.REFUSED, str(error)) from error
-
-
-def _verify_frames(message: bytes) -> bytes:
-    try:
-        return strip_binary_crc(message)
-    except FileFormatError as error:
-        raise CloseConnection(LinkCloseCode.MALFORMED, str(error)) from error
 
 
 def _read_protocol(message: str | bytes) -> int | None:

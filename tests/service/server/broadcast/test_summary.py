@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from devices.frames import FrameBatch
 from service.estimation.foot import CONTACT_UNKNOWN
+from service.protocol.live import SessionProgress
 from service.server.broadcast.history import nan_min, reduce_tiles, summarize_force
 from service.server.broadcast.summary import (
     SUMMARY_NS,
@@ -85,6 +86,17 @@ def taken(
 
     texts = summary.pop_update().encode_messages(ages_ms or {})
     return [json.loads(text, parse_constant=refuse) for text in texts]
+
+
+def progress(frames: int) -> SessionProgress:
+    return SessionProgress(
+        frames=frames,
+        pending_frames=0,
+        pending_reason=None,
+        lost={},
+        missed_slots=0,
+        duration_s=0.0,
+    )
 
 
 def of_type(messages: Sequence[dict[str, Any]], kind: str) -> list[dict[str, Any]]:
@@ -273,11 +285,11 @@ def test_there_is_something_to_tell_until_it_is_taken() -> None:
     summary = PendingUpdate("left")
     assert not summary
     summary.join_summary_or_drop_older("right", piece(0, 1))
-    summary.add_progress("right", {"session": {"frames": 1}})
+    summary.add_progress("right", {"session": progress(1)})
     assert not summary
     changes: list[Callable[[], None]] = [
         lambda: summary.join_summary_or_drop_older("left", piece(0, 1)),
-        lambda: summary.add_progress("left", {"session": {"frames": 1}}),
+        lambda: summary.add_progress("left", {"session": progress(1)}),
         lambda: summary.add_notice('{"type":"notice"}'),
     ]
     for change in changes:
@@ -300,7 +312,7 @@ def test_notices_come_first_in_their_order_and_the_oldest_are_forgotten() -> Non
 
 def test_a_session_is_not_told_as_smaller_after_it_is_told_as_sealed() -> None:
     summary = PendingUpdate()
-    summary.add_progress("bench", {"session": {"frames": 10}})
+    summary.add_progress("bench", {"session": progress(10)})
     summary.add_notice('{"type":"session"}')
     assert [m["type"] for m in taken(summary)] == ["session_progress", "session"]
 
@@ -329,7 +341,7 @@ def test_what_was_taken_and_not_told_is_told_later_as_if_it_had_not_been_taken(
         for summary in (told_once, feed):
             summary.join_summary_or_drop_older("bench", piece(seq, rows, period_ns=period_ns))
             summary.add_notice(json.dumps({"type": "notice", "n": at}))
-            summary.add_progress("bench", {"session": {"frames": seq}})
+            summary.add_progress("bench", {"session": progress(seq)})
         seq += rows
         if at in ticks:
             missed.add_update(feed.pop_update())

@@ -16,9 +16,9 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
-from service.protocol import CloseConnection, LinkCloseCode
+from service.protocol.codec import CloseConnection, LinkCloseCode
+from service.protocol.live import Policy
 from service.server.live_feed.events import FeedEvent, FrameRows, Gap, Position, StreamStart
-from service.server.live_feed.reader import Policy
 from tests.service.server.live_feed.world import LOST, WAITING, World, bits
 
 few = st.integers(1, 30)

@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 
 from devices.errors import DamagedFramesError, FileFormatError, StorageError
-from service.protocol import CloseConnection, LinkCloseCode
+from service.protocol.codec import CloseConnection, LinkCloseCode
+from service.protocol.live import Policy
 from service.server.live_feed.events import FeedEvent, FrameRows, Gap, Position, StreamStart
-from service.server.live_feed.reader import FeedReader, Policy, RecomputedFrames
+from service.server.live_feed.reader import FeedReader, RecomputedFrames
 from storage.journal.journal import Journal
 from tests.builders.arrays import PERIOD_NS, UTC_NS
 from tests.service.server.live_feed.world import WAITING, World, bits

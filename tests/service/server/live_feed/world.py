@@ -16,10 +16,11 @@ import numpy as np
 
 from devices.errors import DamagedFramesError
 from devices.frames import ArrayInfo, FrameBatch
-from service.protocol import PROTOCOL, EarlierStream, Hello
+from service.protocol.link import PROTOCOL, EarlierStream, Hello
+from service.protocol.live import Policy
 from service.server.live_feed.buffer import FeedBuffer
 from service.server.live_feed.events import Position
-from service.server.live_feed.reader import FeedReader, Policy
+from service.server.live_feed.reader import FeedReader
 from service.server.node import ServerNode
 from service.sessions.pipeline import Columns
 from storage.intervals import NO_END, Intervals

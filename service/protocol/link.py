@@ -1,4 +1,4 @@
-"""Protocol between node and server, `foottile.v1`: messages, checksums, close codes.
+"""Messages between node and server, `foottile.v1`.
 
 node                                  server
     identify (its name)              -->
@@ -18,35 +18,16 @@ acknowledged; a new connection begins with identify again. Frames may arrive twi
 a server stores each (stream, seq) once.
 
 A node proves that it is the machine that had its name before: `service.node_identity`.
-
-Every message has a CRC-32 (zlib), because neither websockets nor Arrow detect a flipped bit: the
-last four bytes of a binary message, little endian, over all before; the last field of a text
-message, `"crc32"` with eight hex digits, over the text before its comma. A message with a wrong
-CRC-32 ends the connection, and its content is sent again.
-
-Server and sessions only store it, for people and for `foottile node`; `devices.scene` interprets
-it.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import re
-import zlib
-from enum import IntEnum
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    Field,
-    TypeAdapter,
-    ValidationError,
-    model_validator,
-)
+from pydantic import AfterValidator, Field, TypeAdapter, model_validator
 
-from devices.errors import FileFormatError, LinkError
 from devices.frames import ArrayInfo
 from devices.types import (
     Count,
@@ -60,7 +41,6 @@ from devices.types import (
     check_text,
 )
 from service.estimation.calibration import Calibration
-from service.user_folders import strip_private_folders
 from storage.intervals import NO_END
 
 SCENE_BYTES_MAX = 256 << 10
@@ -97,22 +77,16 @@ def _check_value(value: Any, depth: int) -> None:
 
 
 SceneContent = Annotated[dict[str, Any], AfterValidator(_check_bounds)]
+"""Content of a scene file. Server and sessions only store it, for people and for `foottile node`;
+`devices.scene` interprets it."""
 
-
-_T = TypeVar("_T")
-
-SUBPROTOCOL = "foottile.v1"
 PROTOCOL = 4
 INGEST_PATH = "/api/v1/ingest"
-LIVE_PATH = "/api/v1/live"
 MESSAGE_BYTES_MAX = 1 << 20
 """Longest message that either side accepts. A batch of 64 tiles is 0.1 MB."""
 LINK_TIMEOUT_S = 5.0
 """Timeout of the link: a side closes it after receiving nothing for so long."""
 PROBES_PER_MEASUREMENT = 8
-_REASON_BYTES_MAX = 123
-_CRC_BYTES = 4
-_TEXT_WITH_CRC = re.compile(r'(\{.*),"crc32":"([0-9a-f]{8})"\}', re.DOTALL)
 
 _INTERVALS_MAX = 1 << 14
 """Most intervals in a list: a gap every ten seconds for two days."""
@@ -128,40 +102,6 @@ _SeqOrEnd = Annotated[int, Field(ge=0, le=NO_END)]
 StreamId = Annotated[str, Field(pattern=f"^{STREAM_ID_PATTERN}$")]
 """Id of a stream."""
 _Hex256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-
-
-class LinkCloseCode(IntEnum):
-    """Close codes of foottile's websockets (4000 to 4999 are private to the application)."""
-
-    POLICY = 1008
-    TOO_BIG = 1009
-    BUG = 1011
-    RESTART = 1012
-    TRY_LATER = 1013
-    REFUSED = 4001
-    """Valid message, invalid content."""
-    WRONG_VERSION = 4002
-    MALFORMED = 4004
-    """Message damaged in transit."""
-    SILENT = 4005
-    TOO_SLOW = 4008
-    NAME_TAKEN = 4009
-    SUPERSEDED = 4010
-    NO_STREAM = 4011
-    """A requested stream does not exist, or no longer."""
-    UNREADABLE = 4012
-    """Stored frames cannot be read, permanently."""
-    WRONG_IDENTITY = 4013
-    """The node's name belongs to another machine, until a person accepts this one."""
-
-
-class CloseConnection(Exception):  # noqa: N818  # no error: how a connection ends
-    """Request of a connection's handler to close it with a code and a reason."""
-
-    def __init__(self, code: LinkCloseCode, reason: str) -> None:
-        super().__init__(reason)
-        self.code = code
-        self.reason = reason
 
 
 def _check_rising(pairs: tuple[tuple[int, int | None], ...]) -> tuple[tuple[int, int | None], ...]:
@@ -369,77 +309,19 @@ class NodeStatus(StrictModel):
     """Fault counts of this stream, by serial and reason."""
 
 
-NodeMessage = (
-    Identify | Proof | Hello | StreamSelect | ClockProbe | ClockSample | NodeStatus | LossReport
-)
-ServerMessage = Challenge | Welcome | Ack | RetentionMessage | ClockProbe
-NODE_MESSAGES: TypeAdapter[NodeMessage] = TypeAdapter(
-    Annotated[NodeMessage, Field(discriminator="type")]
-)
-SERVER_MESSAGES: TypeAdapter[ServerMessage] = TypeAdapter(
-    Annotated[ServerMessage, Field(discriminator="type")]
-)
-
-
-def parse_message(messages: TypeAdapter[_T], text: str) -> _T:
-    """Parse and validate a message.
-
-    Args:
-        messages: `NODE_MESSAGES` or `SERVER_MESSAGES`.
-        text: JSON without its checksum.
-
-    Raises:
-        LinkError: it is no such message, or a value is out of bounds.
-    """
-    try:
-        # Strict: true is not 1, and "1" neither.
-        return messages.validate_json(text, strict=True)
-    except ValidationError as error:
-        complaint = error.errors(include_url=False, include_input=False, include_context=False)[0]
-        where = ".".join(str(part) for part in complaint["loc"])
-        raise LinkError(f"message not understood: {where}: {complaint['msg']}") from error
-
-
-def encode_message(message: BaseModel) -> str:
-    """Encode a message as JSON with its checksum."""
-    body = message.model_dump_json()[:-1]
-    return f'{body},"crc32":"{zlib.crc32(body.encode()):08x}"}}'
-
-
-def strip_text_crc(text: str | bytes) -> str:
-    """Verify the checksum of a text message and return the JSON without it.
-
-    Raises:
-        LinkError: the checksum is wrong or missing.
-    """
-    text = text.decode(errors="replace") if isinstance(text, bytes) else text
-    found = _TEXT_WITH_CRC.fullmatch(text)
-    if found is None or int(found[2], 16) != zlib.crc32(found[1].encode()):
-        raise LinkError("a message was damaged on its way", expected="the CRC-32 of its text")
-    return found[1] + "}"
-
-
-def append_crc(payload: bytes) -> bytes:
-    """Append the checksum to encoded frames, for a binary message."""
-    return payload + zlib.crc32(payload).to_bytes(_CRC_BYTES, "little")
-
-
-def strip_binary_crc(message: bytes) -> bytes:
-    """Verify the checksum of a binary message and return the encoded frames.
-
-    Raises:
-        FileFormatError: the checksum is wrong or missing.
-    """
-    payload, check = message[:-_CRC_BYTES], message[-_CRC_BYTES:]
-    if len(check) < _CRC_BYTES or zlib.crc32(payload) != int.from_bytes(check, "little"):
-        raise FileFormatError(
-            "a message of frames was damaged on its way", expected="the CRC-32 of its bytes"
-        )
-    return payload
-
-
-def format_close_reason(text: str) -> str:
-    """Format a reason for a close frame and a log: 123 bytes (RFC 6455 5.5) in one line."""
-    text = strip_private_folders(text)
-    plain = "".join(char if char.isprintable() else "?" for char in text[:_REASON_BYTES_MAX])
-    return plain.encode()[:_REASON_BYTES_MAX].decode(errors="ignore")
+LinkMessage = Annotated[
+    Identify
+    | Challenge
+    | Proof
+    | Hello
+    | Welcome
+    | StreamSelect
+    | Ack
+    | RetentionMessage
+    | ClockProbe
+    | ClockSample
+    | NodeStatus
+    | LossReport,
+    Field(discriminator="type"),
+]
+LINK_MESSAGES: TypeAdapter[LinkMessage] = TypeAdapter(LinkMessage)

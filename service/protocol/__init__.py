@@ -1,0 +1,1 @@
+"""Messages of the websockets: link of nodes, live sockets; encoding, close codes."""
