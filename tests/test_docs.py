@@ -43,11 +43,9 @@ from service.api.settings import Settings
 from service.cli.main import SUMMARIES, load_command
 from service.estimation.calibration import TileCalibration
 from service.protocol.codec import LinkCloseCode
-from service.server.broadcast.history import reduce_tiles, summarize_force
-from service.server.broadcast.summary import PendingUpdate, summarize_frames
+from service.protocol.live import FeedMessage, PageMessage
 from service.server.server import Server
 from storage.schema import COLUMNS_BY_NAME
-from tests.builders.frames import make_frames
 from tests.tokens import SHARED_TOKEN
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -194,13 +192,25 @@ def openapi() -> dict[str, Any]:
     return plain
 
 
-def test_the_api_description_in_the_repository_is_the_one_that_is_served() -> None:
-    kept = ROOT / "docs" / "openapi.json"
-    if os.environ.get("FOOTTILE_WRITE_OPENAPI"):
-        kept.write_text(json.dumps(openapi(), indent=1, sort_keys=True) + "\n")
-    assert json.loads(kept.read_text("utf-8")) == openapi(), (
-        "if that is on purpose: FOOTTILE_WRITE_OPENAPI=1 sh scripts/test tests/test_docs.py"
-    )
+def load_script(name: str) -> Any:
+    spec = spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    script = module_from_spec(spec)
+    spec.loader.exec_module(script)
+    return script
+
+
+def test_the_api_description_and_the_types_of_the_pages_are_those_of_the_server() -> None:
+    for kept, made in (
+        (ROOT / "docs" / "openapi.json", json.dumps(openapi(), indent=1, sort_keys=True) + "\n"),
+        (ROOT / "scripts" / "page_types.d.ts", load_script("page_types").render_types(openapi())),
+    ):
+        if os.environ.get("FOOTTILE_WRITE_OPENAPI"):
+            kept.write_text(made)
+        assert kept.read_text("utf-8") == made, (
+            "if that is on purpose: FOOTTILE_WRITE_OPENAPI=1 sh scripts/test tests/test_docs.py"
+        )
 
 
 def test_every_route_is_documented() -> None:
@@ -211,16 +221,13 @@ def test_every_route_is_documented() -> None:
                 assert f"`{method.upper()} {shown}`" in API, (method, path)
 
 
-def test_every_live_message_field_is_documented() -> None:
-    summary = PendingUpdate()
-    frames = make_frames(1, 1)
-    span, tiles = summarize_force(frames, {}), reduce_tiles({}, 1)
-    piece = summarize_frames("0" * 32, span, tiles, frames, {})
-    summary.join_summary_or_drop_older("node", piece)
-    (text,) = summary.pop_update().encode_messages({"node": 1.0})
-    frame = json.loads(text)
-    for name in frame:
-        assert f"`{name}`" in API, name
+@pytest.mark.parametrize("messages", [PageMessage, FeedMessage])
+def test_every_live_message_and_its_fields_are_documented(messages: Any) -> None:
+    for message in get_args(get_args(messages)[0]):
+        for kind in get_args(message.model_fields["type"].annotation):
+            assert f"`{kind}`" in API, kind
+        for name in message.model_fields:
+            assert f"`{name}`" in API, name
 
 
 def test_every_close_code_is_documented() -> None:
@@ -403,11 +410,7 @@ def test_every_decision_is_in_the_list_and_says_what_would_change_our_mind() -> 
 
 
 def test_the_page_of_symptoms_is_that_of_its_document() -> None:
-    spec = spec_from_file_location("help_page", ROOT / "scripts" / "help_page.py")
-    assert spec is not None
-    assert spec.loader is not None
-    help_page = module_from_spec(spec)
-    spec.loader.exec_module(help_page)
+    help_page = load_script("help_page")
     text = help_page.SOURCE.read_text("utf-8")
     assert help_page.PAGE.read_text("utf-8") == help_page.render_page(text)
 

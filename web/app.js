@@ -46,8 +46,7 @@ const state = {
   received: { frameMs: null, heartbeat: null, sinceMs: performance.now() },
   recordings: new Map(),
   cannotRecord: "", // reason why a recording or a tare would be refused now
-  serverAheadMs: 0,
-  serverNowMs: () => Date.now() + state.serverAheadMs,
+  serverNowMs: () => link.serverNowMs(),
 };
 
 inSunlight();
@@ -80,6 +79,7 @@ const tares = new Tares();
 const markers = new MarkerQueue();
 const actions = new Actions(state, markers, updateSession);
 
+/** @type {import("./common/link.js").Handlers} */
 const handlers = {
   hello(message) {
     state.nodes = new Map((message.nodes ?? []).map((node) => [node.node, node]));
@@ -114,17 +114,7 @@ const handlers = {
   },
 };
 
-const link = new Link({
-  onMessage(message) {
-    if (Number.isFinite(message.t_ns) && ["hello", "heartbeat", "pong"].includes(message.type)) {
-      // Sent half a round trip ago.
-      state.serverAheadMs = message.t_ns / 1e6 + (link.roundTripMs ?? 0) / 2 - Date.now();
-    }
-    // Types of a newer server are ignored.
-    if (Object.hasOwn(handlers, message.type)) handlers[message.type](message);
-  },
-  onChange: () => {},
-});
+const link = new Link({ handlers });
 const status = new Status(link);
 
 function receiveFrame(frame) {

@@ -23,7 +23,7 @@ export class Guide {
     byId("cancel").addEventListener("click", onCancel);
   }
 
-  /** Draw the running calibration; null hides the panel. @param {Weighing | null} weighing @param {boolean} isConnected */
+  /** Draw the running calibration; null hides the panel. @param {WeighingView | null} weighing @param {boolean} isConnected */
   draw(weighing, isConnected) {
     const wasHidden = this.element.hidden && weighing !== null;
     this.element.hidden = weighing === null;
@@ -51,7 +51,7 @@ export class Guide {
     this.drawSteps(weighing, at, isFitting);
   }
 
-  /** Draw the remaining time of a step. @param {Weighing} weighing @param {boolean} isFitting */
+  /** Draw the remaining time of a step. @param {WeighingView} weighing @param {boolean} isFitting */
   drawBar(weighing, isFitting) {
     const fill = byId("bar-fill");
     if (weighing.left_s === null || isFitting) {
@@ -63,7 +63,7 @@ export class Guide {
     fill.style.width = `${100 * (1 - weighing.left_s / (this.longestS || 1))}%`;
   }
 
-  /** Draw tiles and weights with their state. @param {Weighing} weighing @param {number} at @param {boolean} isFitting */
+  /** Draw tiles and weights with their state. @param {WeighingView} weighing @param {number} at @param {boolean} isFitting */
   drawSteps(weighing, at, isFitting) {
     const key = JSON.stringify([weighing.session_id, at, weighing.tiles, isFitting]);
     if (key === this.shown) return;
@@ -79,14 +79,14 @@ export class Guide {
   }
 }
 
-/** Make the list item of a weight. @param {string} weight @param {Repeatability | undefined} held @param {boolean} isNow */
+/** Make the list item of a weight. @param {string} weight @param {RepeatabilityView | undefined} held @param {boolean} isNow */
 function stepItem(weight, held, isNow) {
   const item = el("li", { "data-state": held ? "done" : isNow ? "now" : "next" }, el("span", { text: plainWeight(weight) }));
   if (held) item.append(el("span", { cls: "value", text: `${number(held.mean_kpa, 2)} kPa` }), el("span", { cls: "unseen", text: " done" }));
   return item;
 }
 
-/** Draw the pressure of the last seconds: above the rest, or absolute before the first rest. @param {SVGSVGElement} box @param {Weighing} weighing */
+/** Draw the pressure of the last seconds: above the rest, or absolute before the first rest. @param {SVGSVGElement} box @param {WeighingView} weighing */
 function drawTrace(box, { recent_kpa: recent, rest_kpa: rest }) {
   const [width, height] = [box.clientWidth, box.clientHeight];
   box.setAttribute("viewBox", `0 0 ${width} ${height}`);

@@ -16,9 +16,9 @@ const FRAMES_HZ = 1; // this page shows no frames
 const POLL_RUNNING_MS = 300;
 const POLL_IDLE_MS = 2000;
 
-/** @type {Map<string, LiveNode>} */
+/** @type {Map<string, NodeView>} */
 const nodes = new Map();
-/** @type {Weighing | null} */
+/** @type {WeighingView | null} */
 let weighing = null;
 let name = new URLSearchParams(location.search).get("node");
 let requests = 0; // responses to older requests are ignored
@@ -54,16 +54,17 @@ const result = new Result({
 
 const link = new Link({
   rateHz: FRAMES_HZ,
-  onMessage(message) {
-    if (message.type === "hello") {
+  handlers: {
+    hello(message) {
       nodes.clear();
       (message.nodes ?? []).forEach((node) => nodes.set(node.node, node));
       selectNode();
       look(); // the login may have ended
-    } else if (message.type === "node") {
-      nodes.set(message.node.node, message.node);
+    },
+    node({ node }) {
+      nodes.set(node.node, node);
       selectNode();
-    }
+    },
   },
   onChange: () => setText(byId("link-down"), link.open || !link.failures ? "" : "Server link down; reconnecting."),
 });
@@ -111,7 +112,7 @@ async function poll() {
   timer = setTimeout(poll, isRunning ? POLL_RUNNING_MS : POLL_IDLE_MS);
 }
 
-/** Show a state: form, instructions or result. @param {Weighing | null} next */
+/** Show a state: form, instructions or result. @param {WeighingView | null} next */
 function show(next) {
   if (document.hidden) return;
   weighing = next;

@@ -26,7 +26,7 @@ export class Result {
     this.shown = null;
   }
 
-  /** Draw an ended calibration; null hides the panel. @param {Weighing | null} weighing @param {string} node */
+  /** Draw an ended calibration; null hides the panel. @param {WeighingView | null} weighing @param {string} node */
   draw(weighing, node) {
     const wasHidden = this.element.hidden && weighing !== null;
     this.element.hidden = weighing === null;
@@ -57,7 +57,7 @@ function tolerances(labels) {
   return `${labels.length} weights within ${distinct.join(", ")}`;
 }
 
-/** Make the card of a tile: table and curve. @param {TileResult} tile */
+/** Make the card of a tile: table and curve. @param {TileResultView} tile */
 function card(tile) {
   const rows = tile.weights.map((row) => {
     // A residual outside the interval points to a wrong or misplaced weight.
@@ -77,7 +77,7 @@ function card(tile) {
     curve(tile));
 }
 
-/** Plot force over pressure with its band. @param {TileResult} tile */
+/** Plot force over pressure with its band. @param {TileResultView} tile */
 function curve({ serial, weights, band }) {
   const box = svg("svg", { class: "curve", viewBox: `0 0 ${WIDTH} ${HEIGHT}`, role: "img", "aria-label": `Force of tile ${serial} over pressure, with its 95 % band` });
   const [maxKpa, maxN] = [Math.max(...band.map((p) => p.gauge_kpa)), Math.max(...band.map((p) => p.force_n + p.half_width_n))];

@@ -21,7 +21,7 @@ const WEIGHT_S = 40; // including loading, settling and unloading
 
 /** Form that starts a calibration. */
 export class Setup {
-  /** @param {(body: WeighingPlan) => void} onStart */
+  /** @param {(body: StartWeighing) => void} onStart */
   constructor(onStart) {
     this.form = byId("setup", HTMLFormElement);
     this.weights = byId("weights", HTMLInputElement);
@@ -30,6 +30,7 @@ export class Setup {
     this.order = []; // selected tiles
     this.shown = "";
     this.filled = ""; // session of the calibration that the form shows
+    /** @type {StartWeighing["method"]} */
     this.method = "weights";
     this.useMethod();
     this.form.addEventListener("submit", (event) => {
@@ -39,13 +40,13 @@ export class Setup {
     this.form.addEventListener("input", () => this.drawTexts());
     for (const radio of this.form.querySelectorAll("[name=method]")) {
       radio.addEventListener("change", () => {
-        this.method = /** @type {HTMLInputElement} */ (radio).value;
+        this.method = /** @type {any} */ (radio).value;
         this.useMethod();
       });
     }
   }
 
-  /** Show the tiles of a node. @param {LiveNode} node */
+  /** Show the tiles of a node. @param {NodeView} node */
   update(node) {
     const serials = node.tiles.filter((tile) => !tile.reference).map((tile) => tile.serial);
     const key = [node.node, ...serials].join("\n");
@@ -56,7 +57,7 @@ export class Setup {
     this.drawTexts();
   }
 
-  /** Fill in tiles, method, weights and tolerance of a calibration: this page may be younger than it. @param {Weighing} weighing */
+  /** Fill in tiles, method, weights and tolerance of a calibration: this page may be younger than it. @param {WeighingView} weighing */
   fill({ session_id: id, tiles, weights, method }) {
     if (id === this.filled) return;
     this.filled = id;
@@ -106,7 +107,7 @@ export class Setup {
     setText(byId("time-needed"), tiles ? `${countText(tiles, "tile")}, ${countText(weights, "weight")}${tiles > 1 ? " each" : ""}: about ${countText(minutes, "minute")}` : "Select a tile.");
   }
 
-  /** Return the request body. @returns {WeighingPlan} */
+  /** Return the request body. @returns {StartWeighing} */
   body() {
     const valueOf = (id) => byId(id, HTMLInputElement).value.trim();
     return {

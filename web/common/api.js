@@ -38,43 +38,43 @@ export const tareNow = (node) => call("POST", `/nodes/${id(node)}/tare`, { body:
 /** @type {(node: string, fingerprint: string) => Promise<void>} */
 export const acceptReplacement = (node, fingerprint) => call("POST", `/nodes/${id(node)}/accept-replacement`, { body: { fingerprint } });
 export const listTares = (node) => call("GET", `/nodes/${id(node)}/tares`);
-/** @type {(node: string) => Promise<NodeCalibration>} */
+/** @type {(node: string) => Promise<NodeCalibrationView>} */
 export const calibrationOf = (node) => call("GET", `/nodes/${id(node)}/calibration`);
-/** @type {(node: string, calibration: string, revision: string) => Promise<NodeCalibration>} */
+/** @type {(node: string, calibration: string, revision: string) => Promise<NodeCalibrationView>} */
 export const assignCalibration = (node, calibration, said) =>
   call("PUT", `/nodes/${id(node)}/calibration`, { body: { id: calibration }, said });
-/** @type {(node: string, revision: string) => Promise<NodeCalibration>} */
+/** @type {(node: string, revision: string) => Promise<NodeCalibrationView>} */
 export const unassignCalibration = (node, said) => call("DELETE", `/nodes/${id(node)}/calibration`, { said });
-/** @type {() => Promise<{items: Calibration[]}>} */
+/** @type {() => Promise<Page_CalibrationSummaryView_>} */
 export const listCalibrations = () => call("GET", "/calibrations");
-/** Upload a file unchanged: its hash covers every byte. @type {(file: Blob) => Promise<Calibration>} */
+/** Upload a file unchanged: its hash covers every byte. @type {(file: Blob) => Promise<CalibrationSummaryView>} */
 export const uploadCalibration = (file) => call("POST", "/calibrations", { body: file });
 export const deleteCalibration = (calibration) => call("DELETE", `/calibrations/${id(calibration)}`);
-/** @type {(node: string) => Promise<{weighing: Weighing | null}>} */
+/** @type {(node: string) => Promise<NodeWeighingView>} */
 export const weighingOf = (node) => call("GET", `/nodes/${id(node)}/weighing`);
-/** @type {(node: string, plan: WeighingPlan) => Promise<Weighing>} */
+/** @type {(node: string, plan: StartWeighing) => Promise<WeighingView>} */
 export const startWeighing = (node, plan) => call("POST", `/nodes/${id(node)}/weighing`, { body: plan });
-/** @type {(node: string, revision: string) => Promise<Weighing>} */
+/** @type {(node: string, revision: string) => Promise<WeighingView>} */
 export const repeatWeight = (node, said) => call("POST", `/nodes/${id(node)}/weighing/repeat`, { said });
 export const endWeighing = (node, said) => call("DELETE", `/nodes/${id(node)}/weighing`, { said });
 export const undoTare = (node, tare) => call("DELETE", `/nodes/${id(node)}/tares/${id(tare)}`);
-/** @type {(node: string, name: string) => Promise<Session>} */
+/** @type {(node: string, name: string) => Promise<SessionView>} */
 export const startSession = (node, name) => call("POST", "/sessions", { body: { node, name } });
-/** @type {(session: string) => Promise<Session>} */
+/** @type {(session: string) => Promise<SessionView>} */
 export const stopSession = (session) => call("POST", `/sessions/${id(session)}/stop`);
-/** @type {(session: string, marker: object) => Promise<Marker>} */
+/** @type {(session: string, marker: object) => Promise<MarkerView>} */
 export const addMarker = (session, marker) => call("POST", `/sessions/${id(session)}/markers`, { body: marker });
-/** @type {(name: string) => Promise<Take>} */
+/** @type {(name: string) => Promise<TakeView>} */
 export const startTake = (name) => call("POST", "/takes", { body: { name } });
-/** @type {(take: string) => Promise<Take>} */
+/** @type {(take: string) => Promise<TakeView>} */
 export const getTake = (take) => call("GET", `/takes/${id(take)}`);
-/** @type {(take: string) => Promise<Take>} */
+/** @type {(take: string) => Promise<TakeView>} */
 export const stopTake = (take) => call("POST", `/takes/${id(take)}/stop`);
-/** @type {(take: string, marker: object) => Promise<Take>} */
+/** @type {(take: string, marker: object) => Promise<TakeView>} */
 export const addTakeMarker = (take, marker) => call("POST", `/takes/${id(take)}/markers`, { body: marker });
-/** @type {(session: string) => Promise<Session>} */
+/** @type {(session: string) => Promise<SessionView>} */
 export const getSession = (session) => call("GET", `/sessions/${id(session)}`);
-/** @type {(session: string) => Promise<{items: Marker[]}>} */
+/** @type {(session: string) => Promise<Page_MarkerView_>} */
 export const listMarkers = (session) => call("GET", `/sessions/${id(session)}/markers`);
 export const listStances = (session) => call("GET", `/sessions/${id(session)}/stances`);
 export const stancesOverlay = (session) => call("GET", `/sessions/${id(session)}/stances/overlay`);
@@ -83,35 +83,36 @@ export const getComparison = (session, name) => call("GET", `/sessions/${id(sess
 export const comparisonSeries = (session, name, query, stop) =>
   call("GET", `/sessions/${id(session)}/comparisons/${id(name)}/series?${encoded(query)}`, { stop });
 export const newestSessions = (limit) => call("GET", `/sessions?limit=${limit}`);
-/** @type {(session: string) => Promise<ArrayInfo>} */
+/** @type {(session: string) => Promise<ArrayView>} */
 export const arrayOf = (session) => call("GET", `/sessions/${id(session)}/tiles`);
 export const ledgerOf = (session) => call("GET", `/sessions/${id(session)}/ledger`);
-/** Verify all files on the server: slow for a long session. @type {(session: string) => Promise<Verified>} */
+/** Verify all files on the server: slow for a long session. @type {(session: string) => Promise<VerificationView>} */
 export const verifyFiles = (session) => call("GET", `/sessions/${id(session)}/verification`, { timeoutS: 300 });
-/** @type {(session: string) => Promise<Clock>} */
+/** @type {(session: string) => Promise<ClockSummary>} */
 export const clockOf = (session) => call("GET", `/sessions/${id(session)}/clock`);
-/** @type {(session: string, query: OverviewQuery, stop?: AbortSignal) => Promise<Overview>} */
+/** @typedef {{points: number, start_s?: number, end_s?: number, columns?: string}} OverviewQuery */
+/** @type {(session: string, query: OverviewQuery, stop?: AbortSignal) => Promise<OverviewView>} */
 export const overview = (session, query, stop) =>
   call("GET", `/sessions/${id(session)}/timeseries?${encoded(query)}`, { stop });
 /** Return some seconds of a session's frames, as CSV. */
 export const samples = (session, query) =>
   call("GET", `/sessions/${id(session)}/data?${encoded({ format: "csv", markers: "false", ...query })}`, { type: "text/csv" });
-/** @type {(session: string, changes: object, said?: string | null) => Promise<Session>} */
+/** @type {(session: string, changes: object, said?: string | null) => Promise<SessionView>} */
 export const changeSession = (session, changes, said = null) =>
   call("PATCH", `/sessions/${id(session)}`, { body: changes, said });
-/** @type {(session: string, marker: string, changes: object, revision: string) => Promise<Marker>} */
+/** @type {(session: string, marker: string, changes: object, revision: string) => Promise<MarkerView>} */
 export const changeMarker = (session, marker, changes, said) =>
   call("PATCH", `/sessions/${id(session)}/markers/${id(marker)}`, { body: changes, said });
 export const removeMarker = (session, marker, said) =>
   call("DELETE", `/sessions/${id(session)}/markers/${id(marker)}`, { said });
-/** @type {(session: string) => Promise<Session>} */
+/** @type {(session: string) => Promise<SessionView>} */
 export const sealSession = (session) => call("POST", `/sessions/${id(session)}/abandon-missing`);
 export const deleteSession = (session) => call("DELETE", `/sessions/${id(session)}`);
 export const listTrash = () => call("GET", "/trash");
-/** @type {(session: string) => Promise<Session>} */
+/** @type {(session: string) => Promise<SessionView>} */
 export const restoreSession = (session) => call("POST", `/trash/${id(session)}/restore`);
 export const emptyTrash = () => call("DELETE", "/trash");
-/** @type {(query: {limit: number, cursor?: string, q?: string, complete?: string, node?: string}) => Promise<{items: Session[], next_cursor: string | null}>} */
+/** @type {(query: {limit: number, cursor?: string, q?: string, complete?: string, node?: string}) => Promise<SessionPage>} */
 export const listSessions = (query) => call("GET", `/sessions?${encoded(query)}`);
 export const zipAddress = (ids) => `${PREFIX}/sessions/zip?ids=${ids.map(id).join(",")}`;
 export const listFormats = () => call("GET", "/formats");

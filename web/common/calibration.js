@@ -7,7 +7,7 @@ const SHOWN_TILES = 4;
 
 /**
  * Open the dialog for a node.
- * @param {{node: string, tiles: Tile[]}} node
+ * @param {{node: string, tiles: TileView[]}} node
  */
 export async function openCalibration(node) {
   const dialog = new CalibrationDialog(node);
@@ -15,11 +15,11 @@ export async function openCalibration(node) {
 }
 
 class CalibrationDialog {
-  /** @param {{node: string, tiles: Tile[]}} node */
+  /** @param {{node: string, tiles: TileView[]}} node */
   constructor({ node, tiles }) {
     this.node = node;
     this.loadSerials = tiles.filter((tile) => !tile.reference).map((tile) => tile.serial);
-    /** @type {NodeCalibration | null} */
+    /** @type {NodeCalibrationView | null} */
     this.used = null;
     this.inUse = el("p", { id: "calibration-used" });
     this.back = el("button", { type: "button", cls: "small requires-operator", id: "calibration-back", text: "Use the node’s calibration" });
@@ -69,7 +69,7 @@ class CalibrationDialog {
     this.list.replaceChildren(...available.items.map((one) => this.row(one)));
   }
 
-  /** @param {Calibration} calibration */
+  /** @param {CalibrationSummaryView} calibration */
   row(calibration) {
     const isUsed = calibration.id === this.used?.calibration?.id;
     const any = calibration.serials.includes("*");
@@ -94,7 +94,7 @@ class CalibrationDialog {
     return this.used?.calibration?.id ?? "none";
   }
 
-  /** @param {Calibration} calibration */
+  /** @param {CalibrationSummaryView} calibration */
   async assign(calibration) {
     await api.assignCalibration(this.node, calibration.id, this.shown);
     await this.load();

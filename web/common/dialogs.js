@@ -11,8 +11,8 @@ export async function ask(title, text, yes) {
 
 /**
  * Edit a session; resolve to the changes, or null.
- * @param {Session} session
- * @returns {Promise<Partial<Session> | null>}
+ * @param {SessionView} session
+ * @returns {Promise<Partial<SessionView> | null>}
  */
 export async function edit(session) {
   const line = (part, maxlength) => el("input", { id: `edit-${part}`, type: "text", maxlength, autocomplete: "off" });

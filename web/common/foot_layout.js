@@ -7,7 +7,7 @@ const SAME_PLACE_M = 1e-6; // tiles that differ by less are in one row
 
 const range = (values) => [Math.min(...values), Math.max(...values)];
 
-/** Return true if the tiles spread in y: shown from above. @param {Tile[]} tiles */
+/** Return true if the tiles spread in y: shown from above. @param {TileView[]} tiles */
 export function isPlan(tiles) {
   const [least, most] = range(tiles.map((tile) => tile.y_m));
   return most - least > GRID_FROM_M;
@@ -39,7 +39,7 @@ function commonPlace(placesM) {
 /** Layout of a foot in a box. */
 export class FootLayout {
   /**
-   * @param {Tile[]} tiles
+   * @param {TileView[]} tiles
    * @param {object} box
    * @param {number} box.widthPx
    * @param {number} box.heightPx

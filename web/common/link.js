@@ -1,4 +1,4 @@
-// Websocket: reconnects, measures the round trip, passes on parsed messages.
+// Websocket: reconnects, measures the round trip and the server's clock, passes on parsed messages.
 
 import { logInFromUrl, needsLogin, waitForLogin, look } from "./login.js";
 import { notice } from "./notices.js";
@@ -11,13 +11,19 @@ const BLOCKED_AFTER = 3; // failed attempts while HTTP works
 const BLOCKED = "the server responds, but a proxy or filter may block WebSockets";
 const SILENT_AFTER_MS = 5000; // a heartbeat is due each second
 
+/** @typedef {{[T in PageMessage["type"]]?: (message: Extract<PageMessage, {type: T}>) => void}} Handlers */
+
 /** Live connection to the server. */
 export class Link {
-  /** `onMessage(message)` per message, `onChange()` at open and close; `rateHz`: of live messages. */
-  constructor({ onMessage, onChange, rateHz = 30 }) {
+  /**
+   * `handlers`: by type of message; others are ignored. `onChange()` at open and close; `rateHz`: of frames.
+   * @param {{handlers: Handlers, onChange?: () => void, rateHz?: number}} how
+   */
+  constructor({ handlers, onChange = () => {}, rateHz = 30 }) {
     this.rateHz = rateHz;
-    this.onMessage = onMessage;
+    this.handlers = handlers;
     this.onChange = onChange;
+    this.serverAheadMs = 0;
     this.open = false;
     this.roundTripMs = null;
     this.unansweredSinceMs = null; // send time of the oldest unanswered ping
@@ -85,7 +91,17 @@ export class Link {
       }
     }
     if (message.type === "hello") this.checkSoftware(message.software);
-    this.onMessage(message);
+    if (Number.isFinite(message.t_ns) && ["hello", "heartbeat", "pong"].includes(message.type)) {
+      // Sent half a round trip ago.
+      this.serverAheadMs = message.t_ns / 1e6 + (this.roundTripMs ?? 0) / 2 - Date.now();
+    }
+    // Types of a newer server are ignored.
+    if (Object.hasOwn(this.handlers, message.type)) this.handlers[message.type](message);
+  }
+
+  /** Return the present time of the server, ms since 1970. */
+  serverNowMs() {
+    return Date.now() + this.serverAheadMs;
   }
 
   /** Offer a reload after an update of the server. */

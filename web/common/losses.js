@@ -25,13 +25,13 @@ export function lossTexts(lost) {
     .map(([reason, count]) => [reason, `${many(count)}: ${REASONS[reason] ?? reason.replaceAll("_", " ")}`]);
 }
 
-/** Return the share of a session's slots that were not sampled, 0 to 1. @param {Session} session */
+/** Return the share of a session's slots that were not sampled, 0 to 1. @param {SessionView} session */
 export function missedShare({ frames: recorded, lost, missed_slots: missed }) {
   const slots = recorded + countLost(lost) + missed;
   return slots ? missed / slots : 0;
 }
 
-/** Return the share of slots that were not sampled, such as "12 % not sampled"; "" without any. @param {Session} session */
+/** Return the share of slots that were not sampled, such as "12 % not sampled"; "" without any. @param {SessionView} session */
 export function missedText(session) {
   const percent = 100 * missedShare(session);
   return percent ? `${percent < 1 ? "<1" : Math.round(percent)}\u00a0% not sampled` : "";

@@ -8,7 +8,7 @@ import { el, setText } from "./text.js";
 /** Warning with a button to accept the machine. */
 export class ReplacementWarning {
   constructor() {
-    /** @type {{node: string, replacement: Replacement | null} | null} */
+    /** @type {{node: string, replacement: ReplacementView | null} | null} */
     this.node = null;
     this.text = el("span");
     const accept = el("button", { type: "button", cls: "small requires-operator", text: "Accept …" });
@@ -17,7 +17,7 @@ export class ReplacementWarning {
     this.element.hidden = true;
   }
 
-  /** Update the warning. @param {{node: string, replacement: Replacement | null} | null} node */
+  /** Update the warning. @param {{node: string, replacement: ReplacementView | null} | null} node */
   draw(node) {
     this.node = node;
     const request = node?.replacement;

@@ -14,11 +14,11 @@ export class LastSession {
   }
 
   clear() {
-    /** @type {Map<string, Session | null>} by node; null: none, or requested */
+    /** @type {Map<string, SessionView | null>} by node; null: none, or requested */
     this.newest = new Map();
   }
 
-  /** Store a session if it is the latest of its node. @param {Session} session */
+  /** Store a session if it is the latest of its node. @param {SessionView} session */
   update(session) {
     const stored = this.newest.get(session.node);
     if (stored && stored.id !== session.id && stored.started_t_ns > session.started_t_ns) return;

@@ -176,7 +176,7 @@ const withReason = (what, why) => (why.toLowerCase().startsWith(what.toLowerCase
 
 const sentence = (text) => `${text[0]?.toUpperCase() ?? ""}${text.slice(1)}${/[.!?]$/.test(text) ? "" : "."}`;
 
-/** Return the text of a clipped tile. @param {Tile} tile @param {number | null | undefined} gaugeKpa */
+/** Return the text of a clipped tile. @param {TileView} tile @param {number | null | undefined} gaugeKpa */
 const clippedText = ({ serial }, gaugeKpa) => `${serial} stops rising ${Number.isFinite(gaugeKpa) ? `above ${number(gaugeKpa, 0)} kPa` : "below its range"}: force is a lower bound.`;
 
 const tareAge = (tare, serverNowMs) => roughly((serverNowMs - tare.t_ns / 1e6) / 1000);

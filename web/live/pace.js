@@ -51,7 +51,7 @@ export class FramePace {
   }
 }
 
-/** Return the state of a frame without its values. @param {Frame | null} frame */
+/** Return the state of a frame without its values. @param {FrameMessage | null} frame */
 function stateOf(frame) {
   if (!frame) return "";
   const known = (value) => (Number.isFinite(value) ? 1 : 0);

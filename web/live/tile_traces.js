@@ -54,7 +54,7 @@ export class TileTraces {
   }
 
   /**
-   * @param {{tiles: Tile[]}} node
+   * @param {{tiles: TileView[]}} node
    * @param {{points: TilePoint[], tileHistory: TilePoint[], endS: number, windowS: number, live: boolean}} shown points of the GRF trace
    * @param {number} nowMs
    * @param {string} unitChosen
@@ -157,6 +157,8 @@ export class TileTraces {
     strip.show(this.context, LEFT_PX, 0, width, height);
   }
 }
+
+/** @typedef {{timeS: number, tiles: Record<string, (number | null)[]> | null, gap?: boolean}} TilePoint */
 
 /** Return the greatest values of the visible points, in the form of a frame. @param {TilePoint[]} points */
 function greatestOf(points) {

@@ -14,17 +14,17 @@ const EVERY_MS = 200;
 
 const cards = new Map(); // by name of the node
 const recordings = new Map(); // by id of the session
-let serverAheadMs = 0;
 
 const takes = new Takes({
   recordings,
   cannotRecord: () => (!link.open ? "The server link is down." : [...cards.values()].some(({ node }) => node.connected) ? "" : "No node is connected."),
-  serverNowMs: () => Date.now() + serverAheadMs,
+  serverNowMs: () => link.serverNowMs(),
   onSession: updateSession,
   connected: () => [...cards.values()].map(({ node }) => node).filter((node) => node.connected).map((node) => node.node),
   onRefused: (action, failed) => cards.forEach((card, name) => { card.refused = failed[name] ? `${action}: ${failed[name]}` : ""; }),
 });
 
+/** @type {import("../common/link.js").Handlers} */
 const handlers = {
   hello(message) {
     const names = new Set((message.nodes ?? []).map((node) => node.node));
@@ -54,16 +54,7 @@ const handlers = {
   frame: (frame) => cards.get(frame.node)?.addFrame(frame),
 };
 
-const link = new Link({
-  rateHz: RATE_HZ,
-  onMessage(message) {
-    if (Number.isFinite(message.t_ns) && ["hello", "heartbeat", "pong"].includes(message.type)) {
-      serverAheadMs = message.t_ns / 1e6 + (link.roundTripMs ?? 0) / 2 - Date.now();
-    }
-    if (Object.hasOwn(handlers, message.type)) handlers[message.type](message);
-  },
-  onChange: () => {},
-});
+const link = new Link({ handlers, rateHz: RATE_HZ });
 
 function updateNode(node) {
   if (!cards.has(node.node)) cards.set(node.node, new Card(node.node));
@@ -91,7 +82,7 @@ function arrange() {
 function write() {
   const nowMs = performance.now();
   const all = [...cards.values()];
-  for (const card of all) card.write(nowMs, Date.now() + serverAheadMs, link.open);
+  for (const card of all) card.write(nowMs, link.serverNowMs(), link.open);
   const live = link.open ? all.filter((card) => card.isLive(nowMs)).length : 0;
   setText(byId("summary"), all.length ? `${live} of ${all.length} live` : "");
   byId("no-nodes").hidden = Boolean(all.length) || !link.open;

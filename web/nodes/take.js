@@ -13,10 +13,10 @@ const KEYS = { r: "record-all", m: "marker-all", s: "stop-all", t: "tare-all" };
 export class Takes {
   /**
    * @param {object} page
-   * @param {Map<string, Session>} page.recordings running recordings, by id
+   * @param {Map<string, SessionView>} page.recordings running recordings, by id
    * @param {() => string} page.cannotRecord reason, or ""
    * @param {() => number} page.serverNowMs
-   * @param {(session: Session) => void} page.onSession receives the sessions of each response
+   * @param {(session: SessionView) => void} page.onSession receives the sessions of each response
    * @param {() => string[]} page.connected names of the nodes that are connected
    * @param {(what: string, failed: Object<string, string>) => void} page.onRefused receives a failed action and the reason per node
    */

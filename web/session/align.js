@@ -7,7 +7,7 @@ import { offsetAt } from "./clock.js";
  * @param {{beginNs: number, durationS: number, stances: {from: number, is_whole: boolean}[],
  *   markers: {label: string, timeS: number}[], offset: (tNs: number, ofServer: boolean) => number | null}} own
  * @param {{beginNs: number, durationS: number, stances: {begin_t_ns: number, is_whole: boolean}[],
- *   events: {label: string, t_ns: number}[], clock: Clock | null}} other
+ *   events: {label: string, t_ns: number}[], clock: ClockSummary | null}} other
  * @returns {{key: string, label: string, meaning: string, shiftS: number}[]}
  */
 export function alignments(own, other) {

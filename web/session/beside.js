@@ -15,7 +15,7 @@ export class Beside {
    * @param {object} how
    * @param {string} how.name for the legend
    * @param {Record<string, [string, string]>} how.columns min and max column by panel
-   * @param {(query: OverviewQuery, stop?: AbortSignal) => Promise<Overview>} how.ask requests bins, on its own time axis
+   * @param {(query: import("../common/api.js").OverviewQuery, stop?: AbortSignal) => Promise<OverviewView>} how.ask requests bins, on its own time axis
    * @param {() => void} how.onChange
    * @param {(error: Error) => void} how.onError
    */
@@ -63,7 +63,7 @@ export class Beside {
 
   /**
    * Request bins on its own time axis; outside of it return none.
-   * @param {OverviewQuery} query
+   * @param {import("../common/api.js").OverviewQuery} query
    * @param {AbortSignal} [stop]
    */
   async request({ points, start_s: startS, end_s: endS }, stop) {

@@ -16,7 +16,7 @@ function lowerBound(list, value) {
 /** Min and max per interval. */
 export class Bins {
   /**
-   * @param {Overview} overview
+   * @param {OverviewView} overview
    * @param {View} covers requested interval
    */
   constructor(overview, covers) {

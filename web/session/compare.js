@@ -34,7 +34,7 @@ function shortNameOf(session, other) {
 /** Controls of the overlay. */
 export class Compare {
   /**
-   * @param {Session} session
+   * @param {SessionView} session
    * @param {import("./plotted.js").Plotted} page
    * @param {(tNs: number, ofServer: boolean) => number | null} offset of this session's node
    * @param {{name: string}[]} references of earlier comparisons

@@ -28,7 +28,7 @@ export class CopPaths {
     });
   }
 
-  /** @param {Tile[]} tiles */
+  /** @param {TileView[]} tiles */
   show(tiles, answer) {
     this.tiles = tiles;
     this.answer = answer;
@@ -39,7 +39,7 @@ export class CopPaths {
   /**
    * @param {{number: number} | null} chosen
    * @param {{percent: number[], copX: (number | null)[], copY: (number | null)[]} | null} frames of the selected stance
-   * @param {import("./stance_overlay.js").Curve | null | undefined} hovered
+   * @param {CurveView | null | undefined} hovered
    * @param {{percent: number[], overlaid: number, spread: object} | null} beside overlay of another session
    */
   draw(colours, chosen, frames, hovered, beside = null) {

@@ -45,7 +45,7 @@ function drawTares(sessions) {
 
 /**
  * State the differences beyond their 95 % interval, and fill the table with the whole stances of two sessions.
- * @typedef {{name: string, stances: any[], tares: ArrayInfo["tares"]}} Compared
+ * @typedef {{name: string, stances: any[], tares: ArrayView["tares"]}} Compared
  * @param {Compared} older @param {Compared} newer
  */
 export function drawDifferences(older, newer) {

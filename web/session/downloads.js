@@ -63,7 +63,7 @@ export class Downloads {
 
   /**
    * Update the links to the selected range.
-   * @param {Session} session @param {import("./view.js").View} view @param {boolean} all the view is the whole session
+   * @param {SessionView} session @param {import("./view.js").View} view @param {boolean} all the view is the whole session
    * @param {{number: number, from: number, to: number} | undefined} stance selected
    */
   draw(session, view, all, stance) {

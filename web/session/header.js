@@ -13,7 +13,7 @@ export function rateText(whole, nominalHz) {
   return `${perSecond(hz)} of ${perSecond(nominalHz)} frames/s`;
 }
 
-/** Return times and kinds of a session's tares, "" without one. @param {ArrayInfo["tares"]} tares */
+/** Return times and kinds of a session's tares, "" without one. @param {ArrayView["tares"]} tares */
 export function taresText(tares) {
   const texts = tares.map(({ t_ns: t, source }) => (source === "lost" ? "one is lost" : `${localTime(new Date(t / 1e6))} ${TARE_SOURCES[source] ?? ""}`.trim()));
   return texts.length > 3 ? `${texts[0]}, and ${texts.length - 1} more` : texts.join("; ");
@@ -21,9 +21,9 @@ export function taresText(tares) {
 
 /**
  * Draw the header.
- * @param {Session} session
+ * @param {SessionView} session
  * @param {import("./bins.js").Bins | null} whole bins of the whole session, once loaded
- * @param {ArrayInfo | null} array
+ * @param {ArrayView | null} array
  */
 export function drawHeader(session, whole = null, array = null) {
   setText(byId("name"), session.name || session.id);

@@ -24,7 +24,7 @@ export function ledgerTexts(ledger, session) {
 
 /**
  * Return the result of a verification: summary and details.
- * @param {Verified} found @param {Session} session @param {Date} at
+ * @param {VerificationView} found @param {SessionView} session @param {Date} at
  * @returns {{whole: boolean, summary: string, details: string[]}}
  */
 export function verificationTexts(found, session, at) {
@@ -48,7 +48,7 @@ export class LedgerCard {
     byId("verify").addEventListener("click", () => this.verify());
   }
 
-  /** @param {Session} session */
+  /** @param {SessionView} session */
   show(session) {
     const grown = this.session?.frames !== session.frames || this.session?.state !== session.state;
     this.session = session;

@@ -13,7 +13,7 @@ export const pointsFor = (widthPx, tiles) =>
 /** Loads bins. */
 export class Loader {
   /**
-   * @param {(query: OverviewQuery, stop?: AbortSignal) => Promise<Overview>} request
+   * @param {(query: import("../common/api.js").OverviewQuery, stop?: AbortSignal) => Promise<OverviewView>} request
    * @param {(bins: Bins) => void} onBins @param {(error: Error) => void} onError
    */
   constructor(request, onBins, onError) {

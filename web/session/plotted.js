@@ -27,7 +27,7 @@ const COLOURS_AT = 9; // index in the key of a drawing
 
 /** Plots, cursor, markers, stances, replay and downloads of a session. */
 export class Plotted {
-  /** @param {Session} session @param {() => void} onArray runs once the tiles are loaded */
+  /** @param {SessionView} session @param {() => void} onArray runs once the tiles are loaded */
   constructor(session, onArray) {
     this.session = session;
     this.onArray = onArray;
@@ -56,7 +56,7 @@ export class Plotted {
     this.drawing = 0;
   }
 
-  /** Load and draw; again while the session grows and once it is sealed. @param {Session} session */
+  /** Load and draw; again while the session grows and once it is sealed. @param {SessionView} session */
   async load(session) {
     const first = !this.view;
     const sealed = session.state === "sealed";

@@ -34,7 +34,7 @@ export class Replay {
   constructor(on) {
     this.on = on;
     this.samples = null;
-    /** @type {ArrayInfo | null} */
+    /** @type {ArrayView | null} */
     this.array = null;
     this.range = this.foot = this.bars = null;
     this.walking = Promise.resolve();
@@ -69,7 +69,7 @@ export class Replay {
     this.writeLag();
   }
 
-  /** Set tiles and calibration; the foot is drawn from then on. @param {ArrayInfo} array of GET /sessions/ID/tiles */
+  /** Set tiles and calibration; the foot is drawn from then on. @param {ArrayView} array of GET /sessions/ID/tiles */
   setArray(array) {
     this.array = array;
     this.writeLag();

@@ -49,6 +49,19 @@ const between = (interval, unit, factor, fixed) =>
 const certain = ({ value, interval_95: [low, high] }, unit, factor, decimals, of = "") =>
   `${number(value * factor, decimals)} ${unit}${of} (95 %: ${number(low * factor, decimals)} to ${number(high * factor, decimals)} ${unit})`;
 
+/**
+ * @typedef {{value: number, interval_95: [number, number]}} Estimate
+ * @typedef {object} ComparisonReport of `foottile compare`: docs/compare.md
+ * @property {string} reference
+ * @property {Record<string, number>} [limits]
+ * @property {string[]} notes
+ * @property {number | null} contact_n
+ * @property {Record<string, {mean: number | null, interval_95: [number, number] | null, trials: number}>} figures
+ * @property {{lag_s?: Estimate, scale?: Estimate, offset_in_flight_n?: Estimate, offset_removed?: boolean}} alignment
+ * @property {object[]} [trials]
+ * @property {string} [trials_are]
+ */
+
 /** Return the alignment as text. @param {ComparisonReport} report */
 function alignmentText({ alignment, contact_n: contactN, trials_are: trialsAre, trials }) {
   const parts = [];
@@ -61,7 +74,7 @@ function alignmentText({ alignment, contact_n: contactN, trials_are: trialsAre, 
   return parts.join(" ");
 }
 
-/** Draw the report. @param {{name: string, matches_current_data: boolean | null, missed: string[], report: ComparisonReport}} found */
+/** Draw the report. @param {Omit<ReportView, "report"> & {report: ComparisonReport}} found */
 export function drawReport(found) {
   const { report } = found;
   const limits = report.limits ?? {};

@@ -36,7 +36,9 @@ export function columnsOf(csv) {
   return Object.fromEntries(names.map((name, i) => [name, values[i]]));
 }
 
-/** Return the frame of a row, with the fields of a live message. @returns {Frame} */
+/** @typedef {FrameMessage & {timeS: number}} TimedFrame `timeS`: seconds after the first frame */
+
+/** Return the frame of a row, with the fields of a live message. @returns {TimedFrame} */
 function frameOf({ timeS, columns }, row, tiles) {
   const one = (name) => { const value = columns[name]?.[row]; return Number.isFinite(value) ? value : null; };
   const each = (name) => Array.from({ length: tiles }, (_, i) => one(`${name}_${i}`));
@@ -92,7 +94,7 @@ export class Samples {
 
   /**
    * Return the nearest frame, unless it is too far away.
-   * @returns {{known: boolean, frame: Frame | null}} not known: not loaded yet
+   * @returns {{known: boolean, frame: TimedFrame | null}} not known: not loaded yet
    */
   at(timeS) {
     const own = this.numberOf(timeS);

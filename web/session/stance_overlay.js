@@ -11,8 +11,6 @@ const HIT_PX = 18;
 const FRAMES_MAX = 4000; // of the selected stance; a longer one is binned
 const HEIGHT_PX = 320;
 
-/** @typedef {{number: number, grf_n: (number | null)[], cop_x_m: (number | null)[], cop_y_m: (number | null)[]}} Curve */
-
 /** Plots of the overlay. */
 export class StanceOverlay {
   /**

@@ -1,8 +1,6 @@
 // Time axis of a session: the node's clock may have been set between parts, so each part has its shift. Pure.
 
-/** @typedef {{part: number, shift_ns: number, by: "node" | "server" | "joined"}[]} TimeAxis of GET /sessions/ID/timeseries */
-
-const shiftOf = (/** @type {TimeAxis} */ axis, part) => axis[Math.min(part, axis.length - 1)].shift_ns;
+const shiftOf = (/** @type {PartShift[]} */ axis, part) => axis[Math.min(part, axis.length - 1)].shift_ns;
 
 /** Return stances with times on the axis. */
 export function moveStances(axis, stances) {

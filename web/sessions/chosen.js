@@ -15,8 +15,8 @@ export class Chosen {
   /**
    * @param {object} of
    * @param {HTMLInputElement} of.all box that selects all of `shown()`
-   * @param {() => Session[]} of.shown
-   * @param {(session: Session) => void} of.onSession updates the list
+   * @param {() => SessionView[]} of.shown
+   * @param {(session: SessionView) => void} of.onSession updates the list
    * @param {(id: string) => void} of.onDeleted
    */
   constructor({ all, shown, onSession, onDeleted }) {
@@ -38,7 +38,7 @@ export class Chosen {
     });
   }
 
-  /** Make the box of a session's row. @param {Session} session */
+  /** Make the box of a session's row. @param {SessionView} session */
   pick(session) {
     const box = el("input", { type: "checkbox", "data-part": "pick", "aria-label": `Select ${session.name || session.id}` });
     box.checked = this.ids.has(session.id);
@@ -50,7 +50,7 @@ export class Chosen {
     return box;
   }
 
-  /** Make the box of a take. @param {Session[]} sessions */
+  /** Make the box of a take. @param {SessionView[]} sessions */
   pickAll(sessions) {
     const box = el("input", { type: "checkbox", "data-part": "pick-take", "aria-label": `Select the take ${sessions[0].name}` });
     box.addEventListener("change", () => {

@@ -102,7 +102,7 @@ export class Sessions {
     return this.load();
   }
 
-  /** Add or replace a session. @param {Session} session */
+  /** Add or replace a session. @param {SessionView} session */
   update(session) {
     if (!isIncluded(session, this.filter)) return this.drop(session.id);
     // Outdated response: a sealed session stays sealed.
@@ -129,7 +129,7 @@ export class Sessions {
     if (this.sessions.delete(id)) this.draw();
   }
 
-  /** @param {Session} session */
+  /** @param {SessionView} session */
   keyOf(session) {
     let key = this.keys.get(session);
     if (key === undefined) this.keys.set(session, key = JSON.stringify(session));
@@ -194,7 +194,7 @@ export class Sessions {
     lines.forEach((row, i) => { if (this.box.children[i] !== row) this.box.insertBefore(row, this.box.children[i] ?? null); });
   }
 
-  /** Make the menu of a session. @param {Session} session */
+  /** Make the menu of a session. @param {SessionView} session */
   menu(session) {
     return menuButton(`Actions: ${session.name || session.id}`, () => {
       const now = this.sessions.get(session.id) ?? session;
@@ -202,12 +202,12 @@ export class Sessions {
     });
   }
 
-  /** Return the other listed sessions of its take. @param {Session} session */
+  /** Return the other listed sessions of its take. @param {SessionView} session */
   others({ id, take }) {
     return take ? [...this.sessions.values()].filter((other) => other.take === take && other.id !== id) : [];
   }
 
-  /** @param {Session} session */
+  /** @param {SessionView} session */
   buttons(session) {
     const made = [];
     const add = (part, text, action) => {
@@ -221,13 +221,13 @@ export class Sessions {
     return made;
   }
 
-  /** @param {Session} session */
+  /** @param {SessionView} session */
   async edit(session) {
     const changes = await edit(session);
     if (changes) this.onSession(await api.changeSession(session.id, changes));
   }
 
-  /** @param {Session} session */
+  /** @param {SessionView} session */
   async abandon(session) {
     const many = frames(session.pending_frames);
     const [title, loss] = session.pending_reason === "end"
@@ -241,7 +241,7 @@ export class Sessions {
     notice(`Sealed “${session.name}”.`);
   }
 
-  /** @param {Session} session */
+  /** @param {SessionView} session */
   async delete(session) {
     await api.deleteSession(session.id);
     this.onDeleted(session.id);
@@ -252,7 +252,7 @@ export class Sessions {
   }
 }
 
-/** Return links to downloads and to comparisons within the take. @param {Session} session @param {Session[]} others */
+/** Return links to downloads and to comparisons within the take. @param {SessionView} session @param {SessionView[]} others */
 function links(session, others) {
   const link = (part, text, attributes) => el("a", { text, "data-part": part, ...attributes });
   const formats = [["parquet", "Parquet"], ["arrow", "Arrow"], ["csv", "CSV"]]
@@ -264,7 +264,7 @@ function links(session, others) {
   ];
 }
 
-/** Group sessions by take, newest first, sorted by node within a take. @param {Session[]} sessions */
+/** Group sessions by take, newest first, sorted by node within a take. @param {SessionView[]} sessions */
 function groupByTake(sessions) {
   const groups = new Map();
   for (const session of sessions) {
@@ -286,7 +286,7 @@ function emptyText({ q, complete }, trashed) {
   return trashed ? `No sessions; ${trashed} in the trash.` : "No sessions yet. Press Record on the live page.";
 }
 
-/** Return true if the server would list a session. @param {Session} session @param {{q?: string, complete?: string}} filter */
+/** Return true if the server would list a session. @param {SessionView} session @param {{q?: string, complete?: string}} filter */
 function isIncluded(session, { q, complete }) {
   return (!complete || String(session.complete) === complete) && (!q || matches(session, q.toLowerCase()));
 }

@@ -24,6 +24,7 @@ function removeSession(id) {
 const trash = new Trash(updateSession, (count) => sessions.setTrashCount(count));
 const sessions = new Sessions({ onSession: updateSession, onDeleted: removeSession });
 
+/** @type {import("../common/link.js").Handlers} */
 const handlers = {
   hello() {
     sessions.reload();
@@ -36,10 +37,8 @@ const handlers = {
 };
 
 const link = new Link({
+  handlers,
   rateHz: RATE_HZ,
-  onMessage(message) {
-    if (Object.hasOwn(handlers, message.type)) handlers[message.type](message);
-  },
   onChange: () => setText(byId("link-down"), link.open || !link.failures ? "" : "Server link down; reconnecting."),
 });
 

@@ -13,7 +13,7 @@ export function head(all) {
   return row;
 }
 
-/** Make the row of a session. @param {Session} session @param {HTMLInputElement} pick selects it @param {HTMLElement} menu */
+/** Make the row of a session. @param {SessionView} session @param {HTMLInputElement} pick selects it @param {HTMLElement} menu */
 export function makeRow(session, pick, menu) {
   const [short, long, weight] = stateText(session);
   const name = el("a", {
@@ -39,7 +39,7 @@ export function makeRow(session, pick, menu) {
     el("div", { cls: "c-do", role: "cell" }, menu));
 }
 
-/** Return subject, tags as links that filter the list, and notes. @param {Session} session */
+/** Return subject, tags as links that filter the list, and notes. @param {SessionView} session */
 function about({ subject, tags, notes }) {
   const parts = [
     ...(subject ? [el("span", { cls: "subject", text: subject })] : []),
@@ -50,10 +50,10 @@ function about({ subject, tags, notes }) {
   return lines;
 }
 
-/** Return the address of a session's page with another one beside it. @param {Session} session @param {Session} other */
+/** Return the address of a session's page with another one beside it. @param {SessionView} session @param {SessionView} other */
 export const comparisonAddress = (session, other) => `/sessions/${encodeURIComponent(session.id)}?with=${encodeURIComponent(other.id)}`;
 
-/** Make the row above the sessions of a take. @param {Session[]} sessions @param {HTMLInputElement} pick selects them all */
+/** Make the row above the sessions of a take. @param {SessionView[]} sessions @param {HTMLInputElement} pick selects them all */
 export function makeTakeRow(sessions, pick) {
   const names = [...new Set(sessions.map(({ name }) => name))];
   const started = localTime(new Date(Math.min(...sessions.map(({ started_t_ns: t_ns }) => t_ns)) / 1e6)).slice(0, 16);
@@ -64,7 +64,7 @@ export function makeTakeRow(sessions, pick) {
       el("span", { cls: "why", text: ` ${started}, ${sessions.length} nodes: ${sessions.map(({ node }) => node).join(", ")}` })));
 }
 
-/** Return the texts that change during a recording, by class. @param {Session} session */
+/** Return the texts that change during a recording, by class. @param {SessionView} session */
 export function counts(session) {
   const lost = countLost(session.lost);
   return {

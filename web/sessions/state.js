@@ -9,7 +9,7 @@ const WAITS = {
   end: () => "Waiting for the last frames before stop.",
 };
 
-/** Return state and completeness: [label, details, severity]. @param {Session} session */
+/** Return state and completeness: [label, details, severity]. @param {SessionView} session */
 export function stateText(session) {
   const why = session.problem ? ` ${session.problem}` : "";
   const losses = lossTexts(session.lost).map(([, text]) => `${text}.`);

@@ -12,7 +12,7 @@ export class Trash {
   constructor(onRestored, onCount) {
     this.onRestored = onRestored;
     this.onCount = onCount;
-    /** @type {Session[]} */
+    /** @type {SessionView[]} */
     this.items = [];
     this.requests = this.answered = 0;
     byId("trash-empty").addEventListener("click", () => this.empty());
@@ -37,7 +37,7 @@ export class Trash {
     if (number === this.requests) this.answered = number;
   }
 
-  /** @param {Session} session */
+  /** @param {SessionView} session */
   row(session) {
     const button = el("button", { type: "button", cls: "small", text: "Restore", "aria-label": `Restore ${session.name}` });
     button.addEventListener("click", () => this.restore(session));
@@ -46,7 +46,7 @@ export class Trash {
     return el("li", { "data-session-id": session.id }, button, el("strong", { text: session.name }), el("span", { text: facts.join(", ") }));
   }
 
-  /** @param {Session} session */
+  /** @param {SessionView} session */
   restore(session) {
     return quietly(async () => {
       const restored = await api.restoreSession(session.id);
