@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from contextlib import closing
+from itertools import accumulate, pairwise
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import numpy as np
@@ -13,9 +15,12 @@ from hypothesis import strategies as st
 
 from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, NOT_READ, FrameBatch
 from storage.frame_rules import describe_first_broken_rule
+from storage.intervals import Intervals
 from storage.journal.journal import Journal
+from storage.journal.time_index import TimeIndex
 from storage.verify.journal import verify_journal
-from tests.builders.arrays import UTC_NS, make_array
+from storage.wire import EncodedBatch
+from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.frames import make_frames, with_columns
 
 INFO = make_array(2)
@@ -115,3 +120,41 @@ def test_what_does_not_fit_between_its_neighbours_is_misplaced(tmp_path: Path) -
         == "time runs back before frame 20"
     )
     journal.close()
+
+
+@given(st.lists(st.integers(1, 4), min_size=1, max_size=12), st.randoms(use_true_random=False))
+def test_messages_of_any_size_in_any_order_are_judged_without_a_look_at_the_disk(
+    sizes: list[int], random: Random
+) -> None:
+    stored = Intervals()
+    instants = TimeIndex(lambda seq, is_upper: pytest.fail(f"{seq} was looked up"))
+    spans = list(pairwise(accumulate(sizes, initial=0)))
+    random.shuffle(spans)
+    for begin, end in spans:
+        frames = make_frames(np.arange(begin, end))
+        before, after = stored.nearest_outside(begin, end - 1)
+        assert instants.describe_reversal_against_stored(frames, stored) == ""
+        for neighbour, side in ((before, -1), (after, 1)):
+            if neighbour is not None:
+                leap_ns = (neighbour - begin + side * len(spans) * 5) * PERIOD_NS
+                moved = with_columns(frames, t_ns=frames.t_ns + leap_ns)
+                assert "time runs back" in instants.describe_reversal_against_stored(moved, stored)
+        stored.add(begin, end - 1)
+        instants.register_message(EncodedBatch.from_frames_and_payload(frames, b""), stored)
+
+
+def test_when_something_is_not_held_any_more_the_disk_is_asked_once() -> None:
+    asked: list[tuple[int, bool]] = []
+
+    def look_up(seq: int, is_upper: bool) -> int:
+        asked.append((seq, is_upper))
+        return int(make_frames([seq]).t_ns[0])
+
+    instants, stored = TimeIndex(look_up), Intervals([(0, 9)])
+    instants.register_message(EncodedBatch.from_frames_and_payload(make_frames(10), b""), stored)
+    instants.forget_cached_times()
+    for _ in range(3):
+        assert (
+            instants.describe_reversal_against_stored(make_frames(np.arange(10, 12)), stored) == ""
+        )
+    assert asked == [(9, True)]

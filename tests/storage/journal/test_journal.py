@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 
 import pyarrow as pa
@@ -135,30 +134,21 @@ def test_a_journal_of_nothing_holds_nothing(tmp_path: Path) -> None:
         reopened(tmp_path / "a" / "b")
 
 
-def test_an_index_without_a_segment_is_set_aside(tmp_path: Path) -> None:
+def test_an_index_without_a_segment_is_set_aside_beside_what_was_before(tmp_path: Path) -> None:
     journal = filled(tmp_path, (0, 9), (20, 29))
     journal.close()
     journal.append_new_frames(part(10, 19))
     journal.close()
-    gone = tmp_path / f"{10:020d}.arrows"
-    gone.unlink()
-    assert_holds(reopened(tmp_path), {*range(10), *range(20, 30)})
-    assert not gone.with_suffix(".idx").exists()
-    assert gone.with_suffix(".unread").exists()
-
-
-def test_what_was_set_aside_before_is_not_replaced(tmp_path: Path) -> None:
-    filled(tmp_path, (0, 9)).close()
-    (path,) = segments(tmp_path)
+    path = tmp_path / f"{10:020d}.arrows"
     path.unlink()
     aside = path.with_suffix(".unread")
     aside.write_bytes(b"what followed the last whole batch")
-    begun(tmp_path).close()
+    assert_holds(reopened(tmp_path), {*range(10), *range(20, 30)})
     assert aside.read_bytes() == b"what followed the last whole batch"
     assert not path.with_suffix(".idx").exists()
     assert path.with_suffix(".2.unread").exists()
     path.write_bytes(b"no segment")
-    begun(tmp_path).close()
+    reopened(tmp_path).close()
     assert aside.read_bytes() == b"what followed the last whole batch"
     assert path.with_suffix(".3.unread").read_bytes() == b"no segment"
 
@@ -289,13 +279,6 @@ def test_open_files_do_not_grow_with_segments(tmp_path: Path) -> None:
     assert len(open_here()) == 0
     reopened(tmp_path)
     assert len(open_here()) == 0
-
-
-def test_names_of_segments_sort_as_their_frames(tmp_path: Path) -> None:
-    long_journal(tmp_path, 20)
-    names = [path.name for path in segments(tmp_path)]
-    assert all(int(one.split(".")[0]) < int(other.split(".")[0]) for one, other in pairwise(names))
-    assert {len(name) for name in names} == {20 + len(".arrows")}
 
 
 def test_batches_of_a_replaced_file_are_invalidated_as_well(tmp_path: Path) -> None:

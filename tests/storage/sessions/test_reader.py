@@ -23,40 +23,10 @@ from tests.builders.frames import assert_same_bits
 from tests.storage.sessions.session_files import frames, read, refused, rewritten, write
 
 
-@pytest.mark.parametrize("content", [b"", b"PAR1", b"time_s,fz_n\n0,1\n", b"\0" * 5000])
-def test_a_file_that_is_no_parquet_is_refused_by_name(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "s.parquet"
-    path.write_bytes(content)
-    refused(path, "cannot be read as Parquet")
-
-
-def test_a_folder_or_a_missing_file_is_refused_by_name(tmp_path: Path) -> None:
-    refused(tmp_path)
-    refused(tmp_path / "nothing.parquet", "cannot be read as Parquet")
-
-
 def test_somebody_elses_parquet_is_refused_by_name(tmp_path: Path) -> None:
     path = tmp_path / "s.parquet"
     pq.write_table(pa.table({"seq": [1, 2], "grf_n": [1.0, 2.0]}), path)
     refused(path, "states no format.*written by foottile")
-
-
-def test_a_truncated_file_is_refused_by_name(tmp_path: Path) -> None:
-    whole = write(tmp_path / "s.parquet", frames(200)).read_bytes()
-    path = tmp_path / "cut.parquet"
-    for size in range(0, len(whole), 97):
-        path.write_bytes(whole[:size])
-        refused(path)
-
-
-def test_a_flipped_bit_is_refused_by_name(tmp_path: Path) -> None:
-    path = write(tmp_path / "s.parquet", frames(100), {"seed": 7})
-    whole = path.read_bytes()
-    for at in range(0, len(whole), 23):
-        damaged = bytearray(whole)
-        damaged[at] ^= 1 << at % 8
-        path.write_bytes(damaged)
-        refused(path)
 
 
 def test_a_later_format_is_refused_however_it_describes_its_array(tmp_path: Path) -> None:

@@ -1,10 +1,13 @@
-"""References read from files that a test writes: texts, whole and damaged, and C3D."""
+"""References read from files that a test writes, held against numbers; and damaged texts."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from devices.arrays import Floats
 from devices.errors import FileFormatError, UsageError
@@ -33,6 +36,14 @@ def read_c3d(
 ) -> ReferenceData:
     """Read a C3D file of these parameters and channels."""
     return read(folder, c3d_bytes(content, analog, **more), stated, "gait.c3d")
+
+
+def check(
+    found: object, *, rtol: float = 0.0, atol: float = 0.0, **expected: npt.ArrayLike
+) -> None:
+    """Numbers of a reference or a load are these: to the last bit, or within the tolerance."""
+    for name, values in expected.items():
+        np.testing.assert_allclose(getattr(found, name), values, rtol, atol, err_msg=name)
 
 
 def damaged_texts(text: str) -> Iterator[str]:

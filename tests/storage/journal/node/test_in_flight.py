@@ -26,7 +26,7 @@ from storage.journal.node.in_flight import (
 from tests.builders.arrays import make_array
 from tests.builders.frames import assert_same_bits
 from tests.storage.faulty_disk import NO_SPACE, refusing
-from tests.storage.stream import frames, take_in_flight
+from tests.storage.journal.node.leg import frames, take_in_flight
 
 
 def found(folder: Path) -> FrameBatch:

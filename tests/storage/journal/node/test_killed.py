@@ -21,8 +21,7 @@ from storage.journal.node.stream import NodeStream
 from storage.journal.stream_notes import StreamNotes
 from tests.builders.arrays import make_array
 from tests.storage.faulty_disk import before_each_sync_of_frames, refusing
-from tests.storage.journal.node.leg import Start, fill, killed, store
-from tests.storage.stream import frames, take_in_flight
+from tests.storage.journal.node.leg import Start, fill, frames, killed, store, take_in_flight
 from tests.waiting import until
 
 
