@@ -35,7 +35,7 @@ def files_in(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.lists(st.binary(max_size=5000), min_size=1, max_size=4))
 def test_a_file_is_replaced_and_nothing_lies_beside_it(
     tmp_path_factory: pytest.TempPathFactory, contents: list[bytes]

@@ -78,7 +78,7 @@ def test_an_offset_that_fits_only_because_it_wraps_is_seen() -> None:
     assert "36 years" in describe_first_broken_rule(wrapped, INFO)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(data=st.data())
 def test_messages_taken_in_any_order_are_whole_for_verify(
     data: st.DataObject, tmp_path_factory: pytest.TempPathFactory

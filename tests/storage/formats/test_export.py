@@ -44,7 +44,7 @@ from tests.storage.formats.walks import DOCUMENT
 # --- the same in every format ---------------------------------------------------------------------
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     every=st.sampled_from([1, 7, 20, ROWS]),
     start=st.one_of(st.none(), st.integers(0, ROWS - 1)),

@@ -132,7 +132,7 @@ def test_without_a_measured_clock_a_mark_is_at_no_frame() -> None:
     assert "clock" in marker.exclusion_reason
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     every=st.integers(1, ROWS),
     t_ns=st.lists(st.integers(-2 * DISTANCE_MAX_NS, GAP_NS + 2 * DISTANCE_MAX_NS), max_size=8),

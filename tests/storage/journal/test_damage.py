@@ -76,7 +76,7 @@ def test_a_segment_that_was_cut_is_a_stream_for_arrow_again(tmp_path: Path) -> N
     assert pa.ipc.open_stream(path.read_bytes()).read_all().num_rows == 10
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(tail=st.binary(min_size=1, max_size=300), framed=st.booleans())
 def test_garbage_behind_whole_messages_is_cut_off(
     tmp_path_factory: pytest.TempPathFactory, tail: bytes, framed: bool
@@ -139,7 +139,7 @@ def crashed(folder: Path, *parts: tuple[int, int]) -> Path:
     return path
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(data=st.data())
 def test_a_flipped_bit_costs_its_own_batch_only(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
@@ -162,7 +162,7 @@ def test_a_flipped_bit_costs_its_own_batch_only(
     assert not journal.lost
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(data=st.data())
 def test_a_flipped_bit_in_the_index_costs_at_most_one_batch(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject

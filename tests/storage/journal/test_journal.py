@@ -39,7 +39,7 @@ ends = st.tuples(st.integers(0, TOP - 1), st.integers(0, TOP - 1)).map(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(parts=st.lists(ends, max_size=8), asked=ends, reopen=st.integers(0, 8), sent=st.booleans())
 def test_each_frame_is_stored_once_in_whatever_order_they_come(
     tmp_path_factory: pytest.TempPathFactory,
@@ -197,7 +197,7 @@ def test_a_segment_is_closed_after_a_minute_of_frames(tmp_path: Path, rows: int)
     assert_holds(reopened(tmp_path), set(range(200)), 0, 199, of=LONG)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(before=st.integers(-1, 210), keep=st.lists(st.integers(0, 199), max_size=3))
 def test_only_old_segments_that_are_not_kept_are_deleted(
     tmp_path_factory: pytest.TempPathFactory, before: int, keep: list[int]
@@ -232,7 +232,7 @@ times = st.integers(-30, 230).map(lambda n: UTC_NS + n * (SEGMENT_DURATION_NS //
 subsets = st.lists(st.integers(0, 19), unique=True, max_size=20)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(order=subsets, t_ns=times)
 def test_the_first_number_since_a_time_is_that_of_its_batch(
     tmp_path_factory: pytest.TempPathFactory, order: list[int], t_ns: int
@@ -246,7 +246,7 @@ def test_the_first_number_since_a_time_is_that_of_its_batch(
 
 
 @example(order=[*range(20)], t_ns=UTC_NS + 39 * (SEGMENT_DURATION_NS // 40), at_least=0)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(order=subsets, t_ns=times, at_least=st.integers(0, 110))
 def test_the_last_number_before_a_time_is_known_once_it_is_passed(
     tmp_path_factory: pytest.TempPathFactory, order: list[int], t_ns: int, at_least: int

@@ -170,7 +170,7 @@ def test_a_session_survives_its_file(tmp_path: Path, kept: Session) -> None:
 
 
 @given(st.text(max_size=30), st.lists(st.text(max_size=5), max_size=3))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_whatever_a_person_writes_is_kept_as_it_is(
     tmp_path_factory: pytest.TempPathFactory, text: str, tags: list[str]
 ) -> None:

@@ -99,7 +99,7 @@ def test_the_lines_in_the_documents_make_the_same_hashes(tmp_path: Path) -> None
     assert "AssertionError: grf_n" in run(tmp_path / "other.parquet").stderr
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.lists(st.integers(1, 199), max_size=4, unique=True).map(sorted))
 def test_content_has_one_hash_however_it_was_cut(
     tmp_path_factory: pytest.TempPathFactory, cuts: list[int]

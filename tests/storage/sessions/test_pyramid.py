@@ -84,7 +84,7 @@ def same(one: Bins, other: Bins) -> None:
         np.testing.assert_array_equal(values, other[name], err_msg=name)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     parts=st.lists(st.integers(1, 200), min_size=1, max_size=4),
     cuts=st.sets(st.integers(0, 300)),

@@ -27,7 +27,7 @@ from tests.storage.faulty_disk import disk_with_room_for
 from tests.storage.sessions.session_files import frames, read, write
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     rows=st.integers(1, 40),
     tiles=st.integers(1, 9),

@@ -153,7 +153,7 @@ def test_a_missing_file_or_a_wrong_place_or_end_is_named(tmp_path: Path) -> None
     assert "it ended with 29" in problems(stream(tmp_path / "end", next_seq=30))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.data())
 def test_a_flipped_bit_in_a_closed_segment_or_its_index_is_found(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject

@@ -202,7 +202,7 @@ def test_what_is_no_c3d_is_refused(tmp_path: Path, content: bytes) -> None:
         read(path)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(at=st.integers(0, 4095), byte=st.integers(0, 255), cut=st.integers(0, 3))
 def test_a_damaged_file_is_read_or_refused_by_our_own_errors(
     tmp_path_factory: pytest.TempPathFactory, at: int, byte: int, cut: int
@@ -249,7 +249,7 @@ def in_plane(place: Floats, up: Floats) -> Floats:
     return np.asarray(turn(axis, np.array([0.0, 0.0, 1.0])) @ turn(up, axis) @ place)[:2]
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     kind=st.sampled_from([1, 2, 3, 4]),
     signs=st.tuples(st.sampled_from([1.0, -1.0]), st.sampled_from([1.0, -1.0])),

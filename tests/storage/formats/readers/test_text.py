@@ -77,7 +77,7 @@ def test_the_same_numbers_are_read_in_any_form(tmp_path: Path, form: str) -> Non
 CELLS = st.one_of(st.none(), st.floats(-1e6, 1e6).map(lambda x: round(x, 5)))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     rows=st.lists(st.tuples(CELLS, CELLS, CELLS), min_size=1, max_size=8),
     delimiter=st.sampled_from(",;\t"),

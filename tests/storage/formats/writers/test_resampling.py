@@ -40,7 +40,7 @@ def test_frames_that_come_on_time_are_the_samples() -> None:
     assert found.begin_ns == BEGIN_NS
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(jitter=st.lists(st.integers(-700_000, 700_000), min_size=5, max_size=60))
 def test_a_straight_line_is_a_straight_line_however_frames_jitter(jitter: list[int]) -> None:
     t_ns = times(len(jitter)) + np.array(jitter)
@@ -50,7 +50,7 @@ def test_a_straight_line_is_a_straight_line_however_frames_jitter(jitter: list[i
     np.testing.assert_allclose(found.interpolate(line), found.elapsed_s * 1e3, atol=slack_ms)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(lost=st.sets(st.integers(1, 58), min_size=1, max_size=20))
 def test_samples_of_lost_frames_are_empty_and_all_others_are_frames(lost: set[int]) -> None:
     kept = np.array([i for i in range(60) if i not in lost])
