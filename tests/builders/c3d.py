@@ -97,6 +97,19 @@ def force_plate(kind: int, channels: int, **more: Any) -> dict[str, dict[str, An
     }
 
 
+def two_plates(**more: Any) -> dict[str, dict[str, Any]]:
+    """Parameters of two plates of type 2 in one place, with six channels each."""
+    corners = force_plate(2, 6)["FORCE_PLATFORM"]["CORNERS"]
+    facts = {
+        "USED": 2,
+        "TYPE": [2, 2],
+        "CORNERS": np.repeat(corners, 2, axis=0),
+        "ORIGIN": np.array([[0.0, 0.0, -40.0]] * 2),
+        "CHANNEL": np.arange(1, 13).reshape(2, 6),
+    }
+    return force_plate(2, 12, **facts | more)
+
+
 def _section(groups: Mapping[str, Mapping[str, Any]]) -> bytes:
     content = b""
     for number, (group, parameters) in enumerate(groups.items(), start=1):

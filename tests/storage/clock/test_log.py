@@ -157,12 +157,6 @@ def test_a_read_only_disk_keeps_the_rows(log: ClockLog, monkeypatch: pytest.Monk
     assert [r for r in log.read_undamaged_rows() if r != row(8)] == [*rows, row(9)]
 
 
-def test_a_folder_that_cannot_be_written_is_an_error_of_storage(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(StorageError):
-        ClockLog(tmp_path / "file").append(row(0))
-
-
 def test_appending_reads_only_the_end(log: ClockLog, monkeypatch: pytest.MonkeyPatch) -> None:
     filled(log, 1000)
     read = 0

@@ -292,7 +292,7 @@ def test_only_a_slice_of_everything_is_unrestricted() -> None:
 @pytest.mark.parametrize(
     ("asked", "expected"),
     [
-        (("grf_n",), "grf_n"),
+        (("grf_n", "time_s"), "grf_n time_s"),
         (("force_n",), "force_n_0 force_n_1"),
         (("force_n_1",), "force_n_1"),
         (("t_ns", "seq"), "t_ns seq"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import codecs
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,9 +22,10 @@ from storage.formats.slice import FormatOptions, Slice
 from storage.schema import Array
 from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import PERIOD_NS, make_array, make_tile
-from tests.builders.c3d import c3d_bytes, force_plate
+from tests.builders.c3d import c3d_bytes, two_plates
 from tests.builders.frames import make_frames
 from tests.storage.formats.exports import export
+from tests.storage.formats.readers.reading import check
 
 Read = Callable[[str | bytes], LoadTrace]
 
@@ -48,26 +48,6 @@ def read(tmp_path: Path) -> Read:
     return reader
 
 
-@pytest.fixture
-def read_parquet(tmp_path: Path) -> Callable[..., LoadTrace]:
-    """Reads these columns from a Parquet file."""
-
-    def reader(**columns: object) -> LoadTrace:
-        path = tmp_path / "trace.parquet"
-        pq.write_table(pa.table(columns), path)
-        return read_load_to_emulate(path)
-
-    return reader
-
-
-def refused(read: Read, content: str | bytes, *words: str) -> None:
-    """The content is refused with the file's name and all of these words."""
-    with pytest.raises(LoadTraceError) as caught:
-        read(content)
-    for word in ("trace.csv", *words):
-        assert word in str(caught.value)
-
-
 def rows(header: str, *lines: str) -> str:
     return "\n".join([header, *lines]) + "\n"
 
@@ -77,23 +57,18 @@ def rows(header: str, *lines: str) -> str:
 
 def test_a_force_and_its_cop_are_read_and_empty_cops_are_nan(read: Read) -> None:
     trace = read(GOOD)
-    assert trace.time_s.tolist() == [0.0, 0.01, 0.02]
-    assert trace.fz_n is not None
-    assert trace.fz_n.tolist() == [0.0, 10.5, 20.0]
-    np.testing.assert_array_equal(trace.cop_m, [[np.nan, np.nan], [0.01, -0.02], [0.02, -0.03]])
-    assert trace.cells_n is None
-    assert trace.angle_rad is None
+    expected = [[np.nan, np.nan], [0.01, -0.02], [0.02, -0.03]]
+    check(trace, time_s=[0.0, 0.01, 0.02], fz_n=[0.0, 10.5, 20.0], cop_m=expected)
+    assert trace.cells_n is trace.angle_rad is None
     assert trace.where.endswith("trace.csv")
     columns = [trace.time_s, trace.fz_n, trace.cop_m]
     assert {column.dtype for column in columns if column is not None} == {np.dtype(np.float64)}
+    check(read(GOOD.replace("-0.02", "")), fz_n=[0.0, 10.5, 20.0])
 
 
 def test_names_are_matched_without_regard_to_case(read: Read) -> None:
-    trace = read(GOOD.replace("time_s,fz_n,cop_x_m,cop_y_m", "Time_S,fz_N,COP_x_m,cop_Y_m"))
-    assert trace.fz_n is not None
-    assert trace.fz_n[1] == 10.5
-    cells = read(rows("TIME_S,Cell1_N,CELL2_n", "0,1,2", "1,3,4"))
-    np.testing.assert_array_equal(cells.cells_n, [[1, 2], [3, 4]])
+    check(read(GOOD.replace(FORCE, "Time_S,fz_N,COP_x_m,cop_Y_m")), fz_n=[0.0, 10.5, 20.0])
+    check(read(rows("TIME_S,Cell1_N,CELL2_n", "0,1,2", "1,3,4")), cells_n=[[1, 2], [3, 4]])
 
 
 def test_cells_are_put_in_the_order_of_their_numbers(read: Read) -> None:
@@ -101,40 +76,36 @@ def test_cells_are_put_in_the_order_of_their_numbers(read: Read) -> None:
     header = "time_s," + ",".join(f"cell{i}_n" for i in numbers)
     line = ",".join(f"{10 * i}" for i in numbers)
     trace = read(rows(header, f"0,{line}", f"1,{line}"))
-    assert trace.cells_n is not None
-    assert trace.cells_n[1].tolist() == [10.0 * i for i in range(1, 11)]
+    check(trace, cells_n=[[10.0 * i for i in range(1, 11)]] * 2)
 
 
 def test_cells_force_and_angle_are_read_and_other_columns_ignored(read: Read) -> None:
     trace = read(rows("time_s,who,cell1_n,angle_rad,fz_n", '0,"a\nb",1,0.5,3', "1,=1+1,2,-0.5,4"))
-    assert trace.fz_n is not None
-    assert trace.cells_n is not None
-    assert trace.angle_rad is not None
-    assert trace.angle_rad.tolist() == [0.5, -0.5]
+    check(trace, fz_n=[3.0, 4.0], cells_n=[[1.0], [2.0]], angle_rad=[0.5, -0.5])
+
+
+def read_parquet(folder: Path, **columns: object) -> LoadTrace:
+    pq.write_table(pa.table(columns), folder / "trace.parquet")
+    return read_load_to_emulate(folder / "trace.parquet")
 
 
 @pytest.mark.parametrize("type_", [pa.float32(), pa.float64(), pa.int16(), pa.uint8()])
-def test_parquet_is_read_of_any_type(
-    read_parquet: Callable[..., LoadTrace], type_: pa.DataType
-) -> None:
+def test_parquet_is_read_of_any_type(tmp_path: Path, type_: pa.DataType) -> None:
     trace = read_parquet(
+        tmp_path,
         Time_s=pa.array([0, 1, 2], type_),
         FZ_N=pa.array([0, 10, 20], type_),
         cop_x_m=pa.array([None, 0.25, 0.5], pa.float32()),
         cop_y_m=pa.array([float("nan"), 0.25, None], pa.float64()),
     )
-    assert trace.time_s.tolist() == [0.0, 1.0, 2.0]
-    assert trace.fz_n is not None
-    assert trace.fz_n.tolist() == [0.0, 10.0, 20.0]
-    np.testing.assert_array_equal(trace.cop_m, [[np.nan, np.nan], [0.25, 0.25], [0.5, np.nan]])
+    expected = [[np.nan, np.nan], [0.25, 0.25], [0.5, np.nan]]
+    check(trace, time_s=[0.0, 1.0, 2.0], fz_n=[0.0, 10.0, 20.0], cop_m=expected)
 
 
 def test_a_plate_a_little_below_zero_in_flight_is_not_upside_down(read: Read) -> None:
     # A hop: most of it in flight, where a drifted plate reads -0.5 N, and a stance of 800 N.
     lines = [f"{i / 100},{800 if 60 <= i < 80 else -0.5},0,0" for i in range(100)]
-    trace = read(rows("time_s,fz_n,cop_x_m,cop_y_m", *lines))
-    assert trace.fz_n is not None
-    assert trace.fz_n.max() == 800.0
+    assert np.max(np.asarray(read(rows(FORCE, *lines)).fz_n)) == 800.0
 
 
 # --- files that are refused -----------------------------------------------------------------------
@@ -149,17 +120,77 @@ def test_a_folder_and_a_missing_file_are_refused_by_name(tmp_path: Path, suffix:
         read_load_to_emulate(tmp_path / f"folder{suffix}")
 
 
+FORCE = "time_s,fz_n,cop_x_m,cop_y_m"
+NO_NUMBERS = [
+    (FORCE, "1,{},0,0", "fz_n"),
+    (FORCE, "{},1,0,0", "time_s"),
+    ("time_s,cell1_n,cell2_n,x", "1,1,{},0", "cell2_n"),
+    ("time_s,cell1_n,cell2_n,angle_rad", "1,1,1,{}", "angle_rad"),
+]
+
+
+def cells_numbered(*numbers: int) -> str:
+    line = ",1" * len(numbers)
+    return rows("time_s" + "".join(f",cell{i}_n" for i in numbers), f"0{line}", f"1{line}")
+
+
+def at_times(*times: float) -> str:
+    return rows("time_s,cell1_n", *(f"{t},1" for t in times))
+
+
 @pytest.mark.parametrize(
-    "content",
+    ("content", "words"),
     [
-        b"",
-        bytes(range(256)) * 4,
-        "time_s,fz_n,cop_x_m,cop_y_m\n0,1,0,0\n1,1,0\n",  # a short line
-        "0,1,0,0\n1,1,0,0\n",  # numbers without names
+        (b"", []),
+        (bytes(range(256)) * 4, []),
+        (rows(FORCE, "0,1,0,0", "1,1,0"), []),  # a short line
+        ("0,1,0,0\n1,1,0,0\n", []),  # numbers without names
+        *(
+            (GOOD.replace(name, "other"), [f"column {name} is missing", "other"])
+            for name in ("time_s", "cop_x_m", "cop_y_m")
+        ),
+        (GOOD.replace("fz_n", "fx_n"), ["no load in its columns", "fx_n", "cell1_n"]),
+        *(
+            (GOOD.replace(right, wrong), [f"{right}, converted from {wrong.lower()!r}"])
+            for wrong, right in (("time_ms", "time_s"), ("time", "time_s"), ("Fz", "fz_n"))
+        ),
+        (GOOD.replace("cop_y_m", "cop_y_cm"), ["cop_y_m, converted from 'cop_y_cm'"]),
+        (rows("time_s,fz_n,fz_N,cop_x_m,cop_y_m", "0,1,2,0,0", "1,1,2,0,0"), []),
+        (rows("time_s,fz_n,fz_n,cop_x_m,cop_y_m", "0,1,2,0,0", "1,1,2,0,0"), []),
+        (cells_numbered(1, 2, 4), ["numbered 1, 2, 4", "without a gap"]),
+        (cells_numbered(2, 3), ["numbered 2, 3", "without a gap"]),
+        (cells_numbered(0, 1), ["numbered 0, 1", "without a gap"]),
+        (cells_numbered(3), ["numbered 3", "without a gap"]),
+        (rows(FORCE), ["0 rows", "at least two"]),
+        (rows(FORCE, "0,1,0,0"), ["1 rows", "at least two"]),
+        (at_times(0.0, 0.1, 0.1, 0.2), ["at row 3;", "from 0.1 to 0.1", "Sort the rows"]),
+        (at_times(0.0, 0.1, 0.2, 0.15), ["at row 4;", "from 0.2 to 0.15", "Sort the rows"]),
+        (at_times(1.0, 0.5, 0.2, 0.1), ["at row 2;", "from 1 to 0.5", "Sort the rows"]),
+        *(
+            (rows(header, "0,0,0,0", line.format(value), "2,0,0,0"), [f"{name} is", "at row 2"])
+            for header, line, name in NO_NUMBERS
+            for value in ("", "NaN", "-inf")
+        ),
+        (GOOD.replace("-0.02", "inf"), ["cop_y_m is inf at row 2"]),
+        *(
+            (GOOD.replace("10.5", word), ["column fz_n is not numeric"])
+            for word in ("heavy", "1.5 N", "1;5")
+        ),
+        # Pressed as it is, it would be clipped to no load at all without a word.
+        (rows(FORCE, "0,0,0,0", "1,-300,0,0", "2,-700,0,0"), ["negative", "Change its sign"]),
+        (
+            rows("time_s,cell1_n,cell2_n", "0,0,0", "1,-300,-10", "2,-700,-30", "3,-1,2"),
+            ["negative", "Change its sign"],
+        ),
     ],
 )
-def test_a_file_that_is_no_table_is_refused(read: Read, content: str | bytes) -> None:
-    refused(read, content)
+def test_a_table_that_is_no_load_is_refused_by_name(
+    read: Read, content: str | bytes, words: list[str]
+) -> None:
+    with pytest.raises(LoadTraceError) as caught:
+        read(content)
+    for word in ("trace.csv", *words):
+        assert word in str(caught.value)
 
 
 def test_a_csv_that_is_called_parquet_is_refused(tmp_path: Path) -> None:
@@ -172,85 +203,7 @@ def test_a_csv_that_is_called_parquet_is_refused(tmp_path: Path) -> None:
 # --- columns --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("column", ["time_s", "cop_x_m", "cop_y_m"])
-def test_a_missing_column_is_named(read: Read, column: str) -> None:
-    refused(read, GOOD.replace(column, "other"), f"column {column} is missing", "other")
-
-
-def test_a_table_without_any_load_is_refused_with_what_it_has(read: Read) -> None:
-    refused(read, GOOD.replace("fz_n", "fx_n"), "no load in its columns", "fx_n", "cell1_n")
-
-
-@pytest.mark.parametrize(
-    ("wrong", "right"),
-    [("time_ms", "time_s"), ("time", "time_s"), ("Fz", "fz_n"), ("cop_y_cm", "cop_y_m")],
-)
-def test_a_column_in_another_unit_is_refused_by_name(read: Read, wrong: str, right: str) -> None:
-    refused(read, GOOD.replace(right, wrong), f"{right}, converted from {wrong.lower()!r}")
-
-
-@pytest.mark.parametrize("names", ["fz_n,fz_N", "fz_n,fz_n"])
-def test_a_column_that_is_there_twice_is_refused(read: Read, names: str) -> None:
-    refused(read, rows(f"time_s,{names},cop_x_m,cop_y_m", "0,1,2,0,0", "1,1,2,0,0"))
-
-
-@pytest.mark.parametrize(
-    ("numbers", "said"), [((1, 2, 4), "1, 2, 4"), ((2, 3), "2, 3"), ((0, 1), "0, 1"), ((3,), "3")]
-)
-def test_cells_with_a_gap_are_refused(read: Read, numbers: tuple[int, ...], said: str) -> None:
-    header = "time_s," + ",".join(f"cell{i}_n" for i in numbers)
-    line = ",".join("1" for _ in numbers)
-    refused(read, rows(header, f"0,{line}", f"1,{line}"), f"numbered {said}", "without a gap")
-
-
 # --- rows -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("lines", "said"), [([], "0 rows"), (["0,1,0,0"], "1 rows")])
-def test_fewer_than_two_rows_are_refused(read: Read, lines: list[str], said: str) -> None:
-    refused(read, rows("time_s,fz_n,cop_x_m,cop_y_m", *lines), said, "at least two")
-
-
-@pytest.mark.parametrize(
-    ("times", "row", "said"),
-    [
-        ((0.0, 0.1, 0.1, 0.2), 3, "from 0.1 to 0.1"),
-        ((0.0, 0.1, 0.2, 0.15), 4, "from 0.2 to 0.15"),
-        ((1.0, 0.5, 0.2, 0.1), 2, "from 1 to 0.5"),
-    ],
-)
-def test_times_that_do_not_rise_are_refused_with_the_row(
-    read: Read, times: tuple[float, ...], row: int, said: str
-) -> None:
-    text = rows("time_s,cell1_n", *(f"{t},1" for t in times))
-    refused(read, text, f"at row {row};", said, "Sort the rows")
-
-
-@pytest.mark.parametrize("value", ["", "NaN", "-inf"])
-@pytest.mark.parametrize(
-    ("header", "line", "column"),
-    [
-        ("time_s,fz_n,cop_x_m,cop_y_m", "1,{},0,0", "fz_n"),
-        ("time_s,fz_n,cop_x_m,cop_y_m", "{},1,0,0", "time_s"),
-        ("time_s,cell1_n,cell2_n,x", "1,1,{},0", "cell2_n"),
-        ("time_s,cell1_n,cell2_n,angle_rad", "1,1,1,{}", "angle_rad"),
-    ],
-)
-def test_a_cell_without_a_number_is_refused_with_column_and_row(
-    read: Read, header: str, line: str, column: str, value: str
-) -> None:
-    text = rows(header, "0,0,0,0", line.format(value), "2,0,0,0")
-    refused(read, text, f"column {column} is", "at row 2")
-
-
-def test_an_infinite_centre_of_pressure_is_refused_and_an_empty_one_is_not(read: Read) -> None:
-    refused(read, GOOD.replace("-0.02", "inf"), "cop_y_m is inf at row 2")
-    assert read(GOOD.replace("-0.02", "")).cop_m is not None
-
-
-@pytest.mark.parametrize("value", ["heavy", "1.5 N", "1;5"])
-def test_a_column_of_words_is_refused_by_name(read: Read, value: str) -> None:
-    refused(read, GOOD.replace("10.5", value), "column fz_n is not numeric")
 
 
 @pytest.mark.parametrize(
@@ -258,23 +211,9 @@ def test_a_column_of_words_is_refused_by_name(read: Read, value: str) -> None:
     [pa.array(["a", "b"]), pa.array([0, 1], pa.timestamp("ms")), pa.array([0, 2**60 + 1])],
     ids=["text", "instants", "too large for a float"],
 )
-def test_a_parquet_column_of_no_numbers_is_refused_by_name(
-    read_parquet: Callable[..., LoadTrace], time_s: pa.Array[Any]
-) -> None:
+def test_a_parquet_column_of_no_numbers_is_refused(tmp_path: Path, time_s: pa.Array[Any]) -> None:
     with pytest.raises(LoadTraceError, match="column time_s is not numeric"):
-        read_parquet(time_s=time_s, cell1_n=[1.0, 2.0])
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        rows("time_s,fz_n,cop_x_m,cop_y_m", "0,0,0,0", "1,-300,0,0", "2,-700,0,0", "3,-1,0,0"),
-        rows("time_s,cell1_n,cell2_n", "0,0,0", "1,-300,-10", "2,-700,-30", "3,-1,2"),
-    ],
-)
-def test_a_negative_load_is_refused_as_upside_down(read: Read, content: str) -> None:
-    # Pressed as it is, it would be clipped to no load at all without a word.
-    refused(read, content, "negative", "Change its sign")
+        read_parquet(tmp_path, time_s=time_s, cell1_n=[1.0, 2.0])
 
 
 # --- size -----------------------------------------------------------------------------------------
@@ -305,17 +244,9 @@ def test_a_text_that_is_too_long_is_refused_before_it_is_read(tmp_path: Path) ->
 
 
 def test_a_plate_of_several_is_named_and_its_unit_stated(tmp_path: Path) -> None:
-    load_n = np.linspace(0.0, 200.0, 50)
-    nothing = np.zeros(50)
+    load_n, nothing = np.linspace(0.0, 200.0, 50), np.zeros(50)
     wrench = [nothing, nothing, load_n, -20.0 * load_n, 10.0 * load_n, nothing]
-    more = {
-        "USED": 2,
-        "TYPE": [2, 2],
-        "CORNERS": np.repeat(force_plate(2, 6)["FORCE_PLATFORM"]["CORNERS"], 2, axis=0),
-        "ORIGIN": np.zeros((2, 3)),
-        "CHANNEL": np.arange(1, 13).reshape(2, 6),
-    }
-    content = force_plate(2, 12, **more)
+    content = two_plates(ORIGIN=np.zeros((2, 3)))
     content["ANALOG"]["UNITS"] = ["V"] * 12
     path = tmp_path / "gait.c3d"
     path.write_bytes(c3d_bytes(content, np.stack([*[nothing] * 6, *wrench], axis=1)))
@@ -325,10 +256,8 @@ def test_a_plate_of_several_is_named_and_its_unit_stated(tmp_path: Path) -> None
     with pytest.raises(LoadTraceError, match=r"not stated.*--units grf="):
         read_load_to_emulate(path, ReferenceOptions(columns))
     trace = read_load_to_emulate(path, ReferenceOptions(columns, {"grf": "N", "cop": "mm"}))
-    assert trace.fz_n is not None
-    assert trace.cop_m is not None
-    np.testing.assert_allclose(trace.fz_n, load_n, atol=1e-4)
-    np.testing.assert_allclose(trace.cop_m[1:], [[-0.01, -0.02]] * 49, atol=1e-6)
+    check(trace, atol=1e-4, fz_n=load_n)
+    check(trace, atol=1e-6, cop_m=[[np.nan, np.nan], *[[-0.01, -0.02]] * 49])
 
 
 def test_names_units_and_sign_of_a_table_are_stated(tmp_path: Path) -> None:
@@ -337,11 +266,8 @@ def test_names_units_and_sign_of_a_table_are_stated(tmp_path: Path) -> None:
     columns = {"time_s": "Time", "grf_n": "Fz", "cop_x_m": "Px", "cop_y_m": "Py"}
     stated = ReferenceOptions(columns, {"time": "ms", "grf": "kN", "cop": "mm"}, "-")
     trace = read_load_to_emulate(path, stated)
-    np.testing.assert_allclose(trace.time_s, [0.0, 0.01, 0.02])
-    assert trace.fz_n is not None
-    assert trace.cop_m is not None
-    np.testing.assert_allclose(trace.fz_n, [0.0, 200.0, 300.0])
-    np.testing.assert_allclose(trace.cop_m[1:], [[0.004, -0.005], [0.005, -0.006]])
+    check(trace, rtol=1e-7, time_s=[0.0, 0.01, 0.02], fz_n=[0.0, 200.0, 300.0])
+    check(trace, rtol=1e-7, cop_m=[[np.nan, np.nan], [0.004, -0.005], [0.005, -0.006]])
 
 
 ROWS = 20
@@ -381,52 +307,36 @@ def exported(folder: Path, to: str, columns: dict[str, Array], *names: str) -> P
     return path
 
 
-def cells(trace: LoadTrace) -> Array:
-    assert trace.cells_n is not None
-    return trace.cells_n
-
-
 def test_a_sealed_session_presses_its_estimates_on_loaded_tiles(tmp_path: Path) -> None:
     trace = read_load_to_emulate(written(tmp_path / "s.parquet", ESTIMATES))
-    np.testing.assert_array_equal(cells(trace), ESTIMATE_N[2:, [0, 2]])  # from the first angle on
-    np.testing.assert_allclose(trace.time_s, np.arange(2, ROWS) * PERIOD_NS * 1e-9, rtol=1e-12)
-    assert trace.angle_rad is not None
-    np.testing.assert_allclose(trace.angle_rad, 0.1, rtol=1e-6)
+    check(trace, cells_n=ESTIMATE_N[2:, [0, 2]])  # from the first angle on
+    time_s = np.arange(2, ROWS) * PERIOD_NS * 1e-9
+    check(trace, rtol=1e-6, angle_rad=[0.1] * (ROWS - 2))
+    check(trace, rtol=1e-12, time_s=time_s)
 
 
 @pytest.mark.parametrize("to", ["parquet", "csv"])
 def test_true_forces_go_before_estimates(tmp_path: Path, to: str) -> None:
     trace = read_load_to_emulate(exported(tmp_path, to, ESTIMATES | TRUTH))
-    np.testing.assert_allclose(cells(trace), TRUE_N[:, [0, 2]], rtol=1e-15)
-    assert trace.angle_rad is not None
-    np.testing.assert_allclose(trace.angle_rad, 0.2)
+    check(trace, rtol=1e-15, cells_n=TRUE_N[:, [0, 2]])
+    check(trace, rtol=1e-7, angle_rad=[0.2] * ROWS)
     assert len(trace.time_s) == ROWS
 
 
 @pytest.mark.parametrize("to", ["parquet", "csv"])
-def test_a_grf_with_its_cop_is_a_load(tmp_path: Path, to: str) -> None:
+def test_a_grf_with_its_cop_is_a_load_and_of_one_row_of_tiles_along_it(
+    tmp_path: Path, to: str
+) -> None:
     names = ("t_ns", "grf_n", "cop_x_m", "cop_y_m")
-    trace = read_load_to_emulate(exported(tmp_path, to, ESTIMATES, *names))
-    assert trace.cells_n is None
-    assert trace.fz_n is not None
-    assert trace.cop_m is not None
-    np.testing.assert_allclose(trace.fz_n, ESTIMATES["grf_n"], rtol=1e-6)
-    np.testing.assert_array_equal(np.isnan(trace.cop_m[:, 0]), np.arange(ROWS) % 4 == 0)
-
-
-@pytest.mark.parametrize("to", ["parquet", "csv"])
-def test_a_grf_of_one_row_of_tiles_has_a_constant_across_it(tmp_path: Path, to: str) -> None:
-    names = ("t_ns", "grf_n", "cop_x_m", "cop_y_m")
-    row = ESTIMATES | {"cop_y_m": np.full(ROWS, np.nan)}
-    trace = read_load_to_emulate(exported(tmp_path, to, row, *names))
-    assert trace.cop_m is not None
-    np.testing.assert_array_equal(np.isnan(trace.cop_m[:, 0]), np.arange(ROWS) % 4 == 0)
-    np.testing.assert_array_equal(trace.cop_m[:, 1], 0.0)
-    neither = read_load_to_emulate(
-        exported(tmp_path, to, row | {"cop_x_m": row["cop_y_m"]}, *names)
-    )
-    assert neither.cop_m is not None
-    assert np.isnan(neither.cop_m).all()
+    x_m, nothing = ESTIMATES["cop_x_m"], np.full(ROWS, np.nan)
+    for known, expected in (
+        ({}, [x_m, ESTIMATES["cop_y_m"]]),
+        ({"cop_y_m": nothing}, [x_m, np.zeros(ROWS)]),
+        ({"cop_y_m": nothing, "cop_x_m": nothing}, [nothing, nothing]),
+    ):
+        trace = read_load_to_emulate(exported(tmp_path, to, ESTIMATES | known, *names))
+        assert trace.cells_n is None
+        check(trace, rtol=1e-6, fz_n=ESTIMATES["grf_n"], cop_m=np.stack(expected, axis=1))
 
 
 def test_rows_without_forces_are_left_out_at_the_ends_only(tmp_path: Path) -> None:
@@ -434,27 +344,25 @@ def test_rows_without_forces_are_left_out_at_the_ends_only(tmp_path: Path) -> No
     columns["force_n"][:3, 0] = np.nan
     columns["force_n"][-2:, 2] = np.nan
     trace = read_load_to_emulate(written(tmp_path / "s.parquet", columns))
-    np.testing.assert_array_equal(cells(trace), ESTIMATE_N[3:-2, [0, 2]])
+    check(trace, cells_n=ESTIMATE_N[3:-2, [0, 2]])
     columns["force_n"][10, 0] = np.nan
     with pytest.raises(LoadTraceError, match=r"cell1_n is nan at row 8"):
         read_load_to_emulate(written(tmp_path / "s.parquet", columns))
 
 
-def test_raw_frames_are_refused_with_what_to_do(tmp_path: Path) -> None:
-    with pytest.raises(LoadTraceError, match=re.escape("Estimate it first")):
-        read_load_to_emulate(written(tmp_path / "s.parquet", {}))
-
-
-def test_a_session_without_known_forces_is_refused(tmp_path: Path) -> None:
-    nothing = {"force_n": np.full((ROWS, 3), np.nan)}
-    with pytest.raises(LoadTraceError, match="no row of it has a load"):
-        read_load_to_emulate(written(tmp_path / "s.parquet", nothing))
-
-
-def test_forces_of_some_tiles_only_are_refused(tmp_path: Path) -> None:
-    path = exported(tmp_path, "csv", ESTIMATES, "t_ns", "force_n_2")
-    with pytest.raises(LoadTraceError, match=re.escape("forces of tiles 2 only")):
-        read_load_to_emulate(path)
+def test_a_session_without_all_forces_is_refused_with_what_to_do(tmp_path: Path) -> None:
+    path = written(tmp_path / "s.parquet", ESTIMATES)
+    pq.write_table(pq.read_table(path), path)
+    unknown = {"force_n": np.full((ROWS, 3), np.nan)}
+    for file, says in (
+        (path, "another program has rewritten it"),
+        (written(tmp_path / "raw.parquet", {}), "Estimate it first"),
+        (written(tmp_path / "unknown.parquet", unknown), "no row of it has a load"),
+        (exported(tmp_path, "csv", ESTIMATES, "t_ns", "force_n_2"), "forces of tiles 2 only"),
+        (exported(tmp_path, "arrow", ESTIMATES), r"ends in \.parquet"),
+    ):
+        with pytest.raises(LoadTraceError, match=says):
+            read_load_to_emulate(file)
 
 
 def test_an_export_for_excel_is_read_again_with_its_umlauts(tmp_path: Path) -> None:
@@ -469,15 +377,3 @@ def test_an_export_for_excel_is_read_again_with_its_umlauts(tmp_path: Path) -> N
     table = read_table(path, lambda name: name.startswith("force_n"))
     found = table.columns["force_n_Größe"].astype(np.float32)
     np.testing.assert_array_equal(found, ESTIMATE_N[:, 0])
-
-
-def test_a_session_rewritten_by_another_program_is_refused(tmp_path: Path) -> None:
-    path = written(tmp_path / "s.parquet", ESTIMATES)
-    pq.write_table(pq.read_table(path), path)
-    with pytest.raises(LoadTraceError, match="another program has rewritten it"):
-        read_load_to_emulate(path)
-
-
-def test_an_arrow_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(LoadTraceError, match=r"ends in \.parquet"):
-        read_load_to_emulate(exported(tmp_path, "arrow", ESTIMATES))

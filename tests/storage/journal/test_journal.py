@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -158,21 +157,6 @@ def test_a_deleted_journal_is_gone(tmp_path: Path) -> None:
     journal.close_and_delete()
     assert not (tmp_path / "journal").exists()
     assert_holds(journal, set())
-
-
-def test_sync_covers_index_and_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    synced: list[str] = []
-    real = os.fsync
-
-    def note(descriptor: int) -> None:
-        synced.append(Path(f"/proc/self/fd/{descriptor}").readlink().name)
-        real(descriptor)
-
-    monkeypatch.setattr("os.fsync", note)
-    journal = filled(tmp_path / "stream", (0, 9))
-    assert synced == [tmp_path.name]  # the stream's own folder has its name
-    journal.sync()
-    assert synced[1:] == [f"{0:020d}.arrows", f"{0:020d}.idx", "stream"]
 
 
 def long_journal(folder: Path, rows: int = 10) -> Journal:

@@ -250,24 +250,27 @@ def test_a_disk_that_fills_within_a_batch_stores_what_was_written(
     assert_holds(reopened(tmp_path), set(range(30)))
 
 
-def test_appending_does_not_sync(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    synced: list[int] = []
+def test_a_sync_covers_segment_index_and_folder_and_appending_syncs_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[str] = []
     real = os.fsync
 
-    def count(descriptor: int) -> None:
-        synced.append(descriptor)
+    def note(descriptor: int) -> None:
+        synced.append(Path(f"/proc/self/fd/{descriptor}").readlink().name)
         real(descriptor)
 
+    monkeypatch.setattr("os.fsync", note)
     journal = begun(tmp_path / "stream")
-    monkeypatch.setattr("os.fsync", count)
     for first in range(0, 200, 20):
         journal.append_new_frames(LONG.slice_rows(first, first + 20))
-    assert synced == []
+    assert synced == [tmp_path.name]  # the stream's own folder has its name
+    synced.clear()
     assert len(segments(tmp_path / "stream")) == 10
-    journal.sync()
-    assert len(synced) == 3 * 9 + 2 + 1  # each segment and its index, closed but one; the folder
-    journal.sync()
-    assert len(synced) == 3 * 9 + 2 + 1
+    for _ in range(2):
+        journal.sync()
+        assert len(synced) == 3 * 9 + 2 + 1  # each segment and its index, closed but one; folders
+        assert synced[-3:] == [f"{180:020d}.arrows", f"{180:020d}.idx", "stream"]
 
 
 def test_a_failed_sync_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -123,11 +123,8 @@ def test_a_file_of_no_session_is_proven_as_far_as_it_goes(tmp_path: Path) -> Non
 def test_what_is_no_sealed_file_is_refused(tmp_path: Path) -> None:
     foreign = tmp_path / "foreign.parquet"
     pq.write_table(pa.table({"a": [1]}), foreign)
-    text = tmp_path / "notes.txt"
-    text.write_text("a walk")
-    for path in (foreign, text, tmp_path / "none.parquet", tmp_path):
-        with pytest.raises(FileFormatError, match=path.name):
-            verify_sealed_file(path)
+    with pytest.raises(FileFormatError, match=foreign.name):
+        verify_sealed_file(foreign)
 
 
 # --- damage ---------------------------------------------------------------------------------------

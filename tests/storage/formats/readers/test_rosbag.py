@@ -257,13 +257,6 @@ def test_our_own_export_to_ros_2_is_read_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.cop_m[:, 0], columns["cop_x_m"][known], rtol=1e-12)
 
 
-def test_our_own_export_to_foxglove_has_no_wrenches(tmp_path: Path) -> None:
-    path = tmp_path / "session.mcap"
-    path.write_bytes(written())
-    with pytest.raises(FileFormatError, match="there is no wrench in it"):
-        read_reference(path, ReferenceOptions())
-
-
 def test_a_unit_that_is_not_ros_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="is in N, not in kN"):
         read_reference(write_bag1(tmp_path, walk()), ReferenceOptions(units={"grf": "kN"}))

@@ -173,14 +173,6 @@ def test_a_saturated_tile_leaves_no_force_but_its_bound() -> None:
     assert (found.channel("estimate_flags")[200:250].astype(int) & 1).all()
 
 
-def test_an_unknown_cop_is_nan_beside_its_force(plain: Read) -> None:
-    for begin, end in STANCES:
-        for row in (begin, end - 1):
-            assert plain.channel("Fz1")[row] < 0.0
-            assert np.isnan(plain.channel("Mx1")[row])
-            assert np.isnan(plain.channel("My1")[row])
-
-
 def test_lost_frames_are_empty_samples() -> None:
     kept = np.delete(np.arange(ROWS), np.arange(600, 640))
     lost = [{"lost": {"disk_full": 40}}]

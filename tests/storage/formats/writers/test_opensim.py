@@ -193,11 +193,13 @@ def test_marks_and_contacts_lie_beside_it(tmp_path: Path) -> None:
     assert found.notes["MARKS"] == 1
 
 
-def test_files_have_the_sessions_name() -> None:
-    source = {"session": "20260101-000000-abc"}
-    content = b"".join(OPENSIM.encode(export_of_walk(provenance=source)))
+@pytest.mark.parametrize(
+    ("session", "stem"), [("20260101-000000-abc",) * 2, ("../../é/x", ".._.._e_x")]
+)
+def test_files_have_the_sessions_name_and_stay_in_the_folder(session: str, stem: str) -> None:
+    content = b"".join(OPENSIM.encode(export_of_walk(provenance={"session": session})))
     with zipfile.ZipFile(io.BytesIO(content)) as file:
-        assert {name.removeprefix("20260101-000000-abc") for name in file.namelist()} == {
+        assert {name.removeprefix(stem) for name in file.namelist()} == {
             *(".mot", ".xml", "_filled.csv", "_events.csv", "_notes.json")
         }
 
@@ -206,12 +208,6 @@ def test_files_have_the_sessions_name() -> None:
 def test_what_is_no_name_of_a_body_is_refused(name: str) -> None:
     with pytest.raises(ValidationError):
         FormatOptions(body=name)
-
-
-def test_names_of_files_stay_in_the_folder() -> None:
-    content = b"".join(OPENSIM.encode(export_of_walk(provenance={"session": "../../é/x"})))
-    with zipfile.ZipFile(io.BytesIO(content)) as file:
-        assert file.namelist()[0] == ".._.._e_x.xml"
 
 
 def test_forces_without_any_point_are_refused() -> None:

@@ -82,12 +82,6 @@ def test_seconds_and_timestamps_come_first(to: str, start: int) -> None:
 
 
 @pytest.mark.parametrize("to", TABLES)
-def test_seconds_can_be_chosen_as_any_column(to: str) -> None:
-    asked = ("grf_n", "time_s")
-    assert read(exported(to, Slice(columns=asked)), to).column_names == list(asked)
-
-
-@pytest.mark.parametrize("to", TABLES)
 def test_with_serials_columns_of_a_tile_end_in_its_serial(to: str) -> None:
     part = Slice(columns=("grf_n", "force_n", "pressure_raw_1"))
     table = read(exported(to, part, options=FormatOptions(names="serial")), to)
