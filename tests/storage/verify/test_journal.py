@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
+import os
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.frames import make_frames
 
 STREAM_ID = "a" * 32
+RECORD_BYTES = RECORD_DTYPE.itemsize
 
 
 def array(**changes: Any) -> ArrayInfo:
@@ -116,41 +118,102 @@ def test_a_cut_segment_is_damaged_if_it_was_closed(tmp_path: Path, closed: bool)
             assert report.stored.number_count == 40 - gone
 
 
+def cut_index(records: int) -> Callable[[Path], object]:
+    def cut(folder: Path) -> None:
+        index_of(folder).write_bytes(index_of(folder).read_bytes()[: records * RECORD_BYTES])
+
+    return cut
+
+
+def flip_fourth_batch(folder: Path) -> None:
+    content = bytearray(segment_of(opened(folder)).read_bytes())
+    content[ends(folder)[3] - 9] ^= 1
+    segment_of(folder).write_bytes(content)
+
+
+def spoil_a_name(folder: Path) -> None:
+    content = segment_of(opened(folder)).read_bytes()
+    segment_of(folder).write_bytes(content.replace(b"frame_flags", b"\xf2rame_flags", 1))
+
+
+def add_segment(folder: Path, batch: FrameBatch, info: ArrayInfo) -> None:
+    payload = encode_frames(batch, wire_schema(info))
+    header = wire_schema(info).serialize().to_pybytes()
+    writer = SegmentWriter(folder / f"{batch.seq[0]:020d}.arrows", header)
+    writer.append(EncodedBatch.from_frames_and_payload(batch, payload))
+    writer.close()
+
+
+def take_back(folder: Path) -> None:
+    add_segment(folder, frames(40, 44, at_ns=-(10**9)), array())
+
+
+def add_other_stream(folder: Path) -> None:
+    add_segment(folder, frames(40, 49), array(stream_id="b" * 32))
+
+
+ALL = Intervals([(0, 39)])
+
+
+@pytest.mark.parametrize(
+    ("damage", "said", "remarked", "stored"),
+    [
+        (cut_index(4), "4 batches behind its last one are in no index", "", None),
+        (cut_index(7), "", "in no index", None),  # the newest may be on its way
+        (lambda folder: index_of(folder).unlink(), "is missing", "", None),
+        (lambda folder: segment_of(folder).unlink(), "segment of this index is missing", "", None),
+        (spoil_a_name, "its columns are not those of a stream of frames", "", ALL),
+        (
+            flip_fourth_batch,
+            "frames 15 to 19 do not agree with their checksum",
+            "",
+            ALL - Intervals([(15, 19)]),
+        ),
+        (add_other_stream, "another stream or array", "", None),
+        (take_back, "time runs back before frame 40", "", None),
+        (lambda folder: (folder / NOTES_FILE).write_bytes(b"{"), NOTES_FILE, "", ALL),
+        (
+            lambda folder: (folder / NOTES_FILE).unlink(),
+            "",
+            "nothing says where the stream ended",
+            ALL,
+        ),
+    ],
+)
+def test_damage_is_named_and_what_is_on_its_way_remarked(
+    tmp_path: Path,
+    damage: Callable[[Path], object],
+    said: str,
+    remarked: str,
+    stored: Intervals | None,
+) -> None:
+    folder = stream(tmp_path)
+    damage(folder)
+    report = verify_journal(folder)
+    assert said in "; ".join(report.problems)
+    assert bool(report.problems) == bool(said)
+    assert remarked in "; ".join(report.remarks)
+    assert stored in (None, report.stored)
+    if damage is flip_fourth_batch:
+        assert report.lost.by_reason["corrupt"] == Intervals([(15, 19)])
+
+
+def test_a_wrong_place_or_end_is_named(tmp_path: Path) -> None:
+    folder = stream(tmp_path / "place")
+    assert "wrongly placed" in problems(folder.rename(folder.with_name("b" * 32)))
+    assert "it ended with 29" in problems(stream(tmp_path / "end", next_seq=30))
+
+
 def test_a_cut_of_segment_and_index_is_seen_by_the_streams_end(tmp_path: Path) -> None:
     folder = stream(tmp_path, next_seq=40)
-    path, index = segment_of(folder), index_of(folder)
-    path.write_bytes(path.read_bytes()[: ends(folder)[4]])
-    index.write_bytes(index.read_bytes()[: 5 * RECORD_DTYPE.itemsize])
+    os.truncate(segment_of(folder), ends(folder)[4])
+    cut_index(5)(folder)
     report = verify_journal(folder)
     assert report.absent_not_lost == Intervals([(25, 39)])
     assert "cut behind frame 24" in "; ".join(report.problems)
     (tmp_path / "nodes").mkdir()  # a server may still get the rest
     report = verify_journal(folder)
     assert (report.problems, report.absent_not_lost.number_count) == ([], 15)
-
-
-def test_batches_that_are_in_no_index_are_seen(tmp_path: Path) -> None:
-    folder = stream(tmp_path)
-    index = index_of(folder)
-    whole = index.read_bytes()
-    index.write_bytes(whole[: 4 * RECORD_DTYPE.itemsize])
-    assert "4 batches behind its last one are in no index" in problems(folder)
-    index.write_bytes(whole[: 7 * RECORD_DTYPE.itemsize])  # the newest may be on its way
-    report = verify_journal(folder)
-    assert report.problems == []
-    assert "in no index" in "; ".join(report.remarks)
-
-
-def test_a_missing_file_or_a_wrong_place_or_end_is_named(tmp_path: Path) -> None:
-    folder = stream(tmp_path / "index")
-    index_of(folder).unlink()
-    assert "is missing" in problems(folder)
-    folder = stream(tmp_path / "segment")
-    segment_of(folder).unlink()
-    assert "the segment of this index is missing" in problems(folder)
-    folder = stream(tmp_path / "place")
-    assert "wrongly placed" in problems(folder.rename(folder.with_name("b" * 32)))
-    assert "it ended with 29" in problems(stream(tmp_path / "end", next_seq=30))
 
 
 @settings(max_examples=60)
@@ -177,59 +240,6 @@ def test_a_flipped_bit_in_a_closed_segment_or_its_index_is_found(
         path.suffix == ".arrows" and at < ends(folder)[0] and report.stored.number_count == 40
     )
     assert report.problems or harmless
-
-
-def test_a_column_with_an_unreadable_name_is_a_problem(tmp_path: Path) -> None:
-    folder = opened(stream(tmp_path))
-    path = segment_of(folder)
-    content = path.read_bytes()
-    path.write_bytes(content.replace(b"frame_flags", b"\xf2rame_flags", 1))
-    report = verify_journal(folder)
-    assert "its columns are not those of a stream of frames" in "; ".join(report.problems)
-    assert report.stored == Intervals([(0, 39)])
-
-
-def test_a_damaged_batch_costs_itself_only_and_is_named(tmp_path: Path) -> None:
-    folder = opened(stream(tmp_path))
-    path = segment_of(folder)
-    content = bytearray(path.read_bytes())
-    content[ends(folder)[3] - 9] ^= 1
-    path.write_bytes(content)
-    report = verify_journal(folder)
-    assert "frames 15 to 19 do not agree with their checksum" in "; ".join(report.problems)
-    assert report.stored == Intervals([(0, 14), (20, 39)])
-    assert report.lost.by_reason["corrupt"] == Intervals([(15, 19)])
-
-
-def test_a_segment_of_another_stream_is_seen(tmp_path: Path) -> None:
-    folder = stream(tmp_path / "one")
-    other = tmp_path / "two"
-    journal = Journal(other, array(stream_id="b" * 32))
-    journal.append_new_frames(frames(40, 49))
-    journal.close()
-    for path in other.iterdir():
-        shutil.copy(path, folder)
-    assert "another stream or array" in problems(folder)
-
-
-def test_notes_that_are_damaged_are_named(tmp_path: Path) -> None:
-    folder = stream(tmp_path)
-    (folder / NOTES_FILE).write_bytes(b"{")
-    assert problems(folder).startswith(NOTES_FILE)
-    (folder / NOTES_FILE).unlink()
-    report = verify_journal(folder)
-    assert report.problems == []
-    assert "nothing says where the stream ended" in "; ".join(report.remarks)
-
-
-def test_time_that_runs_back_between_segments_is_seen(tmp_path: Path) -> None:
-    folder = stream(tmp_path)
-    payload = encode_frames(late := frames(40, 44, at_ns=-(10**9)), wire_schema(array()))
-    header = wire_schema(array()).serialize().to_pybytes()
-    writer = SegmentWriter(folder / f"{40:020d}.arrows", header)
-    writer.append(EncodedBatch.from_frames_and_payload(late, payload))
-    writer.close()
-    assert "time runs back before frame 40" in problems(folder)
 
 
 def test_a_segment_proves_itself_alone(tmp_path: Path) -> None:

@@ -112,26 +112,16 @@ def problems(folder: Path) -> str:
     return "; ".join(verify_session(folder).problems)
 
 
-def edited(folder: Path, change: Any) -> None:
+def edited(folder: Path, place: str = "", **changes: Any) -> None:
+    """Change session.json, its first part, its ledger's or its first clock row; rightly hashed."""
     path = folder / "session.json"
     content = json.loads(path.read_bytes())
     content.pop("check", None)
-    change(content)
+    if place:
+        ((content["ledger"]["parts"] if place == "ledger" else content[place])[0]).update(changes)
+    else:
+        content.update(changes)
     path.write_bytes(append_json_checksum(json.dumps(content).encode()))
-
-
-def raised(name: str, value: Any) -> Any:
-    def change(content: dict[str, Any]) -> None:
-        content[name] = value
-
-    return change
-
-
-def in_ledger(name: str, value: Any) -> Any:
-    def change(content: dict[str, Any]) -> None:
-        content["ledger"]["parts"][0][name] = value
-
-    return change
 
 
 # --- what is whole --------------------------------------------------------------------------------
@@ -260,7 +250,7 @@ def test_what_changes_while_it_is_read_is_read_again(
 ) -> None:
     folder = sealed(tmp_path)
     before = (folder / "session.json").read_bytes()
-    edited(folder, raised("sha256", "0" * 64))
+    edited(folder, sha256="0" * 64)
     from storage.verify import session as module
 
     calls = []
@@ -349,32 +339,37 @@ def test_a_damaged_or_exchanged_file_is_one_finding(tmp_path: Path) -> None:
         assert (f"it is of session {OTHER_ID}" in problem) == (content == other)
 
 
+FIRST_PART = {"stream_id": STREAM_IDS[0], "seq_first": 10, "seq_last": 49}
+
+
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("place", "change", "said"),
     [
-        (raised("id", OTHER_ID), "says id"),
-        (raised("node", "other"), "says node"),
-        (raised("frames", 54), "says frames 54"),
-        (raised("bytes", 54), "says bytes 54"),
-        (raised("sha256", "0" * 64), "not the file that session.json names"),
-        (raised("sha256", None), "not the file that session.json names"),
-        (raised("duration_s", 3.0), "lasted 3.0 s"),
-        (raised("stopped_t_ns", 5), "says stopped_t_ns"),
-        (raised("calibration_id", "x"), "says calibration_id"),
-        (raised("absolute_scale", "measured"), "says absolute_scale"),
-        (raised("ledger", None), "its ledger is missing"),
-        (raised("markers", []), "other events"),
-        (lambda c: c["clock"][0].update(uncertainty_ns=4), "clock.parquet has other rows"),
-        (in_ledger("recorded", 40), "ledgers of session.json and frames.parquet"),
-        (in_ledger("lost", {}), "ledgers of session.json and frames.parquet"),
-        (in_ledger("pending", 5), "still to come"),
-        (lambda c: c["parts"].pop(), "not of the same parts"),
-        (lambda c: c["parts"][0].update(seq_last=50), "not of the same parts"),
+        ("", {"id": OTHER_ID}, "says id"),
+        ("", {"node": "other"}, "says node"),
+        ("", {"frames": 54}, "says frames 54"),
+        ("", {"bytes": 54}, "says bytes 54"),
+        ("", {"sha256": "0" * 64}, "not the file that session.json names"),
+        ("", {"sha256": None}, "not the file that session.json names"),
+        ("", {"duration_s": 3.0}, "lasted 3.0 s"),
+        ("", {"stopped_t_ns": 5}, "says stopped_t_ns"),
+        ("", {"calibration_id": "x"}, "says calibration_id"),
+        ("", {"absolute_scale": "measured"}, "says absolute_scale"),
+        ("", {"ledger": None}, "its ledger is missing"),
+        ("", {"markers": []}, "other events"),
+        ("", {"parts": [FIRST_PART]}, "not of the same parts"),
+        ("clock", {"uncertainty_ns": 4}, "clock.parquet has other rows"),
+        ("ledger", {"recorded": 40}, "ledgers of session.json and frames.parquet"),
+        ("ledger", {"lost": {}}, "ledgers of session.json and frames.parquet"),
+        ("ledger", {"pending": 5}, "still to come"),
+        ("parts", {"seq_last": 50}, "not of the same parts"),
     ],
 )
-def test_an_edit_with_a_right_checksum_is_found(tmp_path: Path, change: Any, said: str) -> None:
+def test_an_edit_with_a_right_checksum_is_found(
+    tmp_path: Path, place: str, change: dict[str, Any], said: str
+) -> None:
     folder = sealed(tmp_path)
-    edited(folder, change)
+    edited(folder, place, **change)
     assert said in problems(folder)
 
 
