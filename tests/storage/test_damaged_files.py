@@ -131,6 +131,8 @@ def test_a_folder_or_a_missing_file_is_no_sealed_file(tmp_path: Path) -> None:
         for open_and_read in (read, verify):
             with pytest.raises(FileFormatError, match=path.name):
                 open_and_read(path)
+    with pytest.raises(FileFormatError, match="cannot be read as Parquet"):
+        read(path)
 
 
 objects = st.dictionaries(

@@ -179,7 +179,6 @@ NO_MESSAGES = {
     "three tiles": (encode_frames(frames(20, 3, first=20), schema_of(3)), "columns are not those"),
     "one tile": (encode_frames(frames(20, 1, first=20), schema_of(1)), "columns are not those"),
     "zstd": (written(RECORD, compression="zstd"), "compressed"),
-    "lz4": (written(RECORD, compression="lz4"), "compressed"),
     # In a journal they would stand where the next message has to begin.
     "bytes behind": (encode_frames(MIDDLE, SCHEMA) + bytes(8), "not those its header states"),
     # Its columns lie four bytes before the places by which runs of messages are read.
@@ -202,6 +201,15 @@ def test_another_message_is_refused_alone_and_among_others(what: str) -> None:
     first, _, last = (encode_frames(part, SCHEMA) for part in parts)
     assert not is_read(parts, [first, payload, last])
     assert not is_read([])
+
+
+@pytest.mark.parametrize("codec", ["zstd", "lz4"])
+def test_compressed_buffers_are_refused_before_they_are_unpacked(codec: str) -> None:
+    record = frames_to_record_batch(frames(4096, 64), schema_of(64))
+    payload, before = written(record, compression=codec), pa.total_allocated_bytes()
+    with pytest.raises(FileFormatError, match="compressed"):
+        decode_message(payload, schema_of(64))
+    assert pa.total_allocated_bytes() - before < 1 << 20
 
 
 @given(data=st.data())

@@ -26,11 +26,19 @@ from tests.storage.clock.clocks import (
     RATES,
     SECOND,
     Clock,
+    Int64,
     anywhere,
     every,
     rows_of,
     wandering,
 )
+
+
+def assert_within(found: ClockOffsets, true: Clock, t_mono_ns: Int64) -> None:
+    """The true offset is within the bound at each of these instants."""
+    offset, bound = found.offset_and_bound_at(t_mono_ns)
+    assert (np.abs(offset - true.at(t_mono_ns)) <= bound).all()
+
 
 # --- the truth is within --------------------------------------------------------------------------
 
@@ -47,8 +55,7 @@ def test_the_bound_grows_outside_of_the_measurements_and_holds(
     clock = Clock((drift_ppm,))
     rows = clock.measured(every(10, n), seed)
     t_mono_ns = anywhere(rows, seed, beyond_ns=round(hours * HOUR))
-    offset, bound = ClockOffsets(rows).offset_and_bound_at(t_mono_ns)
-    assert (np.abs(offset - clock.at(t_mono_ns)) <= bound).all()
+    assert_within(ClockOffsets(rows), clock, t_mono_ns)
     last = int(rows.t_mono_ns[-1])
     _, later = ClockOffsets(rows).offset_and_bound_at(
         last + np.array([0, 1, 60, 3600, 36000]) * SECOND
@@ -78,9 +85,7 @@ def test_the_truth_is_within_the_bound_also_across_steps(
     rows = clock.measured(every(10, drawn[2]), seed, slow_ns=slow_ms * 1e6)
     for after_ns, _ in at:  # a probe during which the clock is set says nothing
         assume((np.abs(rows.t_mono_ns - BEGIN_NS - after_ns) > rows.uncertainty_ns).all())
-    t_mono_ns = anywhere(rows, seed)
-    offset, bound = ClockOffsets(rows).offset_and_bound_at(t_mono_ns)
-    assert (np.abs(offset - clock.at(t_mono_ns)) <= bound).all()
+    assert_within(ClockOffsets(rows), clock, anywhere(rows, seed))
 
 
 @given(
@@ -282,9 +287,7 @@ def test_a_rate_that_wanders_more_than_assumed_is_no_step() -> None:
     mapped = ClockOffsets(rows)
     assert len(mapped.stretches) == 1
     assert not mapped.stretches[0].is_steady
-    t_mono_ns = anywhere(rows, 1)
-    offset, bound = mapped.offset_and_bound_at(t_mono_ns)
-    assert (np.abs(offset - clock.at(t_mono_ns)) <= bound).all()
+    assert_within(mapped, clock, anywhere(rows, 1))
 
 
 @pytest.mark.parametrize("drift_ppm", [-400.0, 150.0, 480.0])
@@ -295,9 +298,7 @@ def test_a_fast_but_steady_clock_has_not_stepped(drift_ppm: float) -> None:
     assert len(mapped.stretches) == 1
     slowest, fastest = mapped.stretches[0].mean_rate_bounds
     assert slowest < drift_ppm * 1e-6 < fastest
-    t_mono_ns = anywhere(rows, 1)
-    offset, bound = mapped.offset_and_bound_at(t_mono_ns)
-    assert (np.abs(offset - clock.at(t_mono_ns)) <= bound).all()
+    assert_within(mapped, clock, anywhere(rows, 1))
 
 
 # --- steps ----------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ NOTES: dict[str, object] = {"seed": 7, "scene": {"name": "mud"}}
 Piece = tuple[FrameBatch, dict[str, Array]]
 
 
-def frames(rows: int = ROWS, tiles: int = 2) -> FrameBatch:
+def frames(rows: int = ROWS, tiles: int = 2, *, period_ns: int = PERIOD_NS) -> FrameBatch:
     """Frames of which some values are not known."""
     rng = np.random.default_rng(5)
     pressure_raw = rng.integers(250, 420, (rows, tiles))
@@ -36,7 +36,7 @@ def frames(rows: int = ROWS, tiles: int = 2) -> FrameBatch:
     return make_frames(
         np.arange(rows) + 2**60,
         tiles,
-        t_mono_ns=123 + PERIOD_NS * np.arange(rows),
+        t_mono_ns=123 + period_ns * np.arange(rows),
         pressure_raw=pressure_raw,
         temperature_raw=rng.integers(470, 490, (rows, tiles)),
         sample_offset_us=rng.integers(-100, 3000, (rows, tiles)),

@@ -15,12 +15,14 @@ from devices.errors import FileFormatError, FootTileError, UsageError
 from storage.formats.readers.table import fit_constant_rate_if_times_repeat
 from storage.formats.reference import ReferenceData, ReferenceOptions, read_reference
 from storage.parquet_hash import write_hashed_table
+from tests.storage.formats.readers.reading import check
 
 LAB = ReferenceOptions(
     {"time_s": "Time", "grf_n": "Fz", "cop_x_m": "COPx", "cop_y_m": "COPy"},
     {"grf": "N", "cop": "mm"},
     "+",
 )
+NAN = [np.nan, np.nan]
 GOOD = "Time,Fz,COPx,COPy\n0.00,0,,\n0.01,10.5,10,-20\n0.02,20,20,-30\n0.03,0,,\n"
 
 
@@ -36,9 +38,7 @@ def test_columns_are_mapped_and_units_converted(tmp_path: Path) -> None:
     found = read(tmp_path, GOOD)
     assert found.time_s.tolist() == [0.0, 0.01, 0.02, 0.03]
     assert found.grf_n.tolist() == [0.0, 10.5, 20.0, 0.0]
-    assert found.cop_m is not None
-    nan = [np.nan, np.nan]
-    np.testing.assert_allclose(found.cop_m, [nan, [0.01, -0.02], [0.02, -0.03], nan])
+    check(found, rtol=1e-7, cop_m=[NAN, [0.01, -0.02], [0.02, -0.03], NAN])
     assert (found.epoch_ns, found.notes) == (None, ())
 
 
@@ -62,8 +62,7 @@ def test_parquet_is_read_as_csv_is(tmp_path: Path) -> None:
     pq.write_table(pa.table(columns), path)
     found = read_reference(path, LAB)
     assert found.grf_n.tolist() == [1.0, 9.0]
-    assert found.cop_m is not None
-    np.testing.assert_allclose(found.cop_m, [[0.001, 0.002], [np.nan, np.nan]])
+    check(found, rtol=1e-7, cop_m=[[0.001, 0.002], [np.nan, np.nan]])
 
 
 def test_a_table_of_ours_that_is_no_session_is_read_as_any_other(tmp_path: Path) -> None:

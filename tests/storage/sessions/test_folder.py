@@ -1,4 +1,4 @@
-"""What is kept of a session beside its frames, and ids that stay in their folder."""
+"""What is kept of a session beside its frames; ids stay in the folder; which sessions are meant."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.errors import FileFormatError, StorageError, UnknownError
+from devices.errors import FileFormatError, StorageError, UnknownError, UsageError
 from storage.checksummed_json import append_json_checksum, verify_and_strip_json_checksum
 from storage.clock.log import ClockOffset
 from storage.sessions.folder import (
+    Completeness,
     Ledger,
     Marker,
     Part,
@@ -25,10 +26,13 @@ from storage.sessions.folder import (
     SessionsFolder,
     make_session_id,
 )
+from storage.sessions.metadata import SessionFilter, parse_completeness, parse_iso_or_t_ns
 from tests.storage.faulty_disk import NO_SPACE, failing_if
 
 ID = "20200131T235959Z-0a1b2c"
 STREAM_ID = "f" * 32
+T_NS = 1_767_225_600_000_000_000
+"""2026-01-01T00:00:00Z"""
 
 BAD_IDS = [
     *("", ".", "..", "../x", "../" + ID, "/" + ID, "/etc/passwd", ID + "/..", ID + "/", "a/" + ID),
@@ -44,7 +48,7 @@ def session(session_id: str = ID, **changes: Any) -> Session:
         "name": "first walk",
         "node": "bench",
         "state": "recording",
-        "started_t_ns": 10**18,
+        "started_t_ns": T_NS,
         "parts": (Part(stream_id=STREAM_ID, seq_first=0),),
         "scene": "mud",
     }
@@ -244,3 +248,83 @@ def test_a_folder_without_a_whole_file_is_no_session(tmp_path: Path) -> None:
     (tmp_path / ID[::-1]).write_bytes(b"")  # no id
     (tmp_path / ID.replace("a", "b")).write_bytes(b"")  # no folder
     assert sorted(folder.load_all()[1]) == sorted([ID, ID.replace("a", "b")])
+
+
+def chosen(choice: SessionFilter, one: Session, complete: Completeness = True) -> bool:
+    return choice.accepts(one, lambda _: complete)
+
+
+def test_no_filter_accepts_every_session() -> None:
+    assert chosen(SessionFilter(), session())
+
+
+def test_one_of_the_nodes_and_all_tags_are_needed() -> None:
+    one = session(tags=("Mud", "third"))
+    assert chosen(SessionFilter(nodes=("right", "bench")), one)
+    assert not chosen(SessionFilter(nodes=("benc",)), one)
+    assert chosen(SessionFilter(tags=("mud", " THIRD ")), one)
+    assert not chosen(SessionFilter(tags=("mud", "fourth")), one)
+    assert not chosen(SessionFilter(tags=("mu",)), one)
+
+
+def test_a_time_range_has_its_begin_and_not_its_end() -> None:
+    assert chosen(SessionFilter(from_t_ns=T_NS, to_t_ns=T_NS + 1), session())
+    assert not chosen(SessionFilter(from_t_ns=T_NS + 1), session())
+    assert not chosen(SessionFilter(to_t_ns=T_NS), session())
+
+
+@pytest.mark.parametrize("wanted", [True, False, "lossy"])
+@pytest.mark.parametrize("found", [True, False, "lossy"])
+def test_sessions_are_filtered_by_completeness(wanted: Completeness, found: Completeness) -> None:
+    assert chosen(SessionFilter(complete=wanted), session(), found) == (wanted == found)
+
+
+def test_frames_of_excluded_sessions_are_not_counted() -> None:
+    def counting(_: Session) -> Completeness:
+        pytest.fail("it is of another node")
+
+    assert not SessionFilter(nodes=("right",), complete=True).accepts(session(), counting)
+
+
+@given(
+    st.datetimes(datetime(1970, 1, 2), datetime(2261, 1, 1)),  # as it is written
+    st.integers(-23 * 60, 23 * 60),
+)
+def test_a_time_is_the_same_in_each_notation(at: datetime, offset_minutes: int) -> None:
+    utc = at.replace(tzinfo=UTC)
+    t_ns = parse_iso_or_t_ns(utc.isoformat(), where="from")
+    assert datetime.fromtimestamp(t_ns // 10**9, UTC) == utc.replace(microsecond=0)
+    assert t_ns % 10**9 == utc.microsecond * 1000
+    elsewhere = utc.astimezone(timezone(timedelta(minutes=offset_minutes)))
+    for written in (at.isoformat(), elsewhere.isoformat(), str(at), f" {at.isoformat()}Z"):
+        assert parse_iso_or_t_ns(written, where="from") == t_ns
+    if t_ns >= 10**8:
+        assert parse_iso_or_t_ns(str(t_ns), where="from") == t_ns
+
+
+def test_a_date_is_its_midnight() -> None:
+    assert parse_iso_or_t_ns("2026-01-01", where="from") == T_NS
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        *("", "yesterday", "2026", "2026-13-01", "-5", "1969-12-31", "9999-01-01", "9" * 400),
+        *("NaN", "1e18", "2026-01-01T00:00:00 01:00", "\N{FULLWIDTH DIGIT ONE}" * 10),
+    ],
+)
+def test_what_is_no_time_is_refused_with_an_example(said: str) -> None:
+    with pytest.raises(UsageError, match="is no instant") as refused:
+        parse_iso_or_t_ns(said, where="--from")
+    assert "--from" in str(refused.value)
+    assert "2026-11-24T08:00" in str(refused.value)
+
+
+def test_a_completeness_is_one_of_three_words() -> None:
+    assert [parse_completeness(said, where="x") for said in ("true", "false", "lossy")] == [
+        True,
+        False,
+        "lossy",
+    ]
+    with pytest.raises(UsageError, match="true, false or lossy"):
+        parse_completeness("True", where="--complete")

@@ -18,51 +18,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
-from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, NOT_READ, FrameBatch
 from storage.parquet_hash import fill_hash_placeholders_and_sync, read_stated_and_actual_hash
 from storage.sessions.reader import SealedFileReader
 from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames
+from tests.storage.formats.exports import extra, frames
 
 FORMATS = Path(__file__).resolve().parents[3] / "docs" / "formats.md"
 
 
-def frames(rows: int, tiles: int = 2) -> FrameBatch:
-    """Frames over minutes, with everything in them that can be missing."""
-    rng = np.random.default_rng(rows)
-    shape = (rows, tiles)
-    return make_frames(
-        rows,
-        tiles,
-        period_ns=1_000_000_000,
-        pressure_raw=rng.choice([300, NOT_READ], shape),
-        temperature_raw=rng.choice([480, NOT_READ], shape),
-        sample_offset_us=rng.integers(-100, 3000, shape),
-        servo_counts=rng.choice([NO_SERVO_COUNTS, 5], rows),
-        servo_age_us=rng.choice([NO_SERVO_AGE, 7], rows),
-        tile_flags=rng.integers(0, 64, shape),
-        frame_flags=rng.integers(0, 32, rows),
-        reference_force_n=rng.choice([np.nan, -0.0, 3.25], rows),
-    )
-
-
-def extra(rows: int) -> dict[str, Any]:
-    rng = np.random.default_rng(rows + 1)
-    return {
-        "part": np.sort(rng.integers(0, 2, rows)).astype(np.uint16),
-        "grf_n": rng.choice([np.nan, 1 / 3, -1e-40], rows),
-        "contact": rng.choice([0, 1, 255], rows).astype(np.uint8),
-        "true_grf_n": rng.choice([np.nan, 1 / 3], rows),
-        "phase": np.array(["rest", "Ärmel"] * rows, dtype=object)[:rows],
-    }
-
-
 def write(path: Path, rows: int = 200, cuts: Sequence[int] = (), **notes: object) -> Path:
-    batch, columns = frames(rows), extra(rows)
+    """Frames over minutes, with everything in them that can be missing."""
+    batch, columns = frames(rows, period_ns=1_000_000_000), extra(rows)
+    columns["true_grf_n"] = np.where(columns["grf_n"] > 0.0, 1 / 3, np.nan)
+    columns["part"] = np.sort(columns["contact"] // 255).astype(np.uint16)
     with SealedFileWriter(path, make_array(), notes) as writer:
-        bounds = [0, *cuts, rows]
-        for begin, end in itertools.pairwise(bounds):
+        for begin, end in itertools.pairwise([0, *cuts, rows]):
             piece = {name: values[begin:end] for name, values in columns.items()}
             writer.append_frames(batch.slice_rows(begin, end), piece)
     return path
@@ -154,8 +126,8 @@ def test_counts_and_parts_are_in_the_metadata(tmp_path: Path) -> None:
     said = content(tmp_path / "s.parquet")
     assert said["frames"] == 10
     assert said["parts"] == [
-        {"part": 0, "seq_first": 0, "seq_last": 3, "frames": 4},
-        {"part": 1, "seq_first": 4, "seq_last": 9, "frames": 6},
+        {"part": 0, "seq_first": 2**60, "seq_last": 2**60 + 3, "frames": 4},
+        {"part": 1, "seq_first": 2**60 + 4, "seq_last": 2**60 + 9, "frames": 6},
     ]
     assert json.loads(metadata_of(tmp_path / "s.parquet")[b"foottile.content"]) == said
 

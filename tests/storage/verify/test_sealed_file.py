@@ -28,17 +28,10 @@ STREAM_IDS = ("a" * 32, "b" * 32)
 
 def frames(*numbers: int, offset_ns: int = UTC_NS) -> FrameBatch:
     """Frames in which everything is known."""
-    rng = np.random.default_rng(len(numbers))
-    pressure_raw, temperature_raw = rng.integers(0, 100, (2, len(numbers), 1))
+    counts = np.random.default_rng(len(numbers)).integers(0, 100, (len(numbers), 1))
     known: dict[str, Any] = {"servo_counts": 5, "servo_age_us": 7, "reference_force_n": 9.0}
-    return make_frames(
-        numbers,
-        1,
-        utc_offset_ns=offset_ns,
-        pressure_raw=pressure_raw,
-        temperature_raw=temperature_raw,
-        **known,
-    )
+    raw = {"pressure_raw": counts, "temperature_raw": counts[::-1]}
+    return make_frames(numbers, 1, utc_offset_ns=offset_ns, **raw, **known)
 
 
 def counted(first: int, last: int, boot: int = 0, **lost: int) -> PartLedger:

@@ -161,14 +161,10 @@ PROGRAMS: dict[str, tuple[str, ReferenceOptions, Any, Any, Any, tuple[str, ...]]
 """Text, what is stated, times, forces, COP, and notes."""
 
 Form = Callable[[str], str | bytes]
-COMMON: dict[str, Form] = {
-    "as it is": str,
-    "lines end as on Windows": lambda text: text.replace("\n", "\r\n"),
-    "a byte order mark": lambda text: text.encode("utf-8-sig"),
-}
 FORMS: dict[str, dict[str, Form]] = {
     "bioware": {
-        **COMMON,
+        "as it is": str,
+        "lines end as on Windows": lambda text: text.replace("\n", "\r\n"),
         "the unit of time in the line of units": lambda text: text.replace(
             "abs time (s)", "abs time"
         ).replace("\n\tN", "\ns\tN"),
@@ -190,7 +186,7 @@ FORMS: dict[str, dict[str, Form]] = {
         "no end of the last line": lambda text: text[:-1],
     },
     "nexus": {
-        **COMMON,
+        "as it is": str,
         "tabs": lambda text: text.replace(",", "\t"),
         "semicolons and decimal commas": lambda text: text.replace(",", ";").replace(".", ","),
         "saved again by a spreadsheet": lambda text: "".join(
@@ -199,7 +195,7 @@ FORMS: dict[str, dict[str, Form]] = {
         "trajectories above the devices": lambda text: NEXUS_MARKERS + text,
     },
     "opensim": {
-        **COMMON,
+        "as it is": str,
         "a blank line below the header": lambda text: text.replace("endheader\n", "endheader\n\n"),
         "Latin-1 in the header": lambda text: text.replace("grf.mot", "Vorwärts").encode("latin-1"),
         "blanks between columns": lambda text: text.replace("\t", "    "),
@@ -311,12 +307,6 @@ def test_units_are_those_of_the_file(tmp_path: Path) -> None:
     check(found, cop_m=[[0.0, 0.0], [0.1, 0.03], [0.2, 0.02]])
     with pytest.raises(UsageError, match="is in m, not in mm"):
         read(tmp_path, OPENSIM, ReferenceOptions(columns, {"cop": "mm"}), "grf.mot")
-
-
-@pytest.mark.parametrize("cell", ["-nan(ind)", "nan", "NaN", "1.#QNAN"])
-def test_no_number_is_none_in_the_words_of_any_program(tmp_path: Path, cell: str) -> None:
-    found = read(tmp_path, OPENSIM.replace("0.1\t0.03", f"{cell}\t{cell}"), name="grf.mot")
-    check(found, cop_m=[[0.0, 0.0], NAN, [0.2, -0.02]])
 
 
 @pytest.mark.parametrize(

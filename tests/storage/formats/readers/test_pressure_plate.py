@@ -13,9 +13,10 @@ import pytest
 
 from devices.errors import FileFormatError, FootTileError
 from storage.formats.reference import ReferenceData, ReferenceOptions, read_reference
-from tests.storage.formats.readers.reading import read
+from tests.storage.formats.readers.reading import check, read
 
 TIME_S = np.array([0.0, 0.01, 0.02])
+NAN = [np.nan, np.nan]
 
 
 def plate(**changes: Any) -> dict[str, Any]:
@@ -35,9 +36,7 @@ def read_arrays(path: Path, content: dict[str, Any]) -> ReferenceData:
 def test_cells_add_up_to_force_and_cop(tmp_path: Path) -> None:
     found = read_arrays(tmp_path / "plate.npz", plate(origin_m=np.array([-0.005, 0.1])))
     assert found.grf_n.tolist() == [0.0, 3.0, 4.0]
-    assert found.cop_m is not None
-    nan = [np.nan, np.nan]
-    np.testing.assert_allclose(found.cop_m, [nan, [0.005, 0.11], [0.0025, 0.1]])
+    check(found, rtol=1e-7, cop_m=[NAN, [0.005, 0.11], [0.0025, 0.1]])
 
 
 def test_kilopascals_are_newtons_on_the_area_of_a_cell(tmp_path: Path) -> None:
@@ -142,12 +141,9 @@ def text(frames: Sequence[str] = FRAMES, /, *, end: str = "@@\n", **facts: str) 
 def test_cells_of_a_movie_add_up_to_force_and_cop(tmp_path: Path) -> None:
     found = read(tmp_path, text(), name="walk.asf")
     # 1 kPa on 50 mm2 is 0.05 N.
-    np.testing.assert_allclose(found.grf_n, [0.0, 1.0, 4.0, 10.0])
-    np.testing.assert_allclose(found.time_s, [0.0, 0.02, 0.04, 0.06])
-    nan = [np.nan, np.nan]
-    assert found.cop_m is not None
-    np.testing.assert_allclose(
-        found.cop_m, [nan, [-0.01, -0.0025], [0.005, -0.00125], [0.0, 0.0]], atol=1e-15
+    check(found, rtol=1e-7, grf_n=[0.0, 1.0, 4.0, 10.0], time_s=[0.0, 0.02, 0.04, 0.06])
+    check(
+        found, rtol=1e-7, cop_m=[NAN, [-0.01, -0.0025], [0.005, -0.00125], [0.0, 0.0]], atol=1e-15
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from devices.errors import FileFormatError, FootTileError, UsageError
 from storage.formats.reference import ReferenceOptions, read_reference
 from storage.formats.slice import FormatOptions
 from tests.storage.formats.exports import frames
+from tests.storage.formats.readers.reading import check
 from tests.storage.formats.writers.test_mcap import estimates, written
 
 BEGIN_NS = 1_750_000_000_123_456_789
@@ -140,39 +141,31 @@ every_format = pytest.mark.parametrize("write", WRITERS)
 def test_a_wrench_has_force_and_centre_of_pressure(tmp_path: Path, write: Write) -> None:
     found = read_reference(write(tmp_path, [*walk(), *walk("/right", turned=2.0)]), LEFT_COP)
     force_n = np.array([float(i % 20) for i in range(COUNT)])
-    np.testing.assert_array_equal(found.grf_n, force_n)
-    np.testing.assert_allclose(found.time_s, np.arange(COUNT) * 5e-3, atol=1e-12)
+    check(found, grf_n=force_n)
+    check(found, rtol=1e-7, atol=1e-12, time_s=np.arange(COUNT) * 5e-3)
     assert found.epoch_ns == BEGIN_NS
-    assert found.cop_m is not None
-    loaded = force_n > 0.0
-    np.testing.assert_allclose(found.cop_m[loaded], [[0.02, -0.01]] * int(loaded.sum()))
-    assert np.isnan(found.cop_m[~loaded]).all()
+    cop_m = np.where(force_n[:, None] > 0.0, [[0.02, -0.01]], np.nan)
+    check(found, rtol=1e-7, cop_m=cop_m)
 
 
 @every_format
-def test_the_sign_follows_from_the_load(tmp_path: Path, write: Write) -> None:
-    found = read_reference(write(tmp_path, walk(turned=-1.0)), LEFT)
-    np.testing.assert_array_equal(found.grf_n, [float(i % 20) for i in range(COUNT)])
-    assert any("--sign -" in note for note in found.notes)
-
-
-@every_format
-def test_the_only_topic_needs_no_mapping_and_gives_no_cop(tmp_path: Path, write: Write) -> None:
-    found = read_reference(write(tmp_path, walk()), ReferenceOptions())
-    assert found.grf_n.max() == 19.0
+def test_the_only_topic_is_taken_with_its_sign_and_one_of_several_named(
+    tmp_path: Path, write: Write
+) -> None:
+    folders = [tmp_path / name for name in ("one", "several", "none")]
+    for folder in folders:
+        folder.mkdir()
+    one, several, none = folders
+    found = read_reference(write(one, walk(turned=-1.0)), ReferenceOptions())
+    check(found, grf_n=[float(i % 20) for i in range(COUNT)])
     assert found.cop_m is None
-
-
-@every_format
-def test_one_of_several_topics_has_to_be_named(tmp_path: Path, write: Write) -> None:
-    with pytest.raises(FileFormatError, match=r"it has left_foot_fz, .*right_fz"):
-        read_reference(write(tmp_path, [*walk(), *walk("/right")]), ReferenceOptions())
-
-
-@every_format
-def test_bags_without_wrenches_are_refused(tmp_path: Path, write: Write) -> None:
-    with pytest.raises(FileFormatError, match="there is no wrench in it"):
-        read_reference(write(tmp_path, []), ReferenceOptions())
+    assert any("--sign -" in note for note in found.notes)
+    for folder, samples, says in (
+        (several, [*walk(), *walk("/right")], r"it has left_foot_fz, .*right_fz"),
+        (none, [], "there is no wrench in it"),
+    ):
+        with pytest.raises(FileFormatError, match=says):
+            read_reference(write(folder, samples), ReferenceOptions())
 
 
 @every_format
@@ -216,25 +209,22 @@ def test_another_axis_of_the_frame_can_be_the_vertical(tmp_path: Path) -> None:
 def test_messages_are_in_the_order_of_their_stamps(tmp_path: Path) -> None:
     samples = walk()
     late = [
-        Sample(one.topic, one.t_ns, one.wrench, logged_ns=BEGIN_NS + i)
-        for i, one in enumerate([*samples[10:], *samples[:10]])
+        replace(one, logged_ns=BEGIN_NS + i) for i, one in enumerate([*samples[10:], *samples[:10]])
     ]
     found = read_reference(write_bag1(tmp_path, late), ReferenceOptions())
-    np.testing.assert_array_equal(found.grf_n, [float(i % 20) for i in range(COUNT)])
+    check(found, grf_n=[float(i % 20) for i in range(COUNT)])
 
 
 def test_without_stamps_the_times_of_recording_count(tmp_path: Path) -> None:
-    samples = [Sample(one.topic, 0, one.wrench, logged_ns=one.t_ns) for one in walk()]
+    samples = [replace(one, t_ns=0, logged_ns=one.t_ns) for one in walk()]
     found = read_reference(write_bag1(tmp_path, samples), ReferenceOptions())
-    np.testing.assert_allclose(found.time_s, np.arange(COUNT) * 5e-3, atol=1e-12)
+    check(found, rtol=1e-7, atol=1e-12, time_s=np.arange(COUNT) * 5e-3)
     assert any("no stamps" in note for note in found.notes)
 
 
 def test_stamps_of_a_simulation_have_no_date(tmp_path: Path) -> None:
-    assert (
-        read_reference(write_bag1(tmp_path, walk(begin_ns=STEP_NS)), ReferenceOptions()).epoch_ns
-        is None
-    )
+    found = read_reference(write_bag1(tmp_path, walk(begin_ns=STEP_NS)), ReferenceOptions())
+    assert found.epoch_ns is None
 
 
 def test_a_topic_in_two_frames_is_refused(tmp_path: Path) -> None:
@@ -281,3 +271,10 @@ def test_a_pipe_in_the_folder_of_a_bag_is_refused_at_once(tmp_path: Path, name: 
     os.mkfifo(folder / name)
     with pytest.raises(FileFormatError, match="not a file that can be read whole"):
         read_reference(folder, LEFT)
+
+
+def test_our_own_export_to_foxglove_has_no_wrenches(tmp_path: Path) -> None:
+    path = tmp_path / "session.mcap"
+    path.write_bytes(written())
+    with pytest.raises(FileFormatError, match="there is no wrench in it"):
+        read_reference(path, ReferenceOptions())

@@ -20,26 +20,20 @@ from storage.formats.reference import ReferenceOptions, read_reference
 PLAIN = "Time,Fz\n0.00,0.5\n0.01,-12.25\n0.02,1e3\n"
 FORMS: dict[str, Callable[[str], str | bytes]] = {
     "as it is": str,
-    "lines end as on Windows": lambda text: text.replace("\n", "\r\n"),
     "lines end as on an old Mac": lambda text: text.replace("\n", "\r"),
-    "a byte order mark": lambda text: text.encode("utf-8-sig"),
     "quoted names": lambda text: text.replace("Time,Fz", '"Time","Fz"').encode("utf-8-sig"),
     "quoted cells": lambda text: "".join(
         ",".join(f'"{cell}"' for cell in line.split(",")) + "\n" for line in text.splitlines()
     ),
-    "UTF-16 as Excel saves it": lambda text: text.replace(",", "\t").encode("utf-16"),
     "UTF-16 without a mark": lambda text: text.encode("utf-16-le"),
     "UTF-16 of big endians": lambda text: text.encode("utf-16-be"),
     "a title in Latin-1": lambda text: ("Vorwärts, Nr. 1\n" + text).encode("latin-1"),
-    "semicolons": lambda text: text.replace(",", ";"),
-    "tabs": lambda text: text.replace(",", "\t"),
     "blanks": lambda text: text.replace(",", "    "),
     "decimal commas": lambda text: text.replace(",", ";").replace(".", ","),
     "decimal commas in quotes": lambda text: "".join(
         ",".join(f'"{cell}"' for cell in line.replace(",", ";").replace(".", ",").split(";")) + "\n"
         for line in text.splitlines()
     ),
-    "a space after each comma": lambda text: text.replace(",", ", "),
     "empty columns at the end": lambda text: text.replace("\n", ",,\n"),
     "a comma at the end of numbers": lambda text: PLAIN[:8] + text[8:].replace("\n", ",\n"),
     "empty columns above numbers only": lambda text: text.replace("Fz\n", "Fz,,\n"),
