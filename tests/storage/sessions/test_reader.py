@@ -14,10 +14,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from devices.errors import FileFormatError
-from storage.parquet_hash import FORMAT_KEY, read_stated_and_actual_hash
-from storage.schema import ARRAY_INFO_KEY
+from storage.parquet_hash import read_stated_and_actual_hash
 from storage.sessions import footer, reader
-from storage.sessions.footer import NOTES_KEY, SealedFileFooter
+from storage.sessions.footer import SealedFileFooter
 from storage.sessions.reader import SealedFileReader, VerifiedFileCache
 from tests.builders.arrays import make_array
 from tests.builders.frames import assert_same_bits
@@ -89,14 +88,10 @@ def test_a_table_that_is_none_of_ours_is_refused_although_its_hashes_are_right(
 
 
 def test_the_keys_of_the_metadata_are_those_of_the_format(tmp_path: Path) -> None:
-    metadata = pq.read_schema(write(tmp_path / "s.parquet", frames(5))).metadata
-    assert (FORMAT_KEY, ARRAY_INFO_KEY, NOTES_KEY) == (
-        b"foottile.format",
-        b"foottile.array_info",
-        b"foottile.notes",
-    )
-    assert metadata[FORMAT_KEY] == b"2"
-    assert json.loads(metadata[ARRAY_INFO_KEY])["tiles"][1]["serial"] == "T02"
+    metadata = pq.read_schema(write(tmp_path / "s.parquet", frames(5), {"seed": 7})).metadata
+    assert metadata[b"foottile.format"] == b"2"
+    assert json.loads(metadata[b"foottile.array_info"])["tiles"][1]["serial"] == "T02"
+    assert json.loads(metadata[b"foottile.notes"]) == {"seed": 7}
 
 
 def test_a_column_that_was_asked_for_and_is_not_there_is_refused(tmp_path: Path) -> None:

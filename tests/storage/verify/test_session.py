@@ -108,6 +108,21 @@ def sealed(data: Path, session_id: str = ID, **changes: Any) -> Path:
     return keep(data, done)
 
 
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data folder with a sealed session."""
+    data = tmp_path_factory.mktemp("data")
+    sealed(data)
+    return data
+
+
+@pytest.fixture
+def folder(data: Path, tmp_path: Path) -> Path:
+    """The folder of the sealed session, in a copy of its data folder."""
+    shutil.copytree(data, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "sessions" / ID
+
+
 def problems(folder: Path) -> str:
     return "; ".join(verify_session(folder).problems)
 
@@ -127,8 +142,7 @@ def edited(folder: Path, place: str = "", **changes: Any) -> None:
 # --- what is whole --------------------------------------------------------------------------------
 
 
-def test_a_whole_session_is_proven_and_nothing_is_touched(tmp_path: Path) -> None:
-    folder = sealed(tmp_path)
+def test_a_whole_session_is_proven_and_nothing_is_touched(folder: Path) -> None:
     before = {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in folder.iterdir()}
     report = verify_session(folder)
     assert (report.problems, report.unproven) == ([], [])
@@ -162,8 +176,7 @@ def test_a_session_without_a_frame_is_whole(tmp_path: Path) -> None:
     assert "no frame recorded" in problems(folder)
 
 
-def test_a_session_that_was_pulled_is_proven_too(tmp_path: Path) -> None:
-    folder = sealed(tmp_path)
+def test_a_session_that_was_pulled_is_proven_too(tmp_path: Path, folder: Path) -> None:
     kept = SessionsFolder(folder.parent).load(ID)
     view = kept.model_dump(
         mode="json",
@@ -246,9 +259,8 @@ def test_damage_in_a_journal_that_it_needs_is_its_own(tmp_path: Path) -> None:
 
 
 def test_what_changes_while_it_is_read_is_read_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = sealed(tmp_path)
     before = (folder / "session.json").read_bytes()
     edited(folder, sha256="0" * 64)
     from storage.verify import session as module
@@ -283,8 +295,7 @@ def test_a_data_folder_is_all_of_its_sessions_and_journals(tmp_path: Path) -> No
     assert find_verdict(verify_path(tmp_path)) == "damaged"
 
 
-def test_whatever_is_named_is_found(tmp_path: Path) -> None:
-    folder = sealed(tmp_path)
+def test_whatever_is_named_is_found(tmp_path: Path, folder: Path) -> None:
     stream = tmp_path / "journal" / "bench" / STREAM_IDS[0]
     for path in (folder, folder / "session.json", stream, stream / "stream.json", tmp_path):
         assert verify_path(path).to_json_dict()["problems"] == []
@@ -302,27 +313,29 @@ def test_whatever_is_named_is_found(tmp_path: Path) -> None:
 FILES = ("session.json", "frames.parquet", "markers.parquet", "clock.parquet")
 
 
-@pytest.mark.parametrize("name", FILES)
-def test_a_file_that_is_missing_is_damage(tmp_path: Path, name: str) -> None:
-    folder = sealed(tmp_path)
-    (folder / name).unlink()
-    assert f"{name} is missing" in problems(folder)
-    report = verify_session(folder)
-    assert report.to_json_dict()["id"] == ID
-    assert find_verdict(report) == "damaged"
+def test_a_file_that_is_missing_is_damage(folder: Path) -> None:
+    for name in FILES:
+        content = (folder / name).read_bytes()
+        (folder / name).unlink()
+        report = verify_session(folder)
+        assert f"{name} is missing" in "; ".join(report.problems)
+        assert report.to_json_dict()["id"] == ID
+        assert find_verdict(report) == "damaged"
+        (folder / name).write_bytes(content)
 
 
-@pytest.mark.parametrize("name", FILES[:3])
-def test_a_file_of_another_session_in_its_place_is_seen(tmp_path: Path, name: str) -> None:
-    one = sealed(tmp_path / "one")
-    two = sealed(tmp_path / "two", OTHER_ID, markers=(EVENTS[0].model_copy(update={"id": "e2"}),))
-    shutil.copy(two / name, one / name)
-    assert problems(one)
-    assert problems(two) == ""
+def test_a_file_of_another_session_in_its_place_is_seen(folder: Path, tmp_path: Path) -> None:
+    markers = (EVENTS[0].model_copy(update={"id": "e2"}),)
+    other = sealed(tmp_path / "other", OTHER_ID, markers=markers)
+    for name in FILES[:3]:
+        content = (folder / name).read_bytes()
+        shutil.copy(other / name, folder / name)
+        assert problems(folder), name
+        (folder / name).write_bytes(content)
+    assert problems(folder) == problems(other) == ""
 
 
-def test_a_session_in_another_one_s_folder_is_seen(tmp_path: Path) -> None:
-    folder = sealed(tmp_path)
+def test_a_session_in_another_one_s_folder_is_seen(tmp_path: Path, folder: Path) -> None:
     folder.rename(folder.with_name(OTHER_ID))
     report = verify_path(tmp_path)
     assert any("lies in the folder of" in said for said in report.to_json_dict()["problems"])
@@ -366,15 +379,13 @@ FIRST_PART = {"stream_id": STREAM_IDS[0], "seq_first": 10, "seq_last": 49}
     ],
 )
 def test_an_edit_with_a_right_checksum_is_found(
-    tmp_path: Path, place: str, change: dict[str, Any], said: str
+    folder: Path, place: str, change: dict[str, Any], said: str
 ) -> None:
-    folder = sealed(tmp_path)
     edited(folder, place, **change)
     assert said in problems(folder)
 
 
-def test_an_edited_note_is_seen_by_the_check_alone(tmp_path: Path) -> None:
-    folder = sealed(tmp_path)
+def test_an_edited_note_is_seen_by_the_check_alone(folder: Path) -> None:
     path = folder / "session.json"
     text = path.read_bytes()
     path.write_bytes(text.replace(b"first try", b"third try"))
@@ -383,8 +394,7 @@ def test_an_edited_note_is_seen_by_the_check_alone(tmp_path: Path) -> None:
     assert "no hash" in problems(folder)
 
 
-def test_a_damaged_table_beside_it_is_seen(tmp_path: Path) -> None:
-    folder = sealed(tmp_path)
+def test_a_damaged_table_beside_it_is_seen(folder: Path) -> None:
     for name in ("markers.parquet", "clock.parquet"):
         whole = (folder / name).read_bytes()
         (folder / name).write_bytes(whole[:-9])
