@@ -30,7 +30,7 @@ def test_somebody_elses_parquet_is_refused_by_name(tmp_path: Path) -> None:
 
 
 NEWER = json.dumps(json.loads(make_array().model_dump_json()) | {"hall_sensors": 4}).encode()
-TYPES = [
+TYPES: list[tuple[str, pa.DataType]] = [
     *(("seq", pa.int64()), ("t_ns", pa.float64()), ("pressure_raw_0", pa.int32())),
     *(("pressure_raw_1", pa.string()), ("tile_flags_0", pa.uint16())),
     ("reference_force_n", pa.float64()),

@@ -75,7 +75,7 @@ def test_the_columns_are_flat_and_those_of_the_contract_in_order(tmp_path: Path)
 
 def test_integers_are_delta_encoded_or_in_dictionaries_floats_split(tmp_path: Path) -> None:
     path = tmp_path / "s.parquet"
-    known = {"part": np.zeros(500, np.uint16), "contact": np.ones(500, np.uint8)}
+    known: dict[str, Any] = {"part": np.zeros(500, np.uint16), "contact": np.ones(500, np.uint8)}
     known |= {"estimate_flags": np.ones(500, np.uint16), "phase": np.array(["rest"] * 500)}
     grf_n = np.random.default_rng(0).normal(size=500)
     write(path, frames(500), grf_n=grf_n, true_grf_n=grf_n, **known)

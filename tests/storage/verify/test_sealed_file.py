@@ -30,8 +30,8 @@ def frames(*numbers: int, offset_ns: int = UTC_NS) -> FrameBatch:
     """Frames in which everything is known."""
     counts = np.random.default_rng(len(numbers)).integers(0, 100, (len(numbers), 1))
     known: dict[str, Any] = {"servo_counts": 5, "servo_age_us": 7, "reference_force_n": 9.0}
-    raw = {"pressure_raw": counts, "temperature_raw": counts[::-1]}
-    return make_frames(numbers, 1, utc_offset_ns=offset_ns, **raw, **known)
+    known |= {"pressure_raw": counts, "temperature_raw": counts[::-1]}
+    return make_frames(numbers, 1, utc_offset_ns=offset_ns, **known)
 
 
 def counted(first: int, last: int, boot: int = 0, **lost: int) -> PartLedger:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from devices.arrays import Floats
 from devices.errors import FileFormatError, UsageError
@@ -38,9 +37,7 @@ def read_c3d(
     return read(folder, c3d_bytes(content, analog, **more), stated, "gait.c3d")
 
 
-def check(
-    found: object, *, rtol: float = 0.0, atol: float = 0.0, **expected: npt.ArrayLike
-) -> None:
+def check(found: object, *, rtol: float = 0.0, atol: float = 0.0, **expected: Any) -> None:
     """Numbers of a reference or a load are these: to the last bit, or within the tolerance."""
     for name, values in expected.items():
         np.testing.assert_allclose(getattr(found, name), values, rtol, atol, err_msg=name)

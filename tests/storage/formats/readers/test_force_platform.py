@@ -503,8 +503,9 @@ def test_bending_of_a_plate_is_corrected_as_ezc3d_does(tmp_path: Path) -> None:
     polynomial = np.array(
         [1e-15, -5e-11, 3e-07, 2e-15, -1e-9, 1e-2, -2e-15, 2e-11, -7e-07, 1e-15, 3e-9, 2e-2]
     )
-    more = {"CAL_MATRIX": np.zeros((1, 6, 6)), "FPCOPPOLY": polynomial.reshape(1, 2, 6)}
-    content = with_units(3, ORIGIN=np.array([[150.0, 80.0, -40.0]]), **more)
+    more: dict[str, Any] = {"CAL_MATRIX": np.zeros((1, 6, 6))}
+    more |= {"FPCOPPOLY": polynomial.reshape(1, 2, 6), "ORIGIN": np.array([[150.0, 80.0, -40.0]])}
+    content = with_units(3, **more)
     shear = 0.05 * ODD_N
     vertical = on_sensors(ODD_N, ODD_X_MM / 300.0, ODD_Y_MM / 160.0)
     analog = np.stack([shear, shear, -shear, -shear, *vertical], axis=1)

@@ -184,8 +184,6 @@ def test_polars_reads_parquet_and_arrow(tmp_path: Path) -> None:
         assert found["phase"].to_list() == extra()["phase"].tolist()
 
 
-pytestmark = [pytest.mark.process, pytest.mark.soak]
-
 OFFICE = shutil.which("soffice")
 POINT, COMMA = "CSV:44,34,76,1", "CSV:59,34,76,1,,1031"
 """What a user chooses when asked: what is between columns, quotes, UTF-8, from the first line on,
@@ -242,6 +240,8 @@ def _values(cell: ElementTree.Element) -> list[Any]:
 
 
 @pytest.mark.in_turn
+@pytest.mark.process
+@pytest.mark.soak
 @pytest.mark.skipif(OFFICE is None, reason="LibreOffice is not installed: libreoffice-calc-nogui")
 @pytest.mark.parametrize(
     ("how", "options"),
