@@ -295,7 +295,7 @@ HASH = "0123456789abcdef" * 4
 
 
 def content(n: int, parts: tuple[int, ...] = ()) -> tuple[list[Bins], pa.Buffer]:
-    levels = gathered(frames(n, parts=parts)).finish()
+    levels = gathered(frames(n, parts=parts)).pop_levels()
     return levels, encode_overview(levels, tile_count=TILES, frames_sha256=HASH)
 
 
