@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
 from typing import Any, get_args
 
 import pytest
@@ -24,6 +25,7 @@ from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.fault_timing import SceneFaults
 from devices.emulation.i2c_bus import EmulatedI2cAdapter, FaultyWires
 from devices.emulation.parts import make_rng
+from devices.errors import BusSetupError
 from devices.frames import TileInfo
 from devices.recovery import BusRecovery
 from devices.scene.emulation_sections import BUS_TARGET, FaultKind, PartFault, ReadDuringConversion
@@ -159,6 +161,38 @@ class Wires(Adapter):
 
     def set_timeout(self, units_10ms: int) -> None:
         self.adapter.set_timeout(units_10ms)
+
+
+@dataclass
+class ScriptedRecovery:
+    """A recovery that records its calls, may fail, and may free SDA."""
+
+    adapter: EmulatedI2cAdapter
+    clock: VirtualClock
+    fails: bool = False
+    reports_free: bool = True
+    clocks_free: bool = False
+    reset_frees: bool = False
+    has_reset: bool = True
+    resets: int = field(default=0, init=False)
+    asked_ns: list[int] = field(default_factory=list, init=False)
+
+    def send_recovery_clocks(self) -> bool:
+        self.asked_ns.append(self.clock.now_ns())
+        if self.fails:
+            raise BusSetupError("another program has the lines", where="gpio", errno=16)
+        if self.clocks_free:
+            self._free_sda()
+        return self.reports_free
+
+    def reset_muxes(self) -> bool:
+        self.resets += 1
+        if self.reset_frees:
+            self._free_sda()
+        return self.has_reset
+
+    def _free_sda(self) -> None:
+        self.adapter.line.sda_low.end_at(self.clock.now_ns())
 
 
 def array_on(

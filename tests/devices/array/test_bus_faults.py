@@ -6,10 +6,12 @@ from itertools import pairwise
 
 import pytest
 
+from devices.array.bus_monitor import BusMonitor
 from devices.array.tile import Scan
 from devices.array.tile_array import TileArray
 from devices.buses.device_files import DeviceReopener
 from devices.buses.i2c import I2cBus
+from devices.chips.tca9548a import MuxRouter
 from devices.errors import BusMisuseError, BusSetupError
 from devices.flags import TileFlag
 from devices.frames import NOT_READ
@@ -21,6 +23,7 @@ from tests.devices.rigs import (
     SETTLED,
     TWO_MUXES,
     Plugs,
+    ScriptedRecovery,
     Wires,
     array_on,
     every_schedule,
@@ -181,26 +184,114 @@ def test_an_open_file_that_keeps_failing_is_opened_again() -> None:
     assert_healthy(array, scan)
 
 
-class BusyLines:
-    """A recovery by lines that another program uses."""
-
-    def send_recovery_clocks(self) -> bool:
-        raise BusSetupError("GPIO lines cannot be used (EBUSY)", where="/dev/gpiochip0, lines 2, 3")
-
-    def reset_muxes(self) -> bool:
-        return False
-
-
-@pytest.mark.parametrize("recovery", [None, BusyLines()])
-def test_a_warning_names_a_stuck_bus_and_the_failure_of_its_recovery(
-    recovery: BusyLines | None,
-) -> None:
+@pytest.mark.parametrize("has_recovery", [False, True])
+def test_a_warning_names_a_stuck_bus_and_the_failure_of_its_recovery(has_recovery: bool) -> None:
     wires = Wires(FOUR)
-    array = array_on(wires, recovery=recovery)
+    busy = ScriptedRecovery(wires.adapter, wires.clock, fails=True, has_reset=False)
+    array = array_on(wires, recovery=busy if has_recovery else None)
     with wires.fault("sda_low"):
         scanned(array, 3)
         assert list(array.get_warnings()) == [""]
         text = array.get_warnings()[""]
     assert text.startswith("the bus is stuck or cut")
-    assert ("GPIO lines cannot be used" in text) == (recovery is not None)
+    assert ("gpio: another program has the lines" in text) == has_recovery
     assert_healthy(array, scanned(array, 200))
+
+
+# The monitor: a mux that keeps its mask shows that the bus works
+
+MS = 1_000_000
+
+
+def monitored(
+    *, has_recovery: bool = True, **script: bool
+) -> tuple[Wires, ScriptedRecovery, BusMonitor]:
+    wires = Wires(TWO_MUXES)
+    recovery = ScriptedRecovery(wires.adapter, wires.clock, **script)
+    router = MuxRouter(wires.bus, (mux for mux, _ in TWO_MUXES))
+    return wires, recovery, BusMonitor(router, wires.clock, recovery if has_recovery else None)
+
+
+def test_a_frame_is_abandoned_only_if_no_mux_works() -> None:
+    wires, _, monitor = monitored()
+    monitor.check_bus(healthy := Scan.empty(4, 0, 0))
+    with wires.fault("brown_out", "0x70"):
+        monitor.check_bus(with_one_mux := Scan.empty(4, 0, 0))
+    for scan in (healthy, with_one_mux):
+        assert not scan.bus_fault
+        assert not scan.is_abandoned
+    for kind in ("sda_low", "sda_high", "scl_low"):
+        with wires.fault(kind):
+            monitor.check_bus(scan := Scan.empty(4, 0, 0))
+        assert scan.bus_fault
+        assert scan.is_abandoned
+
+
+def test_a_bus_is_down_until_it_works_again() -> None:
+    wires, _, monitor = monitored(has_recovery=False)
+    assert not monitor.is_down
+    with wires.fault("sda_high"):
+        monitor.mark_down()
+        assert monitor.is_down
+        assert not monitor.try_reconnect()
+        assert monitor.is_down
+    assert monitor.try_reconnect()
+    assert not monitor.is_down
+    assert monitor.recovery_attempts == 0
+
+
+def test_a_stuck_bus_is_recovered_at_once_and_then_ever_more_rarely() -> None:
+    wires, recovery, monitor = monitored()
+    with wires.fault("sda_low"):
+        monitor.mark_down()
+        begin_ns = wires.clock.now_ns()
+        while wires.clock.now_ns() < begin_ns + 5_000 * MS:
+            assert not monitor.try_reconnect()
+            wires.clock.sleep_until_ns(wires.clock.now_ns() + MS)
+    assert recovery.asked_ns[0] - begin_ns < MS
+    waits_ms = [(after - before) / MS for before, after in pairwise(recovery.asked_ns)]
+    assert waits_ms[:9] == pytest.approx([10, 20, 40, 80, 160, 320, 640, 1000, 1000], abs=3)
+    assert monitor.recovery_attempts == len(recovery.asked_ns)
+    assert recovery.resets == len(recovery.asked_ns), "clocks were not enough"
+
+
+@pytest.mark.parametrize(
+    ("script", "resets"),
+    [
+        ({"clocks_free": True}, 0),
+        ({"reset_frees": True}, 1),
+        ({"reset_frees": True, "reports_free": False}, 1),
+        ({"reset_frees": True, "fails": True}, 1),
+    ],
+)
+def test_a_bus_is_reset_only_if_clocks_do_not_free_it(script: dict[str, bool], resets: int) -> None:
+    wires, recovery, monitor = monitored(**script)
+    with wires.fault("sda_low"):
+        monitor.mark_down()
+        assert monitor.try_reconnect()
+    assert (len(recovery.asked_ns), recovery.resets) == (1, resets)
+
+
+def test_a_failed_recovery_is_a_problem_until_the_bus_works_again() -> None:
+    wires, _, monitor = monitored(fails=True, has_reset=False)
+    with wires.fault("sda_low"):
+        monitor.mark_down()
+        assert monitor.problem == ""
+        assert not monitor.try_reconnect()
+        assert monitor.problem == "gpio: another program has the lines"
+    monitor.mark_down()
+    assert monitor.try_reconnect()
+    assert monitor.problem == ""
+
+
+def test_a_bus_that_is_stuck_again_is_recovered_at_once() -> None:
+    wires, recovery, monitor = monitored()
+    for attempts in (1, 2, 3):
+        with wires.fault("sda_low"):
+            monitor.mark_down()
+            assert not monitor.try_reconnect()
+            assert len(recovery.asked_ns) == attempts
+        assert monitor.try_reconnect()
+    monitor.mark_down()
+    assert monitor.try_reconnect()
+    assert len(recovery.asked_ns) == 3, "a bus that works needs none"

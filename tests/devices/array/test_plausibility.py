@@ -33,6 +33,16 @@ def tamper(wires: Wires, tile: int, change: Callable[[int, list[int]], None]) ->
     part.send_bytes = send_changed_bytes  # type: ignore[method-assign,assignment]  # of this part only
 
 
+def flip(wires: Wires, tile: int, *masks: int, later: int = 0) -> None:
+    """Flip these bits of a tile's pressure counts, a mask for each reading and one for later."""
+
+    def change(number: int, raw: list[int]) -> None:
+        mask = masks[number] if number < len(masks) else later
+        raw[:2] = (int.from_bytes(raw[:2], "big") ^ mask << 6).to_bytes(2, "big")
+
+    tamper(wires, tile, change)
+
+
 def go_to_quiet_frame(array: TileArray) -> None:
     """Scan up to a frame that is followed by some in which no tile is read again."""
     while array._frame_index % LOOK_FRAMES not in (2, 3):
@@ -67,11 +77,7 @@ def test_a_disturbed_reading_is_read_three_times_and_the_majority_counts(foot: F
     wires, array = foot
     expected = array.scan_frame().pressure_raw[1] + 1
     wires.log.clear()
-
-    def change(number: int, raw: list[int]) -> None:
-        raw[0] ^= 0x20 if number == 0 else 0
-
-    tamper(wires, 1, change)
+    flip(wires, 1, 0x80)
     scan = array.scan_frame()
     assert scan.pressure_raw[1] == expected
     assert scan.tile_flags == [0, TileFlag.RETRIED, 0, 0]
@@ -84,23 +90,14 @@ def test_a_bit_error_of_more_than_half_a_kilopascal_gives_no_reading(foot: Foot,
     # A count is 0.1255 kPa (hardware.md 1.3): bits from 2^3 on are more than 0.5 kPa.
     wires, array = foot
     expected = array.scan_frame().pressure_raw[1] + 1
-
-    def change(number: int, raw: list[int]) -> None:
-        if number == 0:
-            raw[:2] = ((raw[0] << 8 | raw[1]) ^ 1 << bit + 6).to_bytes(2, "big")
-
-    tamper(wires, 1, change)
+    flip(wires, 1, 1 << bit)
     scan = array.scan_frame()
     assert scan.pressure_raw[1] == expected or scan.tile_flags[1] & TileFlag.UNUSABLE
 
 
 def test_three_different_readings_are_implausible(foot: Foot) -> None:
     wires, array = foot
-
-    def change(number: int, raw: list[int]) -> None:
-        raw[0] ^= (0x20, 0x40, 0x80)[number] if number < 3 else 0
-
-    tamper(wires, 1, change)
+    flip(wires, 1, 0x80, 0x100, 0x200)
     scan = array.scan_frame()
     assert scan.tile_flags[1] & TileFlag.IMPLAUSIBLE
     assert [scan.tile_flags[i] for i in (0, 2, 3)] == [0] * 3
@@ -108,13 +105,9 @@ def test_three_different_readings_are_implausible(foot: Foot) -> None:
 
 def test_a_jump_that_is_read_twice_is_believed_at_once(foot: Foot) -> None:
     wires, array = foot
-
-    def change(_: int, raw: list[int]) -> None:
-        raw[0] ^= 0x10  # and stays: 64 counts, 8 kPa in a frame
-
     before = array.scan_frame().pressure_raw[1]
     wires.log.clear()
-    tamper(wires, 1, change)
+    flip(wires, 1, later=0x40)  # and stays: 64 counts, 8 kPa in a frame
     scan = array.scan_frame()
     assert abs(scan.pressure_raw[1] - before) > 60
     assert scan.tile_flags == [0] * 4
@@ -154,7 +147,9 @@ def test_impossible_counts_are_flagged_in_their_frame_and_the_tile_is_identified
             raw[:] = counts[: len(raw)]
 
     tamper(wires, 1, change)
-    assert array.scan_frame().tile_flags == [0, flag, 0, 0]
+    scan = array.scan_frame()
+    assert scan.tile_flags == [0, flag, 0, 0]
+    assert scan.pressure_raw[1] == int.from_bytes(counts[:2], "big") >> 6
     is_disturbed = False
     wires.log.clear()
     array.scan_frame()

@@ -229,19 +229,6 @@ def test_no_more_than_one_mux_is_open_outside_a_broadcast(
     assert reads >= 3 * len(plugs)
 
 
-def test_a_broadcast_reaches_the_channels_of_the_scene_only() -> None:
-    wires = Wires(TWO_MUXES)
-    masks = []
-
-    def before(_: int, messages: tuple[i2c_msg, ...]) -> None:
-        if messages[0].addr == 0x60 and len(messages) == 1:
-            masks.append({mux.address: mux.connected_mask for mux in wires.muxes})
-
-    wires.on_transaction = before
-    scanned(array_on(wires, "simultaneous"), 3)
-    assert masks == [{0x70: 0b100001, 0x73: 0b11}] * 3
-
-
 # Conversions
 
 

@@ -82,22 +82,6 @@ def test_an_absent_tile_an_absent_mux_and_another_part_are_named_with_their_plug
     assert caught.value.where == "tile T04 (mux 0x73 channel 1)"
 
 
-def test_coefficients_that_differ_from_read_to_read_are_refused() -> None:
-    wires = Wires(ONE)
-    reads = 0
-
-    def disturb(_: int, messages: tuple[i2c_msg, ...]) -> None:
-        nonlocal reads
-        reads += len(messages) == 2
-        if reads == 3:
-            wires.tiles[0]._registers[0x05] ^= 0x04
-
-    wires.on_transaction = disturb
-    with pytest.raises(TileSetupError, match="differ") as caught:
-        identify_tiles(wires.bus, make_scene(ONE).tile)
-    assert "100 kHz" in caught.value.remedy
-
-
 def test_a_bus_that_fails_at_the_start_is_no_fault_of_a_tile() -> None:
     wires = Wires(FOUR)
     with wires.fault("scl_low"), pytest.raises(BusFaultError):

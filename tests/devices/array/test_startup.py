@@ -5,14 +5,14 @@ from __future__ import annotations
 import re
 from typing import Any
 
-import numpy as np
 import pytest
 
 from devices.array import schedules
+from devices.array.schedules import BusTiming
 from devices.array.startup import (
     ReadyArray,
+    choose_scene_schedule,
     ensure_bus_works,
-    identify_and_measure,
     prepare_array,
     reidentify_replaced_tiles,
 )
@@ -20,12 +20,12 @@ from devices.buses.i2c import I2cBus, open_bus
 from devices.clock import VirtualClock
 from devices.emulation.parts import draw_chip
 from devices.emulation.world import World
-from devices.errors import BusFaultError, BusSetupError, SceneError
+from devices.errors import BusFaultError, SceneError
 from devices.scene.emulation_sections import FaultKind, ReadDuringConversion
-from devices.scene.hardware_sections import ScheduleName
-from devices.scene.scene_file import Scene, load_scene
+from devices.scene.hardware_sections import AnySchedule, ScheduleName
+from devices.scene.scene_file import Scene
 from tests.builders.scenes import make_scene
-from tests.devices.rigs import FOUR, ONE, SCHEDULES, TWO_MUXES, Plugs, full
+from tests.devices.rigs import FOUR, SCHEDULES, TWO_MUXES, Plugs, ScriptedRecovery, full
 
 NOISY = {"noise_kpa": 0.165}
 
@@ -96,37 +96,7 @@ def test_a_healthy_array_flags_nothing_from_its_first_frame_on(schedule: Schedul
     assert all(set(health.fault_counts) <= {"not_converted"} for health in ready.array.health)
 
 
-def test_parts_of_1_6_ms_at_400_khz_reach_544_frames_a_second() -> None:
-    ready, _, clock, _ = started(load_scene("standing"), schedule="pipelined")
-    stops_ns = []
-    while clock.now_ns() < 5_000_000_000:
-        stops_ns.append(ready.array.scan_frame().convert_stop_ns[0])
-    assert np.median(np.diff(stops_ns)) * 1e-9 == pytest.approx(1 / 544, rel=0.02)
-
-
 # Choice of a schedule
-
-
-@pytest.mark.parametrize(
-    ("tiles", "schedule"), [(1, "simultaneous"), (8, "pipelined"), (16, "per_mux")]
-)
-def test_auto_chooses_the_best_schedule_and_gives_its_reason(tiles: int, schedule: str) -> None:
-    array = {"wait_ms": 1.6, "conversion_ms": 1.6}
-    ready, *_ = started(make_scene(full(tiles), array=array))
-    assert ready.choice.schedule == schedule
-    assert ready.array._schedule is schedules.SCHEDULES[ready.choice.schedule]
-    muxes = (tiles + 7) // 8
-    assert ready.choice.reason.startswith(
-        f"{tiles} tile{'s' * (tiles > 1)} on {muxes} mux{'es' * (muxes > 1)}: {schedule} gives "
-    )
-
-
-def test_auto_chooses_a_schedule_without_skew_that_holds_the_rate() -> None:
-    ready, *_ = started(make_scene(emulation=NOISY, rate_hz=300.0))
-    assert ready.choice.schedule == "simultaneous"
-    assert "no skew" in ready.choice.reason
-    assert "300 frames/s" in ready.choice.reason
-    assert started(make_scene(emulation=NOISY, rate_hz=420.0))[0].choice.schedule == "pipelined"
 
 
 def test_a_broadcast_of_sixteen_channels_is_refused_unless_the_scene_allows_it() -> None:
@@ -138,35 +108,46 @@ def test_a_broadcast_of_sixteen_channels_is_refused_unless_the_scene_allows_it()
     assert ready.predicted_rate_hz > 0
 
 
-def test_a_requested_schedule_overrides_that_of_the_scene() -> None:
-    scene = make_scene(array={"schedule": "sequential", "wait_ms": 1.6})
-    choice = started(scene)[0].choice
-    assert (choice.schedule, choice.reason) == ("sequential", "as the scene says")
-    choice = started(scene, schedule="pipelined")[0].choice
-    assert (choice.schedule, choice.reason) == ("pipelined", "as requested")
-
-
 @pytest.mark.parametrize(
-    ("asked", "schedule"),
+    ("scene", "requested", "has_reference", "schedule", "reason"),
     [
-        ("auto", "simultaneous"),
-        ("simultaneous", "simultaneous"),
-        ("sequential", "sequential"),
-        ("pipelined", None),
-        ("per_mux", None),
+        ({"rate_hz": 300.0}, None, False, "simultaneous", "no skew.*300 frames/s"),
+        ({"rate_hz": 420.0}, None, False, "pipelined", ""),
+        ({"plugs": full(16)}, None, False, "per_mux", "^16 tiles on 2 muxes: per_mux gives "),
+        ({"array": {"schedule": "sequential"}}, None, False, "sequential", "^as the scene says$"),
+        ({"array": {"schedule": "sequential"}}, "pipelined", False, "pipelined", "^as requested$"),
+        # Tiles beside a reference force are sampled with it.
+        ({}, None, True, "simultaneous", ""),
+        ({}, "simultaneous", True, "simultaneous", ""),
+        ({}, "sequential", True, "sequential", ""),
+        ({}, "pipelined", True, None, "beside a reference sensor"),
+        ({}, "per_mux", True, None, "beside a reference sensor"),
     ],
 )
-def test_tiles_beside_a_reference_force_are_sampled_with_it(
-    asked: str, schedule: str | None
+def test_a_scene_has_the_schedule_that_was_asked_for_or_the_best(
+    scene: dict[str, Any],
+    requested: AnySchedule | None,
+    has_reference: bool,
+    schedule: ScheduleName | None,
+    reason: str,
 ) -> None:
-    scene = make_scene(array={"schedule": asked, "wait_ms": 1.6})
+    made = make_scene(**scene)
+    timing = BusTiming(400_000, (1.6e-3,) * len(made.tile), tuple(tile.mux for tile in made.tile))
     if schedule is None:
-        with pytest.raises(SceneError, match="beside a reference sensor"):
-            started(scene, read_reference_n=lambda: 7.0)
+        with pytest.raises(SceneError, match=reason):
+            choose_scene_schedule(made, timing, requested, has_reference=has_reference)
     else:
-        ready, *_ = started(scene, read_reference_n=lambda: 7.0)
-        assert ready.choice.schedule == schedule
-        assert ready.array.scan_frame().reference_n == 7.0
+        choice = choose_scene_schedule(made, timing, requested, has_reference=has_reference)
+        assert choice.schedule == schedule
+        assert re.search(reason, choice.reason)
+
+
+def test_a_ready_array_has_the_chosen_schedule_and_reads_the_reference_force() -> None:
+    scene = make_scene(array={"wait_ms": 1.6})
+    ready, *_ = started(scene, schedule="sequential", read_reference_n=lambda: 7.0)
+    assert ready.choice.schedule == "sequential"
+    assert ready.array._schedule is schedules.SCHEDULES["sequential"]
+    assert ready.array.scan_frame().reference_n == 7.0
 
 
 def test_an_array_that_reads_less_temperature_is_faster() -> None:
@@ -190,34 +171,7 @@ def test_the_250_khz_trap_shows_in_the_predicted_rate() -> None:
     assert trapped.predicted_rate_hz == pytest.approx(1e6 / (373 * 4 + 1600), rel=0.01)
 
 
-def test_a_tile_that_is_measured_alone_has_its_measured_conversion_time() -> None:
-    scene = make_scene(ONE, emulation=NOISY)
-    clock = VirtualClock()
-    bus = open_bus("emulated", World(scene, clock).i2c_adapter)
-    found = identify_and_measure(bus, scene, clock)
-    assert found.tiles[0].conversion_ms * 1e-3 == pytest.approx(found.timing.conversions_s[0])
-
-
 # A bus that is stuck since the last run
-
-
-class Recovery:
-    """A recovery that reports success after its clocks, and that may free SDA by RESET."""
-
-    def __init__(self, world: World, *, reset_frees: bool = False, is_busy: bool = False) -> None:
-        self.sda_low = world.i2c_adapter.line.sda_low
-        self.reset_frees = reset_frees
-        self.is_busy = is_busy
-
-    def send_recovery_clocks(self) -> bool:
-        if self.is_busy:
-            raise BusSetupError("GPIO lines cannot be used (EBUSY)", where="/dev/gpiochip0")
-        return True
-
-    def reset_muxes(self) -> bool:
-        if self.reset_frees:
-            self.sda_low.end_at(0)
-        return True
 
 
 @pytest.mark.parametrize("has_recovery", [False, True])
@@ -227,29 +181,24 @@ class Recovery:
 def test_a_bus_that_cannot_be_freed_is_an_error_that_names_the_stuck_wire(
     kind: FaultKind, reason: str, has_recovery: bool
 ) -> None:
-    world = World(scene := make_scene(), VirtualClock())
+    world = World(scene := make_scene(), clock := VirtualClock())
     bus = open_bus("emulated", world.i2c_adapter)
-    recovery = Recovery(world) if has_recovery else None
+    recovery = ScriptedRecovery(world.i2c_adapter, clock) if has_recovery else None
     with world.inject_fault(kind), pytest.raises(BusFaultError, match=re.escape(reason)) as caught:
         ensure_bus_works(bus, scene, recovery)
     assert ("SDA is stuck low" in str(caught.value)) == (kind == "sda_low")
 
 
-@pytest.mark.parametrize("is_busy", [False, True])
-def test_a_bus_that_clocks_do_not_free_is_reset(is_busy: bool) -> None:
-    world = World(scene := make_scene(), VirtualClock())
+def test_a_stuck_bus_is_recovered_or_its_error_names_the_failure_of_the_recovery() -> None:
+    world = World(scene := make_scene(), clock := VirtualClock())
     bus = open_bus("emulated", world.i2c_adapter)
+    recovery = ScriptedRecovery(world.i2c_adapter, clock, fails=True)
     with world.inject_fault("sda_low"):
-        ensure_bus_works(bus, scene, Recovery(world, reset_frees=True, is_busy=is_busy))
-        assert not world.i2c_adapter.line.sda_low(0)
-
-
-def test_an_error_of_a_stuck_bus_names_the_failure_of_its_recovery() -> None:
-    world = World(scene := make_scene(), VirtualClock())
-    bus = open_bus("emulated", world.i2c_adapter)
-    with world.inject_fault("sda_low"), pytest.raises(BusFaultError) as caught:
-        ensure_bus_works(bus, scene, Recovery(world, is_busy=True))
-    assert "could not be freed: /dev/gpiochip0: GPIO lines cannot be used" in str(caught.value)
+        with pytest.raises(BusFaultError, match="could not be freed: gpio: another program has"):
+            ensure_bus_works(bus, scene, recovery)
+        recovery.reset_frees = True
+        ensure_bus_works(bus, scene, recovery)
+        assert not world.i2c_adapter.line.sda_low(clock.now_ns())
 
 
 # A replaced part

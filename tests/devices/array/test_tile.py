@@ -135,28 +135,27 @@ def test_ten_equal_readings_or_twenty_without_temperature_are_stale() -> None:
     assert count_readings_until_stale(health(), repeat((410, NOT_READ))) == 20
 
 
+@pytest.mark.parametrize(
+    ("readings", "is_next_stale"),
+    [
+        ([(410 + frame % 2, 507) for frame in range(100)], False),
+        ([(410, 507 + frame % 2) for frame in range(100)], False),
+        ([(410, 507 + n // 4 % 2 if n % 4 == 0 else NOT_READ) for n in range(400)], False),
+        ([(410, 507)] * 8 + [(NOT_READ, NOT_READ)] * 50 + [(410, 507)] * 2, True),
+    ],
+    ids=["pressure changes", "temperature changes", "the same, rarely read", "nothing is read"],
+)
+def test_a_reading_is_fresh_if_either_count_changes_and_frames_without_one_do_not_count(
+    readings: list[tuple[int, int]], is_next_stale: bool
+) -> None:
+    tile = health()
+    assert not any(tile.update_staleness(*counts) for counts in readings)
+    assert tile.update_staleness(410, 507) == is_next_stale
+
+
 def test_a_temperature_counts_in_the_frames_that_read_it() -> None:
     equal = ((410, 507 if frame % 4 == 0 else NOT_READ) for frame in count())
     assert 15 <= count_readings_until_stale(health(), equal) <= 17
-    tile = health()
-    changing = [(410, 507 + frame // 4 % 2 if frame % 4 == 0 else NOT_READ) for frame in range(400)]
-    assert not any(tile.update_staleness(*counts) for counts in changing)
-
-
-@pytest.mark.parametrize("change", [(1, 0), (0, 1)])
-def test_a_reading_that_changes_in_either_count_is_fresh(change: tuple[int, int]) -> None:
-    tile = health()
-    for frame in range(100):
-        assert not tile.update_staleness(
-            410 + change[0] * (frame % 2), 507 + change[1] * (frame % 2)
-        )
-
-
-def test_frames_without_a_reading_do_not_count() -> None:
-    tile = health()
-    for counts in [(410, 507)] * 8 + [(NOT_READ, NOT_READ)] * 50:
-        assert not tile.update_staleness(*counts)
-    assert count_readings_until_stale(tile, repeat((410, 507))) == 2
 
 
 def test_healthy_readings_are_hardly_ever_stale() -> None:

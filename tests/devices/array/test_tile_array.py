@@ -15,19 +15,13 @@ from devices.array.tile_array import TileArray
 from devices.buses.i2c import open_bus
 from devices.clock import VirtualClock
 from devices.emulation.world import World
-from devices.errors import SceneError
 from devices.flags import TileFlag
 from devices.frames import NOT_READ
 from devices.scene.hardware_sections import ScheduleName
 from devices.scene.scene_file import load_scene
 from tests.devices.rigs import (
-    BIT_NS,
-    CONVERT,
     FOUR,
-    READ,
-    SELECT,
     TWO_MUXES,
-    TYPICAL_NS,
     WHOLE_NS,
     Wires,
     array_on,
@@ -67,22 +61,6 @@ def test_every_frame_is_a_new_conversion_of_every_tile(schedule: ScheduleName) -
     assert [pressure_raw // 100 for pressure_raw in last] == [0, 1, 2, 3], "of each tile its own"
 
 
-def test_all_tiles_of_a_simultaneous_frame_convert_at_one_instant() -> None:
-    wires = Wires(TWO_MUXES)
-    begin_ns = wires.clock.now_ns()
-    # At first no mask is known, so both muxes are selected before the CONVERT.
-    stop_ns = begin_ns + (2 * SELECT + CONVERT) * BIT_NS
-    assert array_on(wires).scan_frame().convert_stop_ns == [stop_ns] * 4
-
-
-def test_each_tile_of_a_sequential_frame_has_its_own_instant() -> None:
-    wires, array = settled_on(FOUR, "sequential")
-    first_ns = wires.clock.now_ns() + (SELECT + CONVERT) * BIT_NS
-    step_ns = (SELECT + CONVERT + READ) * BIT_NS + TYPICAL_NS
-    assert step_ns == 1_887_500
-    assert array.scan_frame().convert_stop_ns == [first_ns + i * step_ns for i in range(4)]
-
-
 @every_schedule
 def test_a_reading_has_the_instant_of_its_own_convert(schedule: ScheduleName) -> None:
     wires = Wires(TWO_MUXES)
@@ -111,18 +89,6 @@ def test_too_short_a_wait_gives_the_conversion_before() -> None:
     first, second = array.scan_frame(), array.scan_frame()
     assert first.tile_flags[0] == TileFlag.NOT_CONVERTED
     assert second.pressure_raw[0] != 2
-
-
-def test_an_array_opens_no_more_channels_than_allowed() -> None:
-    for wires, schedule, channels in (
-        (Wires(FOUR), "simultaneous", 4),
-        (Wires(TWO_MUXES), "per_mux", 2),
-        (Wires(FOUR), "pipelined", 1),
-    ):
-        array_on(wires, schedule, broadcast_channels=channels)  # type: ignore[arg-type]
-        if channels > 1:
-            with pytest.raises(SceneError, match=f"opens {channels} channels at once"):
-                array_on(wires, schedule, broadcast_channels=channels - 1)  # type: ignore[arg-type]
 
 
 # Reference force
@@ -159,15 +125,6 @@ def test_temperature_is_read_in_every_kth_frame_only(schedule: ScheduleName, eve
         assert scan.temperature_raw == [500 if frame % every == 0 else NOT_READ] * 4
         assert NOT_READ not in scan.pressure_raw
         assert scan.tile_flags == [0] * 4
-
-
-def test_a_frame_without_temperature_is_18_bits_a_tile_shorter() -> None:
-    array = settled(wires := Wires(FOUR), temperature_every=2)
-    wires.log.clear()
-    took_ns = [timed_scan(array, wires)[1] for _ in range(4)]
-    assert took_ns[:2] == took_ns[2:]
-    assert set(took_ns) == {WHOLE_NS - 4 * 18 * BIT_NS, WHOLE_NS}
-    assert wires.log.count("60<00 60>2") == wires.log.count("60<00 60>4") == 8
 
 
 @every_schedule
