@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from devices.flags import FrameFlag, TileFlag
+from devices.flags import TileFlag
 from devices.frames import (
     FRAME_COLUMNS,
     NO_SERVO_AGE,
@@ -49,27 +49,12 @@ def batch(n: int = 3, tiles: int = 2, first: int = 0) -> FrameBatch:
     return FrameBatch(**columns)
 
 
-def test_columns_marks_and_flags_are_those_of_the_design() -> None:
+def test_columns_and_marks_are_those_of_the_design() -> None:
     assert [f.name for f in fields(FrameBatch)] == list(DESIGN)
     found = {name: (np.dtype(t).name, per_tile) for name, (t, per_tile) in FRAME_COLUMNS.items()}
     assert found == DESIGN
     assert (NOT_READ, NO_SERVO_COUNTS, NO_SERVO_AGE) == (65535, -2147483648, -1)
-    assert {bit.name: bit.value for bit in TileFlag} == {
-        "NO_ANSWER": 1,
-        "STALE": 2,
-        "RETRIED": 4,
-        "IMPLAUSIBLE": 8,
-        "OVER_RANGE": 16,
-        "NOT_CONVERTED": 32,
-    }
-    assert {bit.name: bit.value for bit in FrameFlag} == {
-        "OVERRUN": 1,
-        "SERVO_STALE": 2,
-        "BUS_FAULT": 4,
-        "LEAD": 8,
-        "NEW_ARRAY_INFO": 16,
-        "SERVO_TURN_UNKNOWN": 32,
-    }
+    # The bits themselves are compared with the documents in tests/test_flags.py.
     usable = [bit.name for bit in TileFlag if not bit & TileFlag.UNUSABLE]
     assert usable == ["RETRIED", "OVER_RANGE"]
 
@@ -86,31 +71,18 @@ def test_a_column_of_another_type_or_shape_is_refused_by_name(name: str, per_til
             replace(good, **{name: values})
 
 
-def test_a_batch_has_frames_and_tiles_even_if_it_is_empty() -> None:
-    for n, tiles in ((3, 2), (0, 4)):
-        assert (len(batch(n, tiles)), batch(n, tiles).tile_count) == (n, tiles)
-
-
-@given(
-    sizes=st.lists(st.integers(0, 5), min_size=1, max_size=6),
-    tiles=st.integers(1, 4),
-    data=st.data(),
-)
-def test_rows_and_concatenation_undo_each_other(
-    sizes: list[int], tiles: int, data: st.DataObject
-) -> None:
+@given(sizes=st.lists(st.integers(0, 5), min_size=1, max_size=6), tiles=st.integers(1, 4))
+def test_rows_and_concatenation_undo_each_other(sizes: list[int], tiles: int) -> None:
     whole = batch(n=sum(sizes), tiles=tiles)
     ends = np.cumsum(sizes).tolist()
     pieces = [whole.slice_rows(end - size, end) for end, size in zip(ends, sizes, strict=True)]
-    assert [len(piece) for piece in pieces] == sizes
+    assert [(len(piece), piece.tile_count) for piece in pieces] == [(n, tiles) for n in sizes]
+    for end, size, piece in zip(ends, sizes, pieces, strict=True):
+        np.testing.assert_array_equal(piece.seq, whole.seq[end - size : end])
     again = FrameBatch.concatenate(pieces)
     for name in DESIGN:
         np.testing.assert_array_equal(getattr(again, name), getattr(whole, name))
         assert getattr(again, name).dtype == getattr(whole, name).dtype
-    row = data.draw(st.integers(0, max(0, sum(sizes) - 1)))
-    np.testing.assert_array_equal(
-        whole.slice_rows(row, row + 1).pressure_raw, whole.pressure_raw[row : row + 1]
-    )
 
 
 def test_rows_copy_nothing() -> None:
@@ -139,11 +111,8 @@ def test_array_info_travels_as_json_without_loss() -> None:
     assert info.serials == ("T01", "T02")
 
 
-def test_array_info_of_a_newer_version_is_refused_rather_than_half_read() -> None:
+def test_array_info_of_a_newer_version_is_refused_rather_than_half_read_or_changed() -> None:
     with pytest.raises(ValidationError, match="phase_of_the_moon"):
         make_array(phase_of_the_moon=1)
-
-
-def test_array_info_cannot_be_changed() -> None:
     with pytest.raises(ValidationError, match="frozen"):
         make_array().node = "other"

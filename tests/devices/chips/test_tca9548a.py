@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from smbus2 import i2c_msg
 
 from devices.buses.i2c import I2cBus
-from devices.chips.tca9548a import ADDRESSES, CHANNELS, MuxRouter, Tca9548a
+from devices.chips.tca9548a import MuxRouter, Tca9548a
 from devices.clock import VirtualClock
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.i2c_bus import EmulatedI2cAdapter
@@ -69,11 +69,6 @@ def router(protocol: Protocol, *addresses: int) -> MuxRouter:
 
 
 # One multiplexer
-
-
-def test_there_are_eight_muxes_of_eight_channels() -> None:
-    assert list(ADDRESSES) == [0x70, 0x71, 0x72, 0x73, 0x74, 0x75, 0x76, 0x77]
-    assert list(CHANNELS) == list(range(8))
 
 
 def test_a_mask_is_written_and_read_as_one_byte_without_a_register_number(

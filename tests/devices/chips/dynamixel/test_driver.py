@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
-
 import pytest
 import serial
 from hypothesis import given
@@ -97,7 +95,7 @@ READ_3_FROM_0 = bytes.fromhex("FFFF 01 04 02 00 03 F5")
 STATUS_1_AT_548 = status_1(0, 0x24, 0x02, 0)
 
 
-# Protocol 2.0
+# Both protocols
 
 
 def test_requests_of_protocol_2_are_the_golden_ones() -> None:
@@ -110,42 +108,74 @@ def test_requests_of_protocol_2_are_the_golden_ones() -> None:
     assert port.written == PING_1
 
 
-@pytest.mark.parametrize("piece", [1, 3, 7, 14])
-@pytest.mark.parametrize("before", [b"", b"\xff\xff\xff\xfd", READ_POSITION_OF_1])
-def test_noise_and_echo_before_an_answer_of_protocol_2_are_ignored(
-    before: bytes, piece: int
+def test_requests_of_protocol_1_are_the_golden_ones() -> None:
+    port = ScriptedPort(STATUS_1_AT_548)
+    assert servo_on(port, protocol=1).read_position().counts == 548
+    assert port.written == READ_3_FROM_36
+    port = ScriptedPort(status_1(0, 0x36, 0x01, 41))
+    assert servo_on(port, protocol=1).read_identity() == ServoIdentity(310, 41)
+    assert port.written == READ_3_FROM_0
+
+
+@pytest.mark.parametrize("piece", [1, 2, 3, 7, 100])
+@pytest.mark.parametrize(
+    ("protocol", "before", "answer", "counts"),
+    [
+        *(
+            (2, before, STATUS_OF_1_AT_166, 166)
+            for before in (b"", b"\xff\xff\xff\xfd", READ_POSITION_OF_1)
+        ),
+        *(
+            (1, echo + bytes.fromhex(noise), STATUS_1_AT_548, 548)
+            for echo in (b"", READ_3_FROM_36)
+            for noise in ("", "FF", "00 FF 01", "FF FF 01 00", "FFFF FE FF")
+        ),
+    ],
+)
+def test_noise_and_echo_before_an_answer_are_ignored(
+    protocol: int, before: bytes, answer: bytes, counts: int, piece: int
 ) -> None:
-    stale = status(0, 9, 9, 9, 9)
-    port = ScriptedPort(before + STATUS_OF_1_AT_166, piece=piece, stale=stale)
-    assert servo_on(port).read_position().counts == 166
+    stale = status(0, 9, 9, 9, 9) + status_1(0, 9, 9, 9)
+    port = ScriptedPort(before + answer, piece=piece, stale=stale)
+    assert servo_on(port, protocol=protocol).read_position().counts == counts
 
 
 @pytest.mark.parametrize(
-    ("answer", "error", "text"),
+    ("protocol", "answer", "error", "text"),
     [
-        (STATUS_OF_2_AT_2079, ServoPacketError, "servo 2 answered; expected servo 1"),
-        (status(), ServoPacketError, r"answer of . bytes; expected 4 bytes"),
-        (status(0), ServoPacketError, r"answer of . bytes; expected 4 bytes"),
-        (status(0, 1, 2, 3), ServoPacketError, r"answer of . bytes; expected 4 bytes"),
-        (status(0, 1, 2, 3, 4, 5), ServoPacketError, r"answer of . bytes; expected 4 bytes"),
-        (status(1), ServoStatusError, "result fail"),
-        (status(7), ServoStatusError, "access"),
-        (status(0x84), ServoStatusError, "error 4, data range"),
-        (status(9), ServoStatusError, "error 9, unknown"),
-        (STATUS_OF_1_AT_166[:9], ServoTimeoutError, "9 bytes came"),
-        (READ_POSITION_OF_1, ServoTimeoutError, "14 bytes came"),  # an echo alone
+        (2, STATUS_OF_2_AT_2079, ServoPacketError, "servo 2 answered; expected servo 1"),
+        *(
+            (2, status(*data), ServoPacketError, r"answer of . bytes; expected 4 bytes")
+            for data in ((), (0,), (0, 1, 2, 3), (0, 1, 2, 3, 4, 5))
+        ),
+        (2, status(1), ServoStatusError, "result fail"),
+        (2, status(7), ServoStatusError, "access"),
+        (2, status(0x84), ServoStatusError, "error 4, data range"),
+        (2, status(9), ServoStatusError, "error 9, unknown"),
+        (2, STATUS_OF_1_AT_166[:9], ServoTimeoutError, "9 bytes came"),
+        (2, READ_POSITION_OF_1, ServoTimeoutError, "14 bytes came"),  # an echo alone
+        *(
+            (1, status_1(bits, *data), ServoStatusError, f"refused: {text}")
+            for bits, text in (
+                (0x08, "range"),
+                (0x10, "checksum of the request"),
+                (0x40, "undefined instruction"),
+                (0x80, "unknown"),
+                (0x49, "range, undefined instruction"),
+            )
+            for data in ((), (0, 0, 0))
+        ),
+        (1, STATUS_1_AT_548[:-1] + b"\x00", ServoPacketError, "damaged"),
+        (1, status_1(0, 1, 2, 3, servo_id=2), ServoPacketError, "servo 2 answered; expected servo"),
+        (1, status_1(0, 1, 2), ServoPacketError, "answer of 2 bytes; expected 3 bytes"),
+        (1, READ_3_FROM_36, ServoTimeoutError, "8 bytes came"),  # an echo alone
     ],
 )
-def test_a_wrong_answer_of_protocol_2_is_refused_with_the_reason(
-    answer: bytes, error: type[Exception], text: str
+def test_a_wrong_answer_is_refused_with_the_reason(
+    protocol: int, answer: bytes, error: type[Exception], text: str
 ) -> None:
     with pytest.raises(error, match=text):
-        servo_on(ScriptedPort(answer)).read_position()
-
-
-def test_an_alert_alone_is_no_error() -> None:
-    reading = servo_on(ScriptedPort(status(0x80, 0xFB, 0xFF, 0xFF, 0xFF))).read_position()
-    assert (reading.counts, reading.has_alert) == (-5, True)
+        servo_on(ScriptedPort(answer), protocol=protocol).read_position()
 
 
 def test_a_timeout_takes_its_time_and_names_its_possible_causes() -> None:
@@ -155,7 +185,6 @@ def test_a_timeout_takes_its_time_and_names_its_possible_causes() -> None:
     for thing in ("power", "its id", "baud rate", "latency timer"):
         assert thing in str(caught.value)
     assert port.clock.now_ns() == 7 + 20 * MS
-    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)  # noqa: S301  # our own
 
 
 def test_an_answer_after_the_timeout_is_not_used() -> None:
@@ -196,27 +225,6 @@ def test_a_request_that_is_sent_in_part_has_no_answer() -> None:
 # Protocol 1.0
 
 
-def test_requests_of_protocol_1_are_the_golden_ones() -> None:
-    port = ScriptedPort(STATUS_1_AT_548)
-    assert servo_on(port, protocol=1).read_position().counts == 548
-    assert port.written == READ_3_FROM_36
-    port = ScriptedPort(status_1(0, 0x36, 0x01, 41))
-    assert servo_on(port, protocol=1).read_identity() == ServoIdentity(310, 41)
-    assert port.written == READ_3_FROM_0
-
-
-@pytest.mark.parametrize(
-    "noise", ["", "00", "FF", "FF FF", "00 FF 01", "FF FF 01 00", "FFFF FE FF"]
-)
-@pytest.mark.parametrize("piece", [1, 2, 3, 5, 100])
-@pytest.mark.parametrize("echo", [b"", READ_3_FROM_36])
-def test_noise_and_echo_before_an_answer_of_protocol_1_are_ignored(
-    noise: str, piece: int, echo: bytes
-) -> None:
-    port = ScriptedPort(echo + bytes.fromhex(noise) + STATUS_1_AT_548, piece=piece)
-    assert servo_on(port, protocol=1).read_position().counts == 548
-
-
 @given(
     position=st.integers(0, 0xFFFF),
     next_byte=st.integers(0, 255),
@@ -234,44 +242,6 @@ def test_no_answer_of_protocol_1_is_taken_for_an_echo(
         reading = servo.read_position()
         assert reading.counts == (position if position < 0x8000 else position - 0x10000)
         assert reading.has_alert == bool(error)
-
-
-@pytest.mark.parametrize(
-    "bit", [ErrorFlag.VOLTAGE, ErrorFlag.ANGLE, ErrorFlag.OVERHEAT, ErrorFlag.OVERLOAD]
-)
-def test_a_servo_of_protocol_1_in_a_bad_state_gives_its_position(
-    bit: ErrorFlag,
-) -> None:
-    port = ScriptedPort(status_1(bit, 0xFB, 0xFF, 0))
-    reading = servo_on(port, protocol=1).read_position()
-    assert (reading.counts, reading.has_alert) == (-5, True)
-
-
-@pytest.mark.parametrize(
-    ("answer", "error", "text"),
-    [
-        *(
-            (status_1(bits, *data), ServoStatusError, f"refused: {text}")
-            for bits, text in (
-                (0x08, "range"),
-                (0x10, "checksum of the request"),
-                (0x40, "undefined instruction"),
-                (0x80, "unknown"),
-                (0x49, "range, undefined instruction"),
-            )
-            for data in ((), (0, 0, 0))
-        ),
-        (STATUS_1_AT_548[:-1] + b"\x00", ServoPacketError, "damaged"),
-        (status_1(0, 1, 2, 3, servo_id=2), ServoPacketError, "servo 2 answered; expected servo 1"),
-        (status_1(0, 1, 2), ServoPacketError, "answer of 2 bytes; expected 3 bytes"),
-        (READ_3_FROM_36, ServoTimeoutError, "8 bytes came"),  # an echo alone
-    ],
-)
-def test_a_wrong_answer_of_protocol_1_is_refused_with_the_reason(
-    answer: bytes, error: type[Exception], text: str
-) -> None:
-    with pytest.raises(error, match=text):
-        servo_on(ScriptedPort(answer), protocol=1).read_position()
 
 
 def test_a_new_firmware_of_the_old_protocol_is_refused_with_the_remedy() -> None:

@@ -10,7 +10,9 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from devices.chips.dynamixel.driver import open_servo
+from devices.chips.dynamixel.servo_search import FoundServo, find_servos
 from devices.clock import SystemClock, VirtualClock
+from devices.emulation.chips.dynamixel import FIRMWARE_VERSION
 from devices.errors import ServoPacketError, ServoSetupError, ServoTimeoutError
 from tests.builders.servo import FaultyServo
 from tests.devices.chips.dynamixel.lines import AMPLE_S, SHORT_S, both_protocols, emulated
@@ -102,15 +104,6 @@ def test_a_damaged_answer_is_refused_at_once(protocol: int) -> None:
         assert driver.read_position().counts == 0
 
 
-def test_a_silent_servo_times_out_and_is_read_once_it_answers() -> None:
-    with emulated(timeout_s=0.25) as (servo, driver, clock):
-        t_ns = clock.now_ns()
-        with servo.silent(), pytest.raises(ServoTimeoutError):
-            driver.read_position()
-        assert clock.now_ns() == t_ns + 250_000_000
-        assert driver.read_position().counts == 0
-
-
 @pytest.mark.parametrize(
     ("asked", "reason"),
     [
@@ -145,15 +138,15 @@ def test_a_reading_has_an_alert_as_long_as_the_servo_reports_one(protocol: int) 
 # Opening
 
 
-def test_a_missing_port_is_a_setup_error_with_a_remedy() -> None:
-    with pytest.raises(ServoSetupError, match="group dialout"):
-        open_servo("/dev/no-such-port", baudrate=57_600, clock=VirtualClock())
-
-
-def test_no_serial_port_no_baud_rate_and_a_port_in_use_are_setup_errors() -> None:
+def test_a_port_that_cannot_be_opened_is_a_setup_error_with_a_remedy() -> None:
     with emulated() as (servo, _, clock):
-        for port, baudrate in ((servo.port, 1_000_000), ("/dev/null", 57_600), (servo.port, -1)):
-            with pytest.raises(ServoSetupError, match="cannot be opened"):
+        for port, baudrate, text in (
+            ("/dev/no-such-port", 57_600, "cannot be opened.*group dialout"),
+            (servo.port, 1_000_000, "cannot be opened"),  # in use
+            ("/dev/null", 57_600, "cannot be opened"),
+            (servo.port, -1, "cannot be opened"),
+        ):
+            with pytest.raises(ServoSetupError, match=text):
                 open_servo(port, baudrate=baudrate, clock=clock)
 
 
@@ -206,3 +199,46 @@ def test_a_slow_adapter_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(check, lambda port: f"{port} is slow")
     with emulated() as (servo, driver, _):
         assert driver.opening_warnings == (f"{servo.port} is slow",)
+
+
+# Search for a servo of unknown protocol and baud rate
+
+# In real time; ample for an emulated servo even where the machine is busy.
+TIMEOUT_S = 0.3
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize(
+    ("protocol", "model", "number"),
+    [(1, "MX-28", 29), (1, "MX-64", 310), (2, "MX-28", 30), (2, "MX-64", 311)],
+)
+@pytest.mark.parametrize("baudrate", [57_600, 3_000_000])
+def test_a_servo_of_any_protocol_and_baud_rate_is_found(
+    protocol: int, model: str, number: int, baudrate: int
+) -> None:
+    clock = VirtualClock()
+    with FaultyServo(
+        lambda _: 0, clock, servo_id=3, model=model, protocol=protocol, baudrate=baudrate
+    ) as servo:
+        found = find_servos(
+            servo.port,
+            clock,
+            servo_ids=(3, 253),
+            baudrates=(57_600, 3_000_000),
+            timeout_s=TIMEOUT_S,
+        )
+    assert found == [FoundServo(3, baudrate, protocol, model, number, FIRMWARE_VERSION)]
+
+
+def test_a_silent_servo_and_a_damaged_answer_are_not_found() -> None:
+    clock = VirtualClock()
+    with FaultyServo(lambda _: 0, clock) as servo:
+        with servo.silent():
+            assert find_servos(servo.port, clock, timeout_s=0.01) == []
+        with servo.corrupt_crc():
+            assert find_servos(servo.port, clock, baudrates=(1_000_000,), timeout_s=0.02) == []
+
+
+def test_a_missing_port_cannot_be_searched() -> None:
+    with pytest.raises(ServoSetupError, match="cannot be opened"):
+        find_servos("/dev/no-such-port", VirtualClock())

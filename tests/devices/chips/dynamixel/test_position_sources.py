@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,14 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from devices.acquisition import ServoSource
 from devices.chips.dynamixel.driver import PositionReading, open_servo
-from devices.chips.dynamixel.position_sources import ThreadedServoSource, VirtualTimeServoSource
+from devices.chips.dynamixel.firmwares import CountRange
+from devices.chips.dynamixel.position_sources import (
+    ThreadedServoSource,
+    TurnUnwrapper,
+    VirtualTimeServoSource,
+)
 from devices.chips.dynamixel.protocol import Instruction, Packet
 from devices.clock import SystemClock, VirtualClock
 from devices.emulation.fault_timing import FaultTiming
@@ -53,6 +60,13 @@ class ScriptedServo:
             half_width_ns=self.answer_ns // 2,
             answered_ns=begin_ns + self.answer_ns,
         )
+
+
+def find_position(source: ServoSource, t_mono_ns: int) -> tuple[int, int]:
+    """Return counts and instant of the latest position, which must be there."""
+    position = source.find_latest_position(t_mono_ns)
+    assert position is not None
+    return position
 
 
 def polled(
@@ -125,9 +139,7 @@ def test_positions_of_an_emulated_servo_have_their_age() -> None:
     with emulated(lambda t_ns: t_ns // 1000 % 100_000) as (_, driver, clock):
         source = VirtualTimeServoSource(driver, clock, rate_hz=200.0)
         for t_ns in (1_010 * MS, 1_013 * MS, 1_050 * MS):
-            seen = source.find_latest_position(t_ns)
-            assert seen is not None
-            counts, sampled_ns = seen
+            counts, sampled_ns = find_position(source, t_ns)
             assert 0 < t_ns - sampled_ns < 6 * MS
             assert counts == pytest.approx(sampled_ns // 1000 % 100_000, abs=260)
         assert source.failed_readings == 0
@@ -190,9 +202,7 @@ def test_the_turn_is_unknown_after_a_restart_unless_the_joint_has_one_turn(
         assert {seen[tenth] for tenth in range(20, 40)} == {None if is_multi_turn else counts}
         if is_multi_turn:
             assert {seen[tenth] for tenth in range(11, 40)} == {None}
-            position = source.find_latest_position(5_000 * MS)
-            assert position is not None
-            assert position[0] == 9000 % 4096, "counts are stored as read"
+            assert find_position(source, 5_000 * MS)[0] == 9000 % 4096, "counts are stored as read"
             assert "turn" in source.warning
 
 
@@ -253,9 +263,7 @@ def test_a_missing_port_is_opened_later_if_the_caller_allows_it(tmp_path: Path) 
     assert source.find_latest_position(1_500 * MS) is None
     with FaultyServo(lambda _: 77, clock) as servo, contextlib.closing(driver):
         path.symlink_to(servo.port)
-        position = source.find_latest_position(2_600 * MS)
-    assert position is not None
-    assert position[0] == 77
+        assert find_position(source, 2_600 * MS)[0] == 77
 
 
 # A thread on the system clock
@@ -301,19 +309,15 @@ def test_a_thread_reads_ever_newer_positions_and_a_frame_gets_that_of_its_instan
     with ThreadedServoSource(servo, SystemClock(), rate_hz=500.0) as source:
         until(lambda: servo.readings > 3)
         t_mono_ns = time.monotonic_ns()
-        at_once = source.find_latest_position(t_mono_ns)
+        at_once = find_position(source, t_mono_ns)
         readings = servo.readings
         until(lambda: servo.readings > readings + 3)
-        later = source.find_latest_position(t_mono_ns)
-        newest = source.find_latest_position(time.monotonic_ns())
-        oldest = source.find_latest_position(0)
-    assert at_once is not None
-    assert later is not None
-    assert newest is not None
+        later = find_position(source, t_mono_ns)
+        newest = find_position(source, time.monotonic_ns())
+        oldest = find_position(source, 0)
     assert later[1] <= t_mono_ns < newest[1]
     assert 0 <= later[0] - at_once[0] <= 1, "one reading may have been on its way"
     assert newest[0] > readings + 2
-    assert oldest is not None
     assert oldest[1] == 0, "no age is negative"
     assert "servo" not in {thread.name for thread in threading.enumerate()}
 
@@ -325,12 +329,11 @@ def test_a_hanging_servo_does_not_delay_frames_and_its_position_ages() -> None:
         servo.may_answer.clear()
         begin_s = time.monotonic()
 
-        def is_stale() -> bool:
-            position = source.find_latest_position(time.monotonic_ns())
-            assert position is not None
-            return time.monotonic_ns() - position[1] > source.stale_after_ns
+        def age_ns() -> int:
+            now_ns = time.monotonic_ns()
+            return now_ns - find_position(source, now_ns)[1]
 
-        until(is_stale)
+        until(lambda: age_ns() > source.stale_after_ns)
         for _ in range(1000):
             source.find_latest_position(time.monotonic_ns())
         assert time.monotonic() - begin_s < 5.0
@@ -345,3 +348,119 @@ def test_a_thread_counts_failed_readings_and_reads_on() -> None:
         assert source.find_latest_position(time.monotonic_ns()) is None
         servo.error = None
         until(lambda: source.find_latest_position(time.monotonic_ns()) is not None)
+
+
+# Whole turns of a count: continued or unknown, and never wrong
+
+TURN = 4096
+
+
+def reading(
+    counts: int,
+    t_ms: float,
+    *,
+    restarted: bool = False,
+    count_range: CountRange = CountRange.MANY_TURNS,
+) -> PositionReading:
+    t_ns = round(t_ms * MS)
+    return PositionReading(counts, t_ns, 0, t_ns, has_restarted=restarted, count_range=count_range)
+
+
+@dataclass
+class Step:
+    """Time, movement and restart between two readings."""
+
+    wait_ms: int
+    speed: float
+    """Share of the greatest speed of a joint, -1 to 1."""
+    restarts: bool
+
+
+steps = st.lists(
+    st.builds(
+        Step,
+        wait_ms=st.sampled_from([1, 5, 10, 20, 100, 300, 2_000]),
+        speed=st.floats(-1, 1),
+        restarts=st.booleans(),
+    ),
+    max_size=30,
+)
+
+
+@given(count_range=st.sampled_from(CountRange), start=st.integers(0, TURN - 1), steps=steps)
+def test_a_position_is_the_true_one_or_its_turn_is_unknown(
+    count_range: CountRange, start: int, steps: list[Step]
+) -> None:
+    unwrapper, true, zero, t_ms = TurnUnwrapper(), start, 0, 0
+    unwrapper.unwrap(reading(true, t_ms, count_range=count_range))
+    for step in steps:
+        t_ms += step.wait_ms
+        true += round(step.speed * 2.9 * TURN * step.wait_ms * 1e-3)
+        if count_range is CountRange.ONE_TURN:
+            true = max(0, min(true, TURN - 1))
+        if step.restarts:
+            zero = true // TURN * TURN
+        counts = true % TURN if count_range is CountRange.WRAPPED else true - zero
+        found = unwrapper.unwrap(
+            reading(counts, t_ms, restarted=step.restarts, count_range=count_range)
+        )
+        if found.is_turn_known:
+            assert found.counts == true
+        else:
+            assert found.counts == counts, "as read"
+
+
+@given(start=st.integers(0, TURN - 1), steps=steps)
+def test_the_turn_of_a_servo_that_answers_quickly_is_known_after_every_restart(
+    start: int, steps: list[Step]
+) -> None:
+    unwrapper, true, zero = TurnUnwrapper(), start, 0
+    unwrapper.unwrap(reading(true, 0))
+    for i, step in enumerate(steps, start=1):
+        true += round(step.speed * 2.9 * TURN * 0.1)
+        if step.restarts:
+            zero = true // TURN * TURN
+        found = unwrapper.unwrap(reading(true - zero, 100 * i, restarted=step.restarts))
+        assert (found.is_turn_known, found.counts) == (True, true)
+
+
+MANY, ONE = CountRange.MANY_TURNS, CountRange.ONE_TURN
+
+
+@pytest.mark.parametrize(
+    ("count_range", "first", "later", "expected"),
+    # Counts, ms and restarts of later readings; None where the turn is unknown.
+    [
+        (MANY, 5000, [(904, 1000, True), (904, 1010, False), (904, 1020, False)], [None] * 3),
+        (MANY, 5000, [(9000, 3000, False)], [9000]),
+        # Torque switched on in position control: no restart, and the count begins again.
+        *((MANY, 5000, [(5000 + n * TURN, 10, False)], [5000]) for n in (1, -1, 3)),
+        (MANY, 1000, [(2000, 10, False), (2000, 20, False)], [None] * 2),
+        (MANY, 2**31 - 10, [(-(2**31) + 10, 10, False)], [None]),
+        (ONE, 1000, [(3000, 2000, True), (3001, 2010, False)], [None, 3001]),
+        (ONE, 5000, [(904, 1000, False)], [None]),
+    ],
+    ids=[
+        "a restart in a long silence",
+        "a long silence without a restart",
+        *("a leap by a turn", "a leap back by a turn", "a leap by three turns"),
+        "a leap faster than any joint",
+        "a count beyond the column",
+        "a joint of one turn is known at its second answer",
+        "torque may have been switched on in a silence",
+    ],
+)
+def test_a_turn_is_known_only_where_it_is_certain(
+    count_range: CountRange,
+    first: int,
+    later: list[tuple[int, int, bool]],
+    expected: list[int | None],
+) -> None:
+    unwrapper = TurnUnwrapper()
+    unwrapper.unwrap(reading(first, 0, count_range=count_range))
+    for (counts, t_ms, restarted), position in zip(later, expected, strict=True):
+        found = unwrapper.unwrap(
+            reading(counts, t_ms, restarted=restarted, count_range=count_range)
+        )
+        assert found.is_turn_known == (position is not None)
+        assert found.counts == (counts if position is None else position)
