@@ -1,17 +1,50 @@
-"""Scene files: built-in scenes, and the defaults of missing keys."""
+"""Scene files: built-in scenes, the defaults of missing keys, and what is refused."""
 
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devices.scene.emulation_sections import MudGround, PoppyGround
-from devices.scene.scene_file import list_builtin_scenes, load_scene
-from tests.devices.scene.texts import refused, scene, tile
+from devices.errors import SceneError
+from devices.scene.emulation_sections import FaultKind, MudGround, PoppyGround, ServoFault
+from devices.scene.scene_file import Scene, list_builtin_scenes, load_scene, parse_scene
+
+TILE = """
+[[tile]]
+serial = "{serial}"
+mux = {mux}
+channel = {channel}
+x_m = {x_m}
+y_m = 0
+z_m = -0.15
+"""
+
+
+def tile(
+    serial: str = "T01", mux: str = "0x70", channel: str = "0", x_m: str = "0.01", more: str = ""
+) -> str:
+    return TILE.format(serial=serial, mux=mux, channel=channel, x_m=x_m) + more
+
+
+def scene(head: str = "", tiles: str | None = None, sections: str = "") -> Scene:
+    tiles = tile() + tile("T02", channel="1") if tiles is None else tiles
+    return parse_scene(f'name = "x"\n{head}\n{tiles}\n{sections}', where="my.toml")
+
+
+def refused(head: str = "", tiles: str | None = None, sections: str = "") -> str:
+    with pytest.raises(SceneError) as caught:
+        scene(head, tiles, sections)
+    assert caught.value.exit_code == 2
+    assert caught.value.where == "my.toml"
+    assert caught.value.__cause__ is not None
+    return str(caught.value)
+
 
 # Built-in scenes
 
@@ -70,36 +103,30 @@ def test_a_scene_file_is_read_by_its_path(tmp_path: Path) -> None:
 
 
 def test_missing_keys_have_the_defaults_of_the_design() -> None:
-    bare = scene()
-    assert bare.rate_hz == 0
-    assert bare.calibration == "emulated-rig"
-    assert bare.array.bus == "emulated"
-    assert bare.array.scl_hz == 400_000
-    assert bare.array.conversion_ms is None
-    assert bare.array.schedule == "auto"
-    assert bare.array.wait_ms is None, "measured"
-    assert bare.array.temperature_every == 1
-    assert bare.array.broadcast_channels == 8  # hardware.md 2: 8 channels want 10 kOhm
-    assert bare.emulation.scl_part == 1.0
-    assert bare.servo is None
-    assert bare.ground.kind == "none"
-    assert (bare.emulation.noise_kpa, bare.emulation.correlated_ms) == (0.165, 0)
-    assert bare.emulation.repeatability == 0
-    assert (bare.emulation.gas, bare.emulation.rubber, bare.emulation.hysteresis) == (True,) * 3
-    assert bare.emulation.clip_kpa == 0
-    assert bare.fault == ()
+    bare = scene(sections="[recovery]").model_dump()
+    del bare["tile"]
+    arrays = {"conversion_ms": None, "wait_ms": None}  # drawn, and measured
+    assert bare["array"] == arrays | {
+        "bus": "emulated",
+        "scl_hz": 400_000,
+        "schedule": "auto",
+        "temperature_every": 1,
+        "broadcast_channels": 8,  # hardware.md 2: 8 channels want 10 kOhm
+    }
+    effects = ("scl_part", "noise_kpa", "correlated_ms", "repeatability", "clip_kpa")
+    assert [bare["emulation"][name] for name in effects] == [1.0, 0.165, 0, 0, 0]
+    assert [bare["emulation"][name] for name in ("gas", "rubber", "hysteresis")] == [True] * 3
+    # The pins of a Raspberry Pi
+    lines = {"gpiochip": "/dev/gpiochip0", "scl_line": 3, "sda_line": 2, "reset_line": None}
+    assert bare["recovery"] == lines | {"i2c_function": "a0"}
+    assert (bare["rate_hz"], bare["calibration"]) == (0, "emulated-rig")
+    assert (bare["servo"], bare["ground"]["kind"], bare["fault"]) == (None, "none", ())
+    assert scene().recovery is None
 
 
 def test_a_rate_is_an_integer_or_as_slow_as_a_stream_can_hold() -> None:
     assert scene("rate_hz = 100").rate_hz == 100.0
     assert scene("rate_hz = 0.001").rate_hz == 0.001
-
-
-def test_a_fault_names_a_tile_and_a_time() -> None:
-    faulty = scene(
-        sections='[[fault]]\nkind = "stale"\ntile = "T02"\nt_s = 3\nduration_s = 0.5'
-    ).fault[0]
-    assert (faulty.kind, faulty.tile, faulty.t_s, faulty.duration_s) == ("stale", "T02", 3.0, 0.5)
 
 
 @given(
@@ -122,15 +149,275 @@ def test_a_reference_force_needs_its_scale_and_nothing_else() -> None:
     assert scene().reference is None
 
 
-def test_recovery_is_by_the_pins_of_a_raspberry_pi() -> None:
-    recovery = scene(sections="[recovery]").recovery
-    assert recovery is not None
-    assert recovery.gpiochip == "/dev/gpiochip0"
-    assert (recovery.scl_line, recovery.sda_line, recovery.reset_line) == (3, 2, None)
-    assert recovery.i2c_function == "a0"
-    assert scene().recovery is None
-
-
 def test_a_scene_cannot_be_changed_once_it_is_read() -> None:
     with pytest.raises(ValueError, match="frozen"):
         scene().rate_hz = 3.0
+
+
+# Refused scenes, each with its wrong key
+
+FAULT = "[[fault]]\nkind='stale'\ntile='T01'\n"
+REFERENCE = "[reference]\nzero_v = 1.65\nn_per_v = 30.0\n"
+
+
+# Strictness and unknown keys are of the base of all sections: a case for each place of a key.
+@pytest.mark.parametrize(
+    ("head", "sections", "key"),
+    [
+        ("Rate_hz = 1", "", "Rate_hz"),
+        ("", "[servo]\nbaud = 57600", "servo.baud"),
+        ("", "[ground]\nkind = 'rolling'\nload_kg = 1", "ground.rolling.load_kg"),
+        ("", "[ground]\nkind = 'none'\nload_n = 1", "ground.none.load_n"),
+        ("", f"{FAULT}t_s=0\nduration_s=1\nseverity=3", "fault.0.severity"),
+        ("", tile("T03", channel="5", more="temperature = 3"), "tile.2.temperature"),
+    ],
+)
+def test_an_unknown_key_is_named_with_its_section(head: str, sections: str, key: str) -> None:
+    text = refused(head, sections=sections)
+    assert text == f"my.toml: unknown key {key!r}. Check its spelling, or remove it"
+
+
+@pytest.mark.parametrize(
+    ("head", "sections", "key"),
+    [
+        ("rate_hz = '100'", "", "rate_hz"),
+        ("rate_hz = true", "", "rate_hz"),
+        ("models = 'static'", "", "models"),
+        ("models = [1]", "", "models.0"),
+        ("calibration = 3", "", "calibration"),
+        ("", "[array]\nschedule = 'fast'", "array.schedule"),
+        ("", "[servo]\nid = 1.5", "servo.id"),
+        ("", "[servo]\nsign = 2", "servo.sign"),
+        ("", "[servo]\nprotocol = 3\nid = 1", "servo.protocol"),
+        ("", "[servo]\nmodel = 'AX-12'", "servo.model"),
+        ("", "[ground]\nkind = 'rolling'\nload_n = '8'", "load_n"),
+        ("", "[emulation]\ngas = 1", "emulation.gas"),
+        ("", "[emulation]\nread_during_conversion = 'random'", "read_during_conversion"),
+        ("", "[[fault]]\nkind = 'fire'\ntile = 'T01'\nt_s = 0\nduration_s = 1", "fault.0.kind"),
+        ("", "[recovery]\nreset_line = true", "recovery.reset_line"),
+        ("", tile("T03", channel='"4"'), "tile.2.channel"),
+        ("", tile("T03", channel="true"), "tile.2.channel"),
+        ("", tile("T03", mux='"0x70"'), "tile.2.mux"),
+        ("", tile("T03", x_m="true"), "tile.2.x_m"),
+    ],
+)
+def test_a_wrong_type_is_refused_and_not_converted(head: str, sections: str, key: str) -> None:
+    text = refused(head, sections=sections)
+    assert f"{key} = " in text
+    assert re.search(r"[Ii]nput should be", text), "it names the right type"
+
+
+@pytest.mark.parametrize(
+    ("head", "sections", "key"),
+    [
+        ("rate_hz = -1", "", "rate_hz"),
+        ("rate_hz = 1e-4", "", "rate_hz = 0.0001"),
+        ("", "[array]\nscl_hz = 0", "array.scl_hz"),
+        ("", "[array]\nscl_hz = 400", "array.scl_hz"),  # kHz
+        ("", "[array]\nscl_hz = 400000000", "array.scl_hz"),
+        ("", "[array]\nwait_ms = 0", "array.wait_ms"),
+        ("", "[array]\nconversion_ms = -1.6", "array.conversion_ms"),
+        ("", "[array]\ntemperature_every = 0", "array.temperature_every"),
+        ("", "[array]\nbroadcast_channels = 0", "array.broadcast_channels"),
+        ("", "[array]\nbroadcast_channels = 65", "array.broadcast_channels"),
+        ("", "[servo]\nrate_hz = 0", "servo.rate_hz"),
+        ("", "[servo]\nprotocol = true", "servo.protocol = True"),
+        ("", "[servo]\nsign = true", "servo.sign = True"),
+        # The angle would be constant, and the emulated servo would divide by it.
+        ("", "[servo]\nratio = 0", "servo.ratio = 0"),
+        ("", "[servo]\nratio = -0.0", "servo.ratio = -0"),
+        ("", "[servo]\nid = 253", "id = 253: 253 is no servo id of protocol 2; expected 0 to 252"),
+        (
+            "",
+            "[servo]\nprotocol = 1\nid = 254",
+            "id = 254: 254 is no servo id of protocol 1; expected 0 to 253",
+        ),
+        ("", "[ground]\nkind = 'plate'\nload_n = -3", "load_n"),
+        ("", "[ground]\nkind = 'indentation'\nrepeats = 1", "repeats"),
+        ("", "[ground]\nkind = 'poppy'\ndrop_m = 10", "drop_m"),  # cm
+        ("", "[ground]\nkind = 'poppy'\nmass_kg = 909", "mass_kg"),  # g
+        ("", "[ground]\nkind = 'poppy'\ndome_share = 80", "dome_share"),  # %
+        ("", "[ground]\nkind = 'mud'\nhead_kpa_per_m = 1.65", "head_kpa_per_m"),  # per 0.1 m
+        ("", "[emulation]\nnoise_kpa = -0.1", "emulation.noise_kpa"),
+        ("", "[emulation]\nambient_kpa = 1013", "emulation.ambient_kpa"),  # hPa
+        ("", "[emulation]\nscl_part = 0", "emulation.scl_part"),
+        ("", "[[fault]]\nkind='bit_errors'\nt_s=0\nduration_s=1\nrate=0", "fault.0.rate"),
+        ("", "[[fault]]\nkind='bit_errors'\nt_s=0\nduration_s=1\nrate=1.5", "fault.0.rate"),
+        ("", f"{FAULT}t_s=-1\nduration_s=1", "fault.0.t_s"),
+        ("", f"{FAULT}t_s=0\nduration_s=0", "fault.0.duration_s"),
+        ("", "[recovery]\nscl_line = 2", "recovery: scl_line, sda_line and reset_line have to be"),
+        ("", "[recovery]\nreset_line = 3", "recovery: scl_line, sda_line and reset_line have to"),
+        ("", "[recovery]\nreset_line = -1", "recovery.reset_line"),
+        ("", "[recovery]\ni2c_function = 'op'", "recovery.i2c_function"),
+        ("", "[recovery]\ni2c_function = 'a0 dl'", "recovery.i2c_function"),
+        ("", "[reference]\nn_per_v = 30", "key 'reference.zero_v' is missing"),
+        ("", "[reference]\nzero_v = 1.65", "key 'reference.n_per_v' is missing"),
+        ("", "[reference]\nzero_v = 1.65\nn_per_v = 0", "0 would make every voltage 0 N"),
+        ("", f"{REFERENCE}channel = 8", "reference.channel = "),
+        ("", f"{REFERENCE}channel = -1", "reference.channel = "),
+        # Longer than a stream can describe:
+        (f"models = ['{'m' * 201}']", "", "models.0"),
+        (f"models = {['static'] * 65}", "", "models"),
+        ("", tile("T" * 201, channel="5"), "tile.2.serial"),
+    ],
+)
+def test_a_value_that_makes_no_sense_is_refused(head: str, sections: str, key: str) -> None:
+    assert key in refused(head, sections=sections)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        *(
+            ("mux", mux, f"0x{int(mux, 0):02x} is no TCA9548A address.*0x70 to 0x77")
+            for mux in ("0x69", "0x78", "0x60", "112112")
+        ),
+        *(("channel", c, f"{c} is no channel.*0 to 7") for c in ("8", "-1", "70")),
+        # A position in millimetres
+        *(("x_m", x, "should be (greater|less) than -?1") for x in ("-21", "14.0", "1.0", "-1.0")),
+    ],
+)
+def test_a_tile_of_no_mux_no_channel_or_no_foot_is_refused(
+    key: str, value: str, expected: str
+) -> None:
+    text = refused(tiles=tile(**{key: value}))
+    assert text.startswith(f"my.toml: tile.0.{key}")
+    assert re.search(expected, text)
+
+
+@pytest.mark.parametrize("zero_v", ["0.0", "-0.1", "3.3", "5.0"])
+def test_a_zero_on_a_rail_is_refused(zero_v: str) -> None:
+    text = refused(sections=f"[reference]\nn_per_v = 30\nzero_v = {zero_v}")
+    assert f"zero_v = {float(zero_v):g} is not between the rails" in text
+    assert "vref_v = 3.3" in text
+
+
+HOPPING = "mass_kg drop_m leg_n_per_m stand_s pitch_rad sole_m2 dome_share strength_n_per_cm3"
+
+
+@pytest.mark.parametrize(
+    ("section", "keys"),
+    [
+        ("", "rate_hz"),
+        ("[array]", "scl_hz wait_ms conversion_ms"),
+        ("[servo]", "ratio rate_hz ankle_travel_m_per_rad"),
+        (
+            "[emulation]",
+            "noise_kpa correlated_ms repeatability ambient_degc ambient_kpa temperature_step_k "
+            "temperature_step_s head_kpa head_s clip_kpa",
+        ),
+        ("[reference]", "vref_v zero_v n_per_v"),
+        ("[ground]\nkind = 'plate'", "load_n sway_m"),
+        ("[ground]\nkind = 'rolling'", "load_n radius_m speed_m_s patch_m"),
+        ("[ground]\nkind = 'indentation'", "load_n stroke_s soak_k"),
+        ("[ground]\nkind = 'poppy'", HOPPING),
+        (
+            "[ground]\nkind = 'mud'",
+            f"{HOPPING} viscosity_pa_s suction_kpa head_kpa_per_m temperature_step_k",
+        ),
+        (FAULT, "t_s duration_s"),
+    ],
+)
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf"])
+def test_a_number_that_is_not_finite_is_refused(section: str, keys: str, value: str) -> None:
+    for key in keys.split():
+        line = f"{key} = {value}"
+        required = {FAULT: ("t_s", "duration_s"), "[reference]": ("zero_v", "n_per_v")}
+        others = (f"{other} = 1" for other in required.get(section, ()) if other != key)
+        lines = "\n".join([section, line, *others])
+        text = refused(sections=lines) if section else refused(line)
+        assert line in text
+    assert f"tile.0.x_m = {value}" in refused(tiles=tile(x_m=value))
+
+
+def test_two_tiles_of_one_channel_or_one_serial_are_refused() -> None:
+    text = refused(tiles=tile("T01", channel="3") + tile("T02", channel="3"))
+    assert "mux 0x70 channel 3 is used by two tiles" in text
+    assert "channel of its own" in text
+    text = refused(tiles=tile("T07", channel="1") + tile("T07", channel="2"))
+    assert "serial 'T07' appears twice" in text
+
+
+def test_a_fault_of_an_absent_tile_or_mux_is_refused() -> None:
+    text = refused(sections="[[fault]]\nkind='stale'\ntile='T9'\nt_s=0\nduration_s=1")
+    assert "a fault names tile 'T9', but there are only T01, T02" in text
+    text = refused(sections="[[fault]]\nkind='brown_out'\nmux=0x77\nt_s=0\nduration_s=1")
+    assert "a fault names mux 0x77" in text
+
+
+@pytest.mark.parametrize("kind", get_args(FaultKind))
+def test_every_fault_has_a_target_of_its_kind(kind: str) -> None:
+    line = f"[[fault]]\nkind='{kind}'\nt_s=0\nduration_s=1\n"
+    targets = {"tile": "tile='T01'", "mux": "mux=0x70", "bus": ""}
+    bus = "sda_low sda_high scl_low adapter_timeout adapter_unplugged nack_storm bit_errors"
+    belongs_to = {
+        **dict.fromkeys(("brown_out", "mux_reset"), "mux"),
+        **dict.fromkeys((*bus.split(), *get_args(ServoFault)), "bus"),
+    }.get(kind, "tile")
+    if kind in get_args(ServoFault):
+        assert "there is no [servo]" in refused(sections=line)
+        line = "[servo]\n" + line
+    for target, key in targets.items():
+        if target == belongs_to:
+            fault = scene(sections=line + key).fault[0]
+            assert fault.target == {"tile": "T01", "mux": "0x70", "bus": "bus"}[target]
+        else:
+            assert kind in refused(sections=line + key)
+    assert kind in refused(sections=line + "tile='T01'\nmux=0x70")
+
+
+def test_a_foot_of_reference_tiles_alone_is_refused() -> None:
+    reference = "reference = true\n"
+    text = refused(tiles=tile("T01", more=reference) + tile("T02", channel="1", more=reference))
+    assert "bear load" in text
+    one_bears = tile("T01", more=reference) + tile("T02", channel="1")
+    assert [t.reference for t in scene(tiles=one_bears).tile] == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("head", "tiles", "sections", "parts"),
+    [
+        ("", '[[tile]]\nserial = "T01"\nmux = 112', "", ["key 'tile.0.channel' is missing"]),
+        ("", "", "", ["key 'tile' is missing"]),
+        ("tile = []", "", "", ["tile = []"]),
+        ("", None, "[ground]\nload_n = 3", ["ground", "kind"]),
+        ("", None, "[ground]\nkind = 'moon'", ["ground", "kind"]),
+    ],
+)
+def test_a_scene_without_a_tile_or_a_ground_without_a_kind_is_refused(
+    head: str, tiles: str | None, sections: str, parts: list[str]
+) -> None:
+    text = refused(head, tiles, sections)
+    assert all(part in text for part in parts)
+
+
+@pytest.mark.parametrize("name", ["", "two words", "a/b", "ü"])
+def test_a_name_of_no_file_is_refused(name: str) -> None:
+    with pytest.raises(SceneError, match="name = "):
+        parse_scene(f'name = "{name}"\n{tile()}', where="my.toml")
+
+
+def test_a_name_that_a_stream_cannot_hold_is_refused() -> None:
+    text = f"name = '{'n' * 200}'\n" + tile()
+    assert parse_scene(text, where="my.toml").name == "n" * 200
+    with pytest.raises(SceneError, match=r"name = .*200 characters"):
+        parse_scene(text.replace("'n", "'nn"), where="my.toml")
+
+
+@pytest.mark.parametrize("text", ["name = ", "[tile", "name: x", 'name = "a"\nname = "b"'])
+def test_a_text_that_is_no_toml_is_refused_with_its_place(text: str) -> None:
+    with pytest.raises(SceneError, match=r"my\.toml: not TOML: .*(line \d|end of)") as caught:
+        parse_scene(text, where="my.toml")
+    assert caught.value.exit_code == 2
+
+
+def test_a_path_without_a_text_is_refused(tmp_path: Path) -> None:
+    missing = str(tmp_path / "nowhere.toml")
+    with pytest.raises(SceneError, match=re.escape(missing)) as caught:
+        load_scene(missing)
+    assert "standing" in caught.value.expected
+    assert caught.value.exit_code == 2
+    (tmp_path / "scene.toml").write_bytes(b"name = \xff\xfe")
+    for path in (tmp_path / "scene.toml", tmp_path):
+        with pytest.raises(SceneError, match=re.escape(str(path))):
+            load_scene(str(path))
