@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +10,7 @@ from devices.acquisition import Acquisition
 from devices.array.schedules import BusTiming
 from devices.array.self_test import identify_tiles
 from devices.array.tile_array import TileArray
-from devices.buses.i2c import I2cAdapter, I2cBus, open_bus
+from devices.buses.i2c import I2cBus, open_bus
 from devices.clock import UtcAnchor, VirtualClock
 from devices.emulation.world import World
 from devices.frames import FrameBatch
@@ -56,13 +56,12 @@ def foot(
     scene: Scene,
     *,
     rate_hz: float = 0.0,
-    wrap: Callable[[I2cAdapter], I2cAdapter] = lambda adapter: adapter,
     schedule: ScheduleName = "simultaneous",
     start_ns: int = 3_000_000_000,
 ) -> Foot:
     clock = VirtualClock(start_ns)
     world = World(scene, clock, lead_s=0.0, begins_now=False)
-    array = array_of(open_bus("emulated", wrap(world.i2c_adapter)), scene.tile, clock, schedule)
+    array = array_of(open_bus("emulated", world.i2c_adapter), scene.tile, clock, schedule)
     for _ in range(SETTLED + 1):  # a tile without history is read twice
         array.scan_frame()
     world.begin_scene_time()
@@ -75,8 +74,11 @@ def array_of(
     tiles: Sequence[TileSection],
     clock: VirtualClock,
     schedule: ScheduleName = "simultaneous",
+    *,
+    wait_s: float = 1.6e-3,
     **options: Any,
 ) -> TileArray:
+    """Return an array of identified tiles."""
     found = identify_tiles(bus, tiles)
-    timing = BusTiming(400_000, (1.6e-3,) * len(found), tuple(tile.mux for tile in found))
+    timing = BusTiming(400_000, (wait_s,) * len(found), tuple(tile.mux for tile in found))
     return TileArray(bus, found, clock, schedule=schedule, timing=timing, **options)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from devices.emulation.fault_timing import FaultTiming, SceneFaults
@@ -25,14 +25,6 @@ def begun(*windows_s: tuple[float, float]) -> FaultTiming:
     return fault
 
 
-def test_a_fault_without_windows_is_never_active() -> None:
-    fault = FaultTiming()
-    fault.begin_scene_time(0)
-    assert not any(fault(t_ns) for t_ns in (-1, 0, 10**18))
-    assert not fault.was_active_between(-1, 10**18)
-    assert not fault.is_possible
-
-
 @settings(max_examples=60)
 @given(
     windows=st.lists(
@@ -42,6 +34,9 @@ def test_a_fault_without_windows_is_never_active() -> None:
     since_ns=st.integers(-10, 2100),
     passed_ns=st.integers(1, 500),
 )
+@example([], -1, 10**6)
+@example([(0, 5)], 5, 3)  # ended at the instant from which it is asked
+@example([(8, 9)], 5, 3)  # begun at the last one
 def test_a_fault_is_active_in_its_windows_only(
     windows: list[tuple[int, int]], since_ns: int, passed_ns: int
 ) -> None:
@@ -51,6 +46,7 @@ def test_a_fault_is_active_in_its_windows_only(
     assert fault(t_ns) == (t_ns in active)
     was_active = not active.isdisjoint(range(since_ns, t_ns + 1))
     assert fault.was_active_between(since_ns, t_ns) == was_active
+    assert fault.is_possible == bool(windows)
 
 
 def test_a_fault_of_the_first_instant_is_active_before_the_scene_begins_and_no_other() -> None:

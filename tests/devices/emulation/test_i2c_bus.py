@@ -18,6 +18,7 @@ from smbus2 import i2c_msg
 from devices.clock import VirtualClock
 from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
+from devices.emulation.fault_timing import FaultTiming
 from devices.emulation.i2c_bus import EmulatedI2cAdapter
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP
 
@@ -167,20 +168,6 @@ def test_a_transaction_takes_its_scl_periods_to_the_nanosecond(
     assert reader.clock.now_ns() - before_ns == periods * ns_per_period
 
 
-def test_a_conversion_begins_at_the_stop_of_its_convert() -> None:
-    sampled_ns: list[int] = []
-
-    def sample(t_ns: int) -> tuple[int, int]:
-        sampled_ns.append(t_ns)
-        return 410, 507
-
-    reader = alone(EmulatedMpl115a2(EmulatedPart(DATA_SHEET_CHIP, TC_NS, sample)))
-    begin_ns = reader.clock.now_ns()
-    reader.send(convert())
-    # 29 periods of 2.5 us to the STOP; sampled a quarter into the conversion (hardware.md 1.4)
-    assert sampled_ns == [begin_ns + 72_500 + TC_NS // 4]
-
-
 def test_a_message_object_can_be_used_again() -> None:
     samples = iter([(410, 507), (272, 521)])
     reader = alone(EmulatedMpl115a2(EmulatedPart(DATA_SHEET_CHIP, TC_NS, lambda _: next(samples))))
@@ -210,6 +197,7 @@ def test_a_select_takes_effect_at_the_stop_only() -> None:
     assert answer.hex() == "3eceb3f9c51733c8"
     assert reader.words() == FORUM_CHIP
     reader.send(select(0b01), select(0b10))
+    reader.send(i2c_msg.write(MUX, []))  # no byte, no mask
     assert reader.words() == FORUM_CHIP
     reader.send(select(0b01))
     reader.send(select(0b10), convert())
@@ -217,17 +205,6 @@ def test_a_select_takes_effect_at_the_stop_only() -> None:
     assert reader.counts() == (0, 0), "the new tile has not converted"
     reader.send(select(0b01))
     assert reader.counts() == (410, 507)
-
-
-def test_the_last_byte_written_to_a_mux_is_its_mask() -> None:
-    reader = Reader({MUX: {0: part(), 3: part(words=FORUM_CHIP)}, OTHER_MUX: {}})
-    # As SMBus write_byte_data does it: a register number first, which the part does not have.
-    reader.send(i2c_msg.write(MUX, [0b0000_0001, 0b0000_0010, 0b0000_1000]))
-    reader.send(i2c_msg.write(MUX, []))
-    reader.send(select(0x81, OTHER_MUX))
-    masks = [reader.send(i2c_msg.read(mux, 1)) for mux in (MUX, OTHER_MUX)]
-    assert masks == [b"\x08", b"\x81"]
-    assert reader.words() == FORUM_CHIP
 
 
 # Open drain
@@ -331,3 +308,100 @@ def test_a_data_byte_needs_the_acknowledge_of_one_device() -> None:
     adapter = EmulatedI2cAdapter(ports, VirtualClock(), 400_000)
     adapter.i2c_rdwr(i2c_msg.write(0x20, [1, 2]))
     assert [port.received for port in ports] == [["write", 1, 2, "stop"]] * 2
+
+
+# One emulated TCA9548A
+
+
+def tile() -> EmulatedMpl115a2:
+    return EmulatedMpl115a2(EmulatedPart((0, 0, 0, 0), 1_600_000, lambda _: (0, 0)))
+
+
+def write(mux: EmulatedTca9548a, *values: int) -> None:
+    assert mux.on_address(False, 0)
+    assert all(mux.receive_byte(value) for value in values)
+
+
+@given(before=st.integers(0, 255), after=st.binary(max_size=5), count=st.integers(0, 4))
+def test_the_last_byte_written_is_the_mask_from_the_stop_on(
+    before: int, after: bytes, count: int
+) -> None:
+    tiles = {channel: tile() for channel in range(7)}  # none on channel 7
+    mux = EmulatedTca9548a(0x70, tiles)
+
+    def connected(mask: int) -> list[EmulatedMpl115a2]:
+        return [t for c, t in tiles.items() if mask >> c & 1]
+
+    write(mux, before)
+    mux.on_stop(0)
+    # The part has no register numbers: SMBus write_byte_data leaves its last byte.
+    write(mux, *after)
+    assert mux.connected_mask == before
+    assert list(mux.get_connected_devices()) == connected(before)
+    mux.on_stop(0)
+    mask = after[-1] if after else before
+    for _ in range(2):  # a read and its STOP change nothing
+        assert mux.connected_mask == mask
+        assert list(mux.get_connected_devices()) == connected(mask)
+        mux.on_address(True, 0)
+        assert mux.send_bytes(count) == bytes([mask]) * count
+        mux.on_stop(0)
+
+
+# Faults
+
+
+def open_mux(**faults: tuple[int, int]) -> EmulatedTca9548a:
+    """Return a mux with channel 0 open and each fault in one interval of nanoseconds."""
+    timings = {
+        name: FaultTiming([(begin_ns * 1e-9, end_ns * 1e-9)])
+        for name, (begin_ns, end_ns) in faults.items()
+    }
+    for timing in timings.values():
+        timing.begin_scene_time(0)
+    mux = EmulatedTca9548a(0x70, {0: tile()}, timings.get("brown_out"), timings.get("mux_reset"))
+    write(mux, 1)
+    mux.on_stop(0)
+    return mux
+
+
+def test_a_mux_without_supply_is_silent_and_connects_nothing_afterwards() -> None:
+    mux = open_mux(brown_out=(100, 200))
+    mux.apply_faults(99)
+    assert mux.on_address(False, 99)
+    assert mux.connected_mask == 1
+    mux.apply_faults(100)
+    assert not mux.on_address(False, 100)
+    assert not mux.on_address(True, 199)
+    assert mux.connected_mask == 0
+    mux.apply_faults(200)
+    assert mux.on_address(True, 200)
+    assert (mux.connected_mask, mux.send_bytes(1)) == (0, b"\0")
+
+
+def test_a_brown_out_between_two_transfers_closes_all_channels() -> None:
+    mux = open_mux(brown_out=(100, 200))
+    mux.apply_faults(50)
+    mux.apply_faults(300)
+    assert mux.on_address(True, 300)
+    assert (mux.connected_mask, mux.send_bytes(1)) == (0, b"\0")
+
+
+def test_a_mux_can_be_opened_at_once_after_its_reset() -> None:
+    mux = open_mux(mux_reset=(100, 200))
+    mux.apply_faults(50)
+    mux.apply_faults(150)
+    assert mux.on_address(False, 150)
+    assert mux.connected_mask == 0
+    assert mux.receive_byte(1)
+    mux.on_stop(150)
+    mux.apply_faults(160)
+    assert mux.connected_mask == 1, "it is reset once"
+
+
+def test_the_reset_line_clears_a_mask_that_is_not_yet_in_force() -> None:
+    mux = EmulatedTca9548a(0x70, {0: tile()})
+    write(mux, 1)
+    mux.reset()
+    mux.on_stop(0)
+    assert mux.connected_mask == 0

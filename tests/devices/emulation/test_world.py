@@ -9,10 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 import pytest
-from smbus2 import i2c_msg
 
-from devices.array.schedules import BusTiming
-from devices.array.self_test import identify_tiles
 from devices.array.tile import Scan
 from devices.array.tile_array import TileArray
 from devices.buses.i2c import open_bus
@@ -24,6 +21,7 @@ from devices.errors import TileSetupError
 from devices.scene.scene_file import load_scene
 from tests.builders.scenes import make_scene
 from tests.devices.emulation.worlds import EPOCH_NS, TWO, identified, moved_to, switched_on
+from tests.devices.feet import array_of
 from tests.devices.rigs import ONE
 
 Floats = npt.NDArray[np.float64]
@@ -95,18 +93,16 @@ def test_a_reference_tile_reads_atmosphere_head_and_temperature_and_no_load() ->
 
 def test_a_replaced_part_is_another_one_of_the_same_kind() -> None:
     scene = moved_to(make_scene(TWO, emulation={"ambient_kpa": 89.9}), 1, reference=True)
-    world, array, clock = switched_on(scene)
+    world, before, clock = switched_on(scene)
     with world.inject_fault("replaced", "T02"):
         pass
-    bus = open_bus("emulated", world.i2c_adapter)
-    tiles = identify_tiles(bus, scene.tile)
-    assert tiles[0].coefficient_words == array.tiles[0].coefficient_words
+    after = array_of(open_bus("emulated", world.i2c_adapter), scene.tile, clock, wait_s=3e-3)
+    words = [tile.coefficient_words for tile in after.tiles]
+    assert words[0] == before.tiles[0].coefficient_words
     spare = draw_chip("T02.spare", 0).coefficients.to_words()
-    assert tiles[1].coefficient_words == spare != array.tiles[1].coefficient_words
-    timing = BusTiming(400_000, (3.0e-3, 3.0e-3), (0x70, 0x70))
-    array = TileArray(bus, tiles, clock, schedule="simultaneous", timing=timing)
-    scans = [array.scan_frame() for _ in range(3)]
-    assert compensate(array, scans)[-1, 1] == pytest.approx(89.9, abs=0.13)
+    assert words[1] == spare != before.tiles[1].coefficient_words
+    scans = [after.scan_frame() for _ in range(3)]
+    assert compensate(after, scans)[-1, 1] == pytest.approx(89.9, abs=0.13)
 
 
 def test_sixty_four_tiles_on_eight_muxes_are_found() -> None:
@@ -143,16 +139,6 @@ def test_without_load_there_is_no_centre_of_pressure() -> None:
     np.testing.assert_allclose(truth.true_cop_x_m[2:], expected, atol=1e-12)
     assert np.ptp(expected) > 0.005
     np.testing.assert_allclose(truth.true_cop_y_m[2:], 0.0, atol=1e-12)
-
-
-def test_the_force_of_a_rolling_foot_is_the_vertical_sum() -> None:
-    world, _, _ = switched_on(load_scene("rolling"), lead_s=0.0)
-    truth = world.compute_truth(at(0.7, 1.0, 1.5, 2.0))
-    np.testing.assert_allclose(truth.true_grf_n, 8.92, atol=1e-3)
-    # Forces along the domes' axes are never less than what they bear vertically.
-    assert (truth.true_force_n.sum(axis=1) >= truth.true_grf_n - 1e-9).all()
-    assert (np.diff(truth.true_cop_x_m) > 0).all()
-    assert (np.diff(truth.true_angle_rad) > 0).all()
 
 
 @pytest.mark.parametrize("protocol", [1, 2])
@@ -240,26 +226,6 @@ def test_a_fault_begins_with_the_scene_unless_it_is_there_from_the_first_instant
     assert array.scan_frame().tile_flags == [0, 0]
     with pytest.raises(TileSetupError, match="T01"):
         switched_on(make_scene(TWO, fault=[fault | {"t_s": 0.0}]), begins_now=False)
-
-
-def test_the_bus_is_as_fast_as_the_core_clock_allows() -> None:
-    # hardware.md 3.2: 250 kHz where 400 was asked for, 5/8
-    world, _, clock = switched_on(make_scene(ONE, emulation={"scl_part": 0.625}))
-    begin_ns = clock.now_ns()
-    world.i2c_adapter.i2c_rdwr(i2c_msg.write(0x70, [1]))
-    assert clock.now_ns() - begin_ns == 20 * 4_000
-
-
-def test_a_tile_over_its_range_reads_no_pressure_of_its_range() -> None:
-    world, array, _ = switched_on(make_scene(ONE))
-
-    def read_kpa() -> float:
-        return float(compensate(array, [array.scan_frame()])[0, 0])
-
-    assert 95 < read_kpa() < 105
-    with world.inject_fault("over_range", "T01"):
-        assert not 50 <= read_kpa() <= 115
-    assert 95 < read_kpa() < 105
 
 
 def test_a_punctured_dome_loses_its_gas_and_its_neighbour_does_not() -> None:

@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from devices.array.schedules import BusTiming
-from devices.array.self_test import identify_tiles
 from devices.array.tile_array import TileArray
 from devices.buses.i2c import open_bus
 from devices.clock import VirtualClock
 from devices.emulation.world import World
 from devices.frames import TileInfo
 from devices.scene.scene_file import Scene
+from tests.devices.feet import array_of
 from tests.devices.rigs import Plugs
 
 TWO: Plugs = ((0x70, 0), (0x70, 1))
@@ -26,12 +25,7 @@ def switched_on(scene: Scene, **options: Any) -> tuple[World, TileArray, Virtual
     clock = VirtualClock(EPOCH_NS)
     world = World(scene, clock, **options)
     bus = open_bus("emulated", world.i2c_adapter)
-    tiles = identify_tiles(bus, scene.tile)
-    timing = BusTiming(400_000, (3.0e-3,) * len(tiles), tuple(tile.mux for tile in tiles))
-    array = TileArray(
-        bus, tiles, clock, schedule="simultaneous", timing=timing, broadcast_channels=64
-    )
-    return world, array, clock
+    return world, array_of(bus, scene.tile, clock, wait_s=3e-3, broadcast_channels=64), clock
 
 
 def identified(scene: Scene, **options: Any) -> tuple[TileInfo, ...]:

@@ -6,7 +6,7 @@ import contextlib
 import os
 import struct
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -65,12 +65,16 @@ class Line:
 
 @contextlib.contextmanager
 def line_to(
-    counts: int = -5, *, protocol: int = 2, baudrate: int = 1_000_000, **options: Any
+    counts: int | Callable[[int], int] = -5,
+    *,
+    protocol: int = 2,
+    baudrate: int = 1_000_000,
+    **options: Any,
 ) -> Iterator[Line]:
+    """Open a line to a servo at these counts, which may be a function of the time in ns."""
     clock = VirtualClock(1_000)
-    with FaultyServo(
-        lambda _: counts, clock, protocol=protocol, baudrate=baudrate, **options
-    ) as servo:
+    position = counts if callable(counts) else lambda _: counts
+    with FaultyServo(position, clock, protocol=protocol, baudrate=baudrate, **options) as servo:
         line = Line(servo, clock, protocol, baudrate)
         with contextlib.closing(line.port):
             yield line
@@ -106,16 +110,13 @@ def test_the_control_table_has_the_settings_of_the_servo() -> None:
 
 
 def test_the_position_is_sampled_at_the_end_of_the_return_delay() -> None:
-    clock = VirtualClock(1_000)
-    with FaultyServo(lambda t_ns: t_ns, clock) as servo:
-        line = Line(servo, clock, 2, 1_000_000)
-        with contextlib.closing(line.port):
-            _, _, data = line.ask(READ_2)
-            assert struct.unpack("<i", data) == (1_000 + 140_000 + 500_000,)
-            assert clock.now_ns() == 1_000 + 140_000 + 500_000 + 150_000
-            _, _, high_half = line.ask(PROTOCOL_2.encode_read_request(1, 134, 2))
-            later = 1_000 + 790_000 + 640_000
-            assert high_half == struct.pack("<i", later)[2:]
+    with line_to(lambda t_ns: t_ns) as line:
+        _, _, data = line.ask(READ_2)
+        assert struct.unpack("<i", data) == (1_000 + 140_000 + 500_000,)
+        assert line.clock.now_ns() == 1_000 + 140_000 + 500_000 + 150_000
+        _, _, high_half = line.ask(PROTOCOL_2.encode_read_request(1, 134, 2))
+        later = 1_000 + 790_000 + 640_000
+        assert high_half == struct.pack("<i", later)[2:]
 
 
 def test_an_answer_of_protocol_1_takes_the_time_of_the_wire() -> None:
