@@ -97,6 +97,22 @@ class Spoken:
         return strip_text_crc(self._socket.recv(timeout=timeout))
 
 
+def make_hello(info: ArrayInfo, calibration: Calibration | None = None, **changes: Any) -> Hello:
+    """Return the hello of a node that has no frames yet."""
+    content: dict[str, Any] = {
+        "protocol": PROTOCOL,
+        "array_info": info,
+        "stored": (),
+        "next_seq": 0,
+        "t_mono_ns": 0,
+        "scene": {"name": "test"},
+        "emulated": False,
+        "calibration": calibration,
+        "calibration_problem": None if calibration else "for this test",
+    }
+    return Hello(**(content | changes))
+
+
 class FakeNode:
     """A node that says what a test has it say."""
 
@@ -161,18 +177,13 @@ class FakeNode:
         if calibration == "by hand":
             calibration = make_calibration(*self.info.serials)
         content: dict[str, Any] = {
-            "protocol": PROTOCOL,
-            "array_info": self.info,
             "stored": ((0, self.seq - 1),) if self.seq else (),
             "next_seq": self.seq,
             "t_mono_ns": time.monotonic_ns(),
             "t_ns_first": int(self.sent[0].t_ns[0]) if self.sent else 0,
-            "scene": {"name": "test"},
             "emulated": self.is_emulated,
-            "calibration": calibration,
-            "calibration_problem": None if calibration else "for this test",
         }
-        return Hello(**(content | changes))
+        return make_hello(self.info, calibration, **(content | changes))
 
     def connect(self, **changes: Any) -> list[tuple[int, int | None]]:
         """Connect and say hello, then how the clocks differ; gives what the server lacks."""
@@ -352,6 +363,15 @@ class FakeNode:
     def taken_in(self) -> None:
         """Wait until the server has the newest frame, be it on its disk or not."""
         until(lambda: self.running.node(self.name)["last_seq"] == self.seq - 1)
+
+    def record_sealed(
+        self, n: int, force_n: float | Sequence[float] = 0.0, **how: Any
+    ) -> Recording:
+        """Record some frames, and seal the session."""
+        recording = self.record()
+        self.deliver(n, force_n, **how)
+        self.finish(recording)
+        return recording
 
     def finish(self, recording: Recording) -> dict[str, Any]:
         """Stop a session, send frames of after the stop, and wait until it is sealed.

@@ -21,16 +21,18 @@ if TYPE_CHECKING:
     from tests.service.running import Running
 
 
-def read_table(answer: httpx.Response, to: str) -> pa.Table:
-    """Read a download in one of the formats of tables."""
-    assert answer.status_code == 200, answer.text
+def read_table(content: httpx.Response | bytes, to: str) -> pa.Table:
+    """Read a file or a download in one of the formats of tables."""
+    if isinstance(content, httpx.Response):
+        assert content.status_code == 200, content.text
+        content = content.content
     match to:
         case "parquet":
-            return pq.read_table(io.BytesIO(answer.content))
+            return pq.read_table(io.BytesIO(content))
         case "arrow":
-            return pa.ipc.open_file(answer.content).read_all()
+            return pa.ipc.open_file(content).read_all()
         case _:
-            return pacsv.read_csv(io.BytesIO(answer.content))
+            return pacsv.read_csv(io.BytesIO(content))
 
 
 @dataclass(frozen=True)

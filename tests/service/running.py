@@ -48,6 +48,12 @@ def assert_refused(answer: httpx.Response, status: int, *words: str) -> None:
         assert word in answer.json()["detail"]
 
 
+def content_of(answer: httpx.Response, status: int = 200) -> Any:
+    """Check the status of an answer and return its JSON."""
+    assert answer.status_code == status, answer.text
+    return answer.json()
+
+
 def receive_live(socket: Any, is_wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
     """Return the next live message that is wanted; others come all the time."""
     end_s = time.monotonic() + PATIENCE_S

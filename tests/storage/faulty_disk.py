@@ -7,6 +7,7 @@ import os
 import resource
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, NoReturn
 
 import pytest
@@ -66,3 +67,10 @@ def before_each_sync_of_frames(monkeypatch: pytest.MonkeyPatch, act: Callable[[]
         real(descriptor)
 
     monkeypatch.setattr(os, "fsync", fsync)
+
+
+def flip_byte(path: Path, at: float = 0.5, bits: int = 1) -> None:
+    """Change a byte of a file: that of this number, or at this part of its length."""
+    content = bytearray(path.read_bytes())
+    content[at if isinstance(at, int) else int(len(content) * at)] ^= bits
+    path.write_bytes(content)

@@ -19,6 +19,11 @@ class Outcome:
     out: str
     err: str
 
+    def succeeds(self) -> Outcome:
+        """Check that the exit code is 0."""
+        assert self.code == 0, self.err
+        return self
+
     def printed(self, code: int = 0) -> Any:
         """Check the exit code and return the printed JSON."""
         assert self.code == code, self.err
