@@ -58,8 +58,7 @@ def simulate(run: Run, tmp_path: Path, bench_cache: Path) -> Simulate:
             file = made.with_suffix(".toml")
             file.write_text(scene)
             source = file if "\n" in scene else scene
-            outcome = run("simulate", "--scene", source, *options, "--out", made)
-            assert outcome.code == 0, outcome.err
+            run("simulate", "--scene", source, *options, "--out", made).succeeds()
             made.rename(kept)
         return Path(shutil.copy(kept, tmp_path / name))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import httpx
@@ -14,8 +15,11 @@ from service.api import address as interfaces
 from service.api.logins import Logins, Role
 from service.cli.commands.serve import print_addresses
 from service.cli.tickets import make_qr_lines, remark_unreachable
-from tests.service.cli.outcome import Run
-from tests.service.running import ServeWith
+from service.node_identity import compute_fingerprint
+from tests.service.cli.outcome import Outcome, Run
+from tests.service.fake_node import FakeNode, NodeOf
+from tests.service.running import Running, ServeWith, closed
+from tests.service.strangers import answer_of, portal, tls_before
 
 TOKEN = "a-token-of-this-test"  # noqa: S105  # of this test
 AWAY = "http://192.168.4.1:8000"
@@ -137,8 +141,7 @@ def test_ticket_prints_an_address_that_lets_in_who_opens_it(
     running = serve_with(token=TOKEN)
     (tmp_path / "token").write_text(TOKEN + "\n")
     monkeypatch.delenv("FOOTTILE_TOKEN", raising=False)
-    done = run("invite", "--server", running.url, "--data", str(tmp_path), *option)
-    assert done.code == 0, done.err
+    done = run("invite", "--server", running.url, "--data", str(tmp_path), *option).succeeds()
     address, _, ticket = done.out.strip().partition("#ticket=")
     assert address == running.url + "/"
     assert "--host 0.0.0.0" in done.err
@@ -175,3 +178,90 @@ def test_a_private_server_is_read_with_its_token(
     assert "private" in refused.err
     monkeypatch.setenv("FOOTTILE_TOKEN", TOKEN)
     assert run("sessions", "--server", running.url).code == 0
+
+
+# --- certificates, and strangers that answer ------------------------------------------------------
+
+
+COMMANDS = (
+    (("sessions",), ""),
+    (("invite",), ""),
+    (("stream", "nobody"), "nobody"),
+    (("pull", "20200101T000000Z-000000", "--out", "."), "20200101T000000Z-000000"),
+)
+
+
+@pytest.mark.parametrize(("words", "unknown"), COMMANDS)
+def test_a_ca_is_named_with_an_option(
+    serve_with: ServeWith,
+    run: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    words: tuple[str, ...],
+    unknown: str,
+) -> None:
+    monkeypatch.setenv("FOOTTILE_TOKEN", TOKEN)
+    with tls_before(serve_with(token=TOKEN).port, tmp_path / "tls") as url:
+        refused = run(*words, "--server", url)
+        assert refused.code == 1
+        assert "--ca" in refused.err
+        trusted = run(*words, "--server", url, "--ca", tmp_path / "tls" / "ca.pem")
+    assert unknown in trusted.err
+    assert "certificate" not in trusted.err
+    assert (trusted.code == 0) is not bool(unknown), trusted.err
+
+
+@pytest.mark.parametrize(("words", "_unknown"), COMMANDS)
+def test_a_login_page_is_an_error_of_one_line(
+    run: Run, words: tuple[str, ...], _unknown: str
+) -> None:
+    with portal(answer_of("302 Found", "Location: http://portal.example/login")) as url:
+        done = run(*words, "--server", url)
+    assert done.code == 1
+    assert len(done.err.splitlines()) == 1
+    assert "portal.example/login" in done.err
+
+
+# --- machines of nodes ----------------------------------------------------------------------------
+
+
+Accept = Callable[..., Outcome]
+
+
+@pytest.fixture
+def accept(run: Run, running: Running) -> Accept:
+    return lambda *arguments: run("accept-node", *arguments, "--server", running.url)
+
+
+@pytest.fixture
+def stranger(running: Running, node: FakeNode, node_of: NodeOf) -> FakeNode:
+    """Another machine, that was refused."""
+    node.connect()
+    node.leave()
+    stranger = node_of(running)
+    stranger.prove(secret=stranger.secret, proof=None)
+    stranger.socket.send(stranger.hello().model_dump_json())
+    assert closed(stranger.socket)[0] == 4013
+    return stranger
+
+
+def test_the_machine_that_asked_last_is_accepted_and_named(
+    accept: Accept, stranger: FakeNode
+) -> None:
+    assert stranger.secret is not None
+    outcome = accept("bench")
+    assert (outcome.code, outcome.err) == (0, "")
+    assert compute_fingerprint(stranger.secret) in outcome.out
+    stranger.connect()
+
+
+def test_a_machine_with_another_fingerprint_or_that_did_not_ask_is_refused(
+    accept: Accept, stranger: FakeNode
+) -> None:
+    other = accept("bench", "--fingerprint", "0000-0000-0000-0000")
+    other.fails(1, "another machine was refused as 'bench' meanwhile")
+    stranger.open_with_hello()
+    assert closed(stranger.socket)[0] == 4013
+    assert accept("bench").code == 0
+    accept("bench").fails(1, "no other machine asks to connect as 'bench'")
+    accept("nobody").fails(1, "no node 'nobody'")

@@ -15,8 +15,11 @@ from typing import Any, Union, get_args, get_origin
 
 import pytest
 
+from devices.errors import StorageError
+from service.cli import commands
 from service.cli.main import SUMMARIES, get_command_function
 from service.cli.options import FootOptions
+from storage.permissions import set_umask_and_create_private_folder
 from tests.service.cli.outcome import Outcome, Run
 
 NUMBERS = ("nan", "inf", "-inf", "-1", "1e308", str(10**30))
@@ -153,6 +156,7 @@ PLACES: dict[str, Callable[[Path], object]] = {
     "pipe": os.mkfifo,
     "socket": listening,
     "loop": lambda path: path.symlink_to(path),
+    "nowhere": lambda path: path.symlink_to("nothing here"),
     "empty": lambda path: path.write_bytes(b""),
     "junk": lambda path: path.write_bytes(bytes(range(256)) * 40),
     "hole": lambda path: truncated(path, 1 << 40),
@@ -185,19 +189,16 @@ READ: dict[tuple[str, str], tuple[object, ...]] = {
     ("simulate", "load"): ("--scene", "standing", "--load", "{}"),
     ("verify", "targets"): ("{}",),
     ("verify", "manifest"): ("--manifest", "{}"),
-    ("accept-node", "ca"): ("bench", "--server", "https://127.0.0.1:1", "--ca", "{}"),
     ("calibrate", "ca"): (
         *("--live", "--tile", "T01", "--out", "cal.json"),
         *("--server", "https://127.0.0.1:1", "--ca", "{}"),
     ),
     ("node", "ca"): ("--scene", "standing", "--server", "https://127.0.0.1:1", "--ca", "{}"),
-    ("pull", "ca"): (
-        *("20200101T000000Z-000000", "--out", "x", "--server", "https://127.0.0.1:1"),
-        *("--ca", "{}"),
-    ),
     ("sessions", "ca"): ("--server", "https://127.0.0.1:1", "--ca", "{}"),
-    ("stream", "ca"): ("bench", "--server", "https://127.0.0.1:1", "--ca", "{}"),
-    ("invite", "ca"): ("--server", "https://127.0.0.1:1", "--ca", "{}"),
+    **{
+        (command, "ca"): (*COMMANDS[command], "--server", "https://127.0.0.1:1", "--ca", "{}")
+        for command in ("accept-node", "pull", "stream", "invite")
+    },
 }
 WRITTEN: dict[tuple[str, str], tuple[object, ...]] = {
     ("calibrate", "out"): ("s.parquet", "--out", "{}"),
@@ -274,3 +275,77 @@ def test_a_file_in_the_place_of_a_folder_is_refused_in_a_sentence(
 
 def test_an_option_is_passed_on_by_its_name_on_the_command_line() -> None:
     assert "--map=grf_n=force" in FootOptions(map_="grf_n=force").to_arguments()
+
+
+# --- paths that are not UTF-8 ---------------------------------------------------------------------
+
+
+ODD = "odd\udcff"
+
+
+@pytest.mark.parametrize("command", SUMMARIES)
+def test_every_command_refuses_an_argument_and_a_working_folder(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    arguments = COMMANDS[command]
+    refused = run(command, *arguments, ODD)
+    refused.fails(2, "not UTF-8", "odd\\udcff")
+    assert refused.err.count("\n") == 1
+    (tmp_path / ODD).mkdir()
+    monkeypatch.chdir(tmp_path / ODD)
+    run(command, *arguments).fails(2, "the working folder is not UTF-8")
+    assert list((tmp_path / ODD).iterdir()) == []
+
+
+def test_a_folder_of_a_variable_is_refused(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", f"/nowhere/{ODD}")
+    run("sessions", "--data", ".").fails(2, "XDG_DATA_HOME is not UTF-8")
+
+
+def test_no_server_or_node_begins_to_write_in_such_a_folder(tmp_path: Path) -> None:
+    umask = os.umask(0o022)
+    os.umask(umask)
+    with pytest.raises(StorageError, match="not UTF-8"):
+        set_umask_and_create_private_folder(tmp_path / ODD)
+    assert list(tmp_path.iterdir()) == []
+    assert os.umask(umask) == umask
+
+
+def test_a_session_in_such_a_folder_is_named_among_many(run: Run, tmp_path: Path) -> None:
+    for name in ("one", ODD):
+        (tmp_path / "all" / name).mkdir(parents=True)
+        (tmp_path / "all" / name / "session.json").write_text("{}")
+    outcome = run("verify", "all", "--jobs", 1, "--out", "out")
+    outcome.fails(1, "all/odd\\udcff: the path is not UTF-8")
+    assert outcome.err.count("not UTF-8") == 1
+
+
+# --- the table of commands ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SUMMARIES)
+def test_a_summary_is_the_first_sentence_of_its_command(name: str) -> None:
+    said = inspect.getdoc(get_command_function(name))
+    assert said is not None
+    assert said.replace("\n", " ").startswith(SUMMARIES[name])
+    assert SUMMARIES[name].endswith(".")
+    assert SUMMARIES[name][:-1].count(". ") == 0
+
+
+def test_every_command_that_is_written_is_in_the_table() -> None:
+    folder = Path(inspect.getfile(commands)).parent
+    written = {
+        line.removeprefix("def ").split("_command(")[0].replace("_", "-")
+        for path in folder.glob("*.py")
+        for line in path.read_text().splitlines()
+        if line.startswith("def ") and "_command(" in line
+    }
+    assert written == set(SUMMARIES)
+
+
+def test_the_help_of_all_names_each_with_its_summary_and_that_of_one_is_its_own(run: Run) -> None:
+    said = run("--help").out
+    for name, summary in SUMMARIES.items():
+        assert f"  {name} " in said
+        assert summary[:30] in said
+    assert "--family" in run("benchmark", "--help").out

@@ -12,7 +12,11 @@ from devices.errors import FootTileError
 from service.estimation.calibration import Calibration
 from service.offline.calibration_lookup import find_calibration
 from studies.benchmark import draws
+from studies.broad import arrays as run
+from studies.broad.arrays import ArrayTask
+from studies.broad.results import ArrayResult, RefusedItem
 from tests.service.cli.outcome import Run, scene_text, static_only
+from tests.studies.broad.kept import made
 
 pytestmark = pytest.mark.slow
 
@@ -89,26 +93,6 @@ def test_a_scene_of_which_no_draw_can_be_used_leaves_nothing_behind(
     assert not (tmp_path / "o").exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (("--scene", "nowhere"), "nowhere"),
-        (("--scene", "rolling", "--scene", "rolling"), "each scene once"),
-        (("--scene", "rolling", "--seconds", "0"), "--seconds 0"),
-        (("--scene", "rolling", "--draws", "0"), "draws"),
-    ],
-)
-def test_absurd_arguments_are_refused_at_once(
-    run: Run, arguments: tuple[object, ...], says: str
-) -> None:
-    run("benchmark", *arguments, "--out", "o").fails(2, says)
-
-
-def test_a_scene_of_real_hardware_is_refused(run: Run, scene: Path) -> None:
-    scene.write_text(scene.read_text() + '\n[array]\nbus = "/dev/i2c-1"\n')
-    run("benchmark", "--scene", scene, "--out", "o").fails(2, "only emulates")
-
-
 def test_a_missing_matplotlib_is_named_with_the_extra_that_brings_it(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -117,3 +101,47 @@ def test_a_missing_matplotlib_is_named_with_the_extra_that_brings_it(
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     outcome = run("benchmark", "--scene", "rolling", "--out", "o")
     outcome.fails(2, "pip install 'foottile[plot]'")
+
+
+# --- broad family ---------------------------------------------------------------------------------
+
+
+BROAD = ("benchmark", "--family", "broad", "--draws", 3, "--jobs", 1, "--out", "o")
+
+
+def test_broad_writes_json_tables_and_plot(run: Run, tmp_path: Path, quick: None) -> None:
+    outcome = run(*BROAD, "--json")
+    outcome.fails(0, "2 arrays of about 30 s CPU each")
+    content = json.loads((tmp_path / "o" / "broad.json").read_text())
+    assert json.loads(outcome.out) == content
+    assert (content["seeds"], content["arrays"]) == ("development", 3)
+    assert len(content["results"]) == 3
+    text = (tmp_path / "o" / "broad.md").read_text()
+    assert "3 arrays of four tiles of the broad family, seeds of development" in text
+    assert "an emulated foot" in text
+    assert (tmp_path / "o" / "broad.png").read_bytes().startswith(b"\x89PNG")
+    assert len(list((tmp_path / "o" / "arrays").iterdir())) == 3
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "run_array", made)
+
+
+def test_seeds_of_judgement_have_to_be_asked_for(run: Run, tmp_path: Path, quick: None) -> None:
+    run(*BROAD, "--seeds", "judgement").fails(0)
+    assert "seeds of judgement" in (tmp_path / "o" / "broad.md").read_text()
+
+
+def test_a_draw_without_a_result_is_named_with_exit_code_3(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from studies.broad import arrays as broad_run
+
+    def refused(task: ArrayTask) -> ArrayResult:
+        refusal = RefusedItem(what="calibration of T02", why="it drifts")
+        return made(task).model_copy(update={"judged": {}, "refusals": (refusal,)})
+
+    monkeypatch.setattr(broad_run, "run_array", refused)
+    run(*BROAD).fails(3, "no result: array 2, calibration of T02: it drifts")
+    assert "| 2 | calibration of T02 |  | it drifts |" in (tmp_path / "o" / "broad.md").read_text()

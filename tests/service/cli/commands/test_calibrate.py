@@ -10,8 +10,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from service.offline.calibration_lookup import find_calibration
-from service.sessions.calibration_file import write_calibration
 from tests.service.cli.outcome import Run, Simulate, short_rig
 from tests.storage.sessions.session_files import rewritten
 
@@ -26,8 +24,7 @@ def test_several_files_of_a_tile_are_merged_in_a_table_for_a_narrow_terminal(
     monkeypatch.setenv("COLUMNS", "80")
     reference = "load cell [/dev/ttyUSB0]"
     options = ("--out", "cal.json", "--sensor", reference)
-    outcome = run("calibrate", "1.parquet", "2.parquet", *options)
-    assert outcome.code == 0, outcome.err
+    outcome = run("calibrate", "1.parquet", "2.parquet", *options).succeeds()
     assert "4 in 2" in outcome.out
     assert reference in outcome.out, "brackets are no markup"
     assert "…" not in outcome.out
@@ -51,19 +48,6 @@ def test_files_that_do_not_go_together_are_refused(run: Run, simulate: Simulate)
     light = run("calibrate", "light.parquet", "--out", "cal.json", "--plot", "cal.png")
     light.fails(1, "never loads the tile", "T01")
     assert not [*Path().glob("cal.*")]
-
-
-def test_a_calibration_of_another_part_with_the_same_serial_is_refused(
-    run: Run, simulate: Simulate
-) -> None:
-    write_calibration(Path("cal.json"), find_calibration("emulated-rig", ["T01"]))
-    arguments = ("--calibration", "cal.json", "--out", "e.parquet")
-    for name, parts_seed in (("same.parquet", 0), ("other.parquet", 9)):
-        parts = ("--tiles", "T01", "--parts-seed", parts_seed, "--seconds", 3)
-        simulate(name, short_rig(), *parts)
-    assert run("estimate", "same.parquet", *arguments).code == 0
-    refused = run("estimate", "other.parquet", *arguments)
-    refused.fails(1, "T01 is not the part that was calibrated")
 
 
 def test_a_tile_without_a_curve_is_named_and_the_others_are_written(run: Run, bench: Path) -> None:

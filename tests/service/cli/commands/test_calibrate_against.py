@@ -39,8 +39,7 @@ def test_a_gain_in_situ_makes_newtons_of_an_assumed_curve_those_of_the_plate(
     assert "the plate's gain is assumed exact" in said.err
     assert set(found["gains"]) == {"T01", "T02", "T03", "T04"}
     assert found["mae_after_n"] < 0.8 * found["mae_before_n"]
-    again = run("estimate", session, "--calibration", "cal.json", "--out", "mounted.parquet")
-    assert again.code == 0, again.err
+    run("estimate", session, "--calibration", "cal.json", "--out", "mounted.parquet").succeeds()
     run("compare", "mounted.parquet", "--reference", plate, *LAG, "--remove-offset", "--out", "c")
     compared = json.loads(Path("c/compare.json").read_text())
     assert abs(compared["figures"]["grf_mae_n"]["mean"] - found["mae_after_n"]) < 0.2
@@ -75,24 +74,3 @@ def test_a_shear_that_three_hops_do_not_determine_is_refused_and_nothing_is_writ
     asked = ("calibrate", session, "--reference", plate, "--out", "cal.json", *LAG, "--shear")
     run(*asked).fails(1, "does not determine the shear")
     assert not Path("cal.json").exists()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (("--per-tile",), "no"),
-        (("--shear",), "no"),
-        (("--map", "grf_n=Fz"), "no"),
-        (("--reference-gain-sigma", 0.1), "no"),
-    ],
-)
-def test_options_of_a_plate_need_a_plate(
-    run: Run, session: Path, arguments: tuple[object, ...], says: str
-) -> None:
-    run("calibrate", session, "--out", "cal.json", *arguments).fails(2, "--reference")
-
-
-def test_a_plate_goes_with_one_session_and_no_plot(run: Run, session: Path, plate: Path) -> None:
-    both = ("calibrate", session, session, "--reference", plate, "--out", "cal.json")
-    run(*both).fails(2, "one session")
-    run("calibrate", session, "--reference", plate, "--out", "c.json", "--plot", "c.png").fails(2)

@@ -144,21 +144,6 @@ def test_the_command_guides_through_the_weights_and_writes_the_calibration(
     assert session["id"] in outcome.err
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (("--live",), "--live goes with --tile"),
-        (("--tile", "T01"), "no recording is named"),
-        (("x.parquet", "--tile", "T01"), "go with --live"),
-        (("--live", "--tile", "T01", "--weights", "200g,much"), "'much' is no weight"),
-    ],
-)
-def test_options_that_exclude_each_other_are_refused(
-    run: Run, arguments: tuple[str, ...], says: str
-) -> None:
-    run("calibrate", *arguments, "--out", "cal.json").fails(2, says)
-
-
 def test_a_calibration_that_a_node_cannot_use_is_refused_before_the_weights(
     run: Run, running: Running, tared: FakeNode
 ) -> None:

@@ -5,14 +5,19 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from devices.errors import CalibrationError
+from service.offline.estimate import preparation
 from service.offline.simulation import START_NS
 from storage.schema import ESTIMATE_COLUMNS, MEASURED_COLUMNS, TRUTH_COLUMNS, Column
+from storage.sessions.reader import SealedFileReader
 from tests.service.cli.outcome import Run, Simulate, faulty, scene_text, short_rig, static_only
+from tests.storage.faulty_disk import flip_byte
 
 pytestmark = pytest.mark.slow
 
@@ -31,8 +36,7 @@ ROLLING = ("rolling", "--seconds", 2, "--truth")
 def test_the_same_seed_gives_the_same_bytes(run: Run, simulate: Simulate) -> None:
     rolling = simulate("kept.parquet", *ROLLING).read_bytes()
     for seed, is_same in ((0, True), (6, False)):
-        outcome = run("simulate", "--scene", *ROLLING, "--seed", seed, "--out", "s.parquet")
-        assert outcome.code == 0, outcome.err
+        run("simulate", "--scene", *ROLLING, "--seed", seed, "--out", "s.parquet").succeeds()
         assert (Path("s.parquet").read_bytes() == rolling) == is_same
 
 
@@ -117,12 +121,11 @@ def test_measured_jumps_stay_within_the_papers_errors_and_omitted_models_are_nam
 def test_measured_walking_is_pressed_cell_by_cell(
     run: Run, recording: Callable[[str], Path], tmp_path: Path
 ) -> None:
-    outcome = run(
+    run(
         *("simulate", "--scene", "insole", "--load", recording("insole_walk_left.csv")),
         *("--load-scale", 0.05, "--truth", "--no-estimates"),
         *("--seconds", 4, "--out", "walk.parquet"),
-    )
-    assert outcome.code == 0, outcome.err
+    ).succeeds()
     table = pq.read_table(tmp_path / "walk.parquet")
     t_ns = table["t_ns"].to_numpy() - START_NS
     t_s = t_ns * 1e-9 - 1.01  # lead, and the touch-down before row 1
@@ -184,8 +187,7 @@ def test_a_tile_with_a_wrapped_count_gives_a_lower_bound_and_no_light_touch(
     assert (table["force_n_0"].to_numpy()[pressed] > 15.0).all()  # as creep may have left it
     assert np.isnan(table["force_sigma_n_0"].to_numpy()[pressed]).all()
     # Without the model it is no force at all.
-    outcome = run("estimate", "s.parquet", "--models", "static", "--out", "e.parquet")
-    assert outcome.code == 0, outcome.err
+    run("estimate", "s.parquet", "--models", "static", "--out", "e.parquet").succeeds()
     assert np.isnan(pq.read_table(tmp_path / "e.parquet")["force_n_0"].to_numpy()[wrapped]).all()
 
 
@@ -216,3 +218,77 @@ def test_faults_of_tiles_are_counted_and_named_on_the_terminal(run: Run) -> None
     assert {"T02"} <= set(printed["flags"]) <= {"T02", "T03"}
     # Half a second, and until it is found again.
     assert 0.45 < printed["flags"]["T02"]["no_answer"] / printed["rate_hz"] < 0.9
+
+
+# --- estimated again ------------------------------------------------------------------------------
+
+
+def test_another_look_ahead_is_stated_with_what_it_changes(run: Run) -> None:
+    preset = 'calibration = "paper-eq2-shape"\n'
+    Path("small.toml").write_text(preset + static_only(scene_text("rolling", 2)))
+    made = ("--scene", "small.toml", "--seconds", 4)
+    assert run("simulate", *made, "--out", "s.parquet").code == 0
+    same = run("estimate", "s.parquet", "--out", "same.parquet", "--json").printed()["change"]
+    outcome = run("estimate", "s.parquet", "--lag-ms", 0, "--out", "other").succeeds()
+    assert "look-ahead 0 ms (before: 100 ms)" in outcome.out
+    assert "other.parquet: " in outcome.out
+    assert same["lag_before_ms"] == 100.0
+    assert (same["grf_most_n"], same["contact_frames"]) == (0.0, 0)
+    other = run("estimate", "other.parquet", "--out", "again.parquet", "--json").printed()["change"]
+    assert other["lag_before_ms"] == 0.0
+    assert other["grf_rms_n"] > 0.0 or other["contact_frames"] > 0
+    assert pq.read_metadata("other.parquet").num_rows == same["frames"]
+
+
+def test_a_part_with_damaged_estimates_is_estimated_again(run: Run) -> None:
+    preset = 'calibration = "paper-eq2-shape"\n'
+    Path("small.toml").write_text(preset + static_only(scene_text("standing", 1)))
+    assert run("simulate", "--scene", "small.toml", "--seconds", 3, "--out", "s.parquet").code == 0
+    group = pq.read_metadata("s.parquet").row_group(0)
+    (grf,) = (c for c in map(group.column, range(group.num_columns)) if c.path_in_schema == "grf_n")
+    at = grf.data_page_offset + grf.total_compressed_size // 2
+    flip_byte(Path("s.parquet"), at, 0xFF)
+    outcome = run(
+        "estimate", "s.parquet", "--end-s", 2, "--out", "part.parquet", "--json"
+    ).succeeds()
+    assert outcome.printed()["change"] is None
+    with SealedFileReader(Path("part.parquet")) as part:
+        assert part.has_columns("grf_n")
+
+
+@pytest.mark.parametrize("family", ["default", "broad"])
+def test_a_session_is_estimated_with_a_bench_of_its_own_family(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, family: str
+) -> None:
+    asked: list[Any] = []
+
+    def no_bench(*_: object, **options: Any) -> object:
+        asked.append((options["family"], options["parts_seed"]))
+        raise CalibrationError("no bench here")
+
+    monkeypatch.setattr(preparation, "find_calibration", no_bench)
+    scene = tmp_path / "family.toml"
+    scene.write_text(scene_text("standing") + f'\n[emulation]\nfamily = "{family}"\n')
+    simulate = ("simulate", "--scene", scene, "--seconds", 0.5, "--parts-seed", 5)
+    run(*simulate, "--no-estimates", "--out", "s.parquet").fails(0)
+    again = ("estimate", "s.parquet", "--calibration", "emulated-rig", "--out", "e.parquet")
+    run(*again).fails(1, "no bench here")
+    assert asked == [(family, 5)]
+
+
+def test_files_of_a_plate_are_named_with_the_injected_truth(run: Run, tmp_path: Path) -> None:
+    asked = ("--scene", "standing", "--seconds", "1.5", "--no-estimates", "--force-plate", "fp.csv")
+    done = run("simulate", *asked).succeeds()
+    assert "fp.csv: the force plate; fp.injected.json: what was injected" in done.out
+    assert "instrument" in json.loads((tmp_path / "fp.injected.json").read_text())
+    assert run("simulate", *asked, "--json").printed()["plates"] == ["fp.csv"]
+
+
+def test_domes_names_one_for_a_load_and_marks_estimates(run: Run) -> None:
+    outcome = run("domes", "--load-n", 24)
+    assert outcome.code == 0
+    assert "For 24 N: v60-11 (paper)." in outcome.out
+    assert outcome.out.count("estimate ") >= 5
+    assert run("domes", "--load-n", 50).code == 3
+    printed = json.loads(run("domes", "--load-n", 30, "--json").out)
+    assert (printed["dome"], printed["verdict"]) == ("v60-11", "perhaps")

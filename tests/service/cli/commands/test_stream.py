@@ -64,21 +64,17 @@ def test_a_stream_without_a_reader_ends_without_a_message(
         assert process.stderr.read() == b""
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "line"),
-    [
-        (("ankle",), 2, "no node 'ankle'"),
-        (("bench", "--columns", "grf_n_sigma"), 2, "did you mean 'grf_sigma_n'?"),
-        (("bench", "--format", "xml"), 2, "expected csv or jsonl"),
-        (("--server", "http://127.0.0.1:1"), 1, "no answer"),
-    ],
-)
 def test_a_wrong_request_ends_with_one_line_and_a_code(
-    running: Running, tared: FakeNode, run: Run, arguments: tuple[str, ...], code: int, line: str
+    running: Running, tared: FakeNode, run: Run
 ) -> None:
-    outcome = run("stream", "--server", running.url, *arguments)
-    outcome.fails(code, line)
-    assert len(outcome.err.splitlines()) == 1
+    for arguments, line in (
+        (("ankle",), "no node 'ankle'"),
+        (("bench", "--columns", "grf_n_sigma"), "did you mean 'grf_sigma_n'?"),
+        (("bench", "--format", "xml"), "expected csv or jsonl"),
+    ):
+        outcome = run("stream", "--server", running.url, *arguments)
+        outcome.fails(2, line)
+        assert len(outcome.err.splitlines()) == 1
 
 
 @pytest.mark.parametrize(

@@ -25,12 +25,10 @@ def test_a_take_is_pulled_and_exported_by_its_id(
     frames_of_long_ago(monkeypatch)
     take = Take(running, [node_of(running, name) for name in ("right", "left")]).sealed()
     url, name = take.running.url, f"take-{take.id}_0s-end"
-    pulled = run("pull", "--take", take.id, "--format", "xdf", "--out", "here", "--server", url)
-    assert pulled.code == 0, pulled.err
+    run("pull", "--take", take.id, "--format", "xdf", "--out", "here", "--server", url).succeeds()
     assert len(said_in("xdf", (tmp_path / "here" / f"{name}.xdf").read_bytes())) == 2
     wanted = ("--format", "opensim", "--out", "x.zip", "--data", str(take.running.data))
-    exported = run("export", "--take", take.id, *wanted)
-    assert exported.code == 0, exported.err
+    run("export", "--take", take.id, *wanted).succeeds()
     said = said_in("opensim", (tmp_path / "x.zip").read_bytes())
     assert [each["node"] for each in said] == ["left", "right"]
     for arguments, why in (
