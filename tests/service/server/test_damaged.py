@@ -183,19 +183,18 @@ def test_a_server_starts_beside_a_lock_and_a_probe_that_are_no_files(
     assert running.http.get("/ready").status_code == 200
 
 
-@pytest.mark.parametrize("odd", ["\x1b[31mred", "\udcff", "two\nlines", "\u202eoverridden"])
-def test_a_problem_of_any_file_name_is_printable(
-    running: Running, tared: FakeNode, odd: str
-) -> None:
+def test_a_problem_of_any_file_name_is_printable(running: Running, tared: FakeNode) -> None:
     running.stop()
     journal = running.data / "journal" / "bench" / tared.stream_id
-    (journal / f"{odd}.arrows").mkdir()
-    (running.data / "nodes" / odd).mkdir()
-    write_checksummed_json(running.data / "nodes" / odd / "hello.json", b'{"a": 1}')
+    odd_names = ("\x1b[31mred", "\udcff", "two\nlines", "\u202eoverridden")
+    for odd in odd_names:
+        (journal / f"{odd}.arrows").mkdir()
+        (running.data / "nodes" / odd).mkdir()
+        write_checksummed_json(running.data / "nodes" / odd / "hello.json", b'{"a": 1}')
     running.start()
     text = list_problems(running)
     assert "it is not a file" in text
-    assert "not this node's last hello" in text
+    assert text.count("not this node's last hello") == len(odd_names)
     assert text.isprintable()
     with running.socket("/api/v1/live") as live:
         assert json.loads(live.recv(timeout=PATIENCE_S))["problems"]
@@ -206,8 +205,7 @@ def test_a_hello_of_another_version_is_named_in_one_sentence(
 ) -> None:
     running.stop()
     path = running.data / "nodes" / "bench" / "hello.json"
-    content = read_checksummed_json(path)
-    hello = json.loads(content) | {"older": 1}
+    hello = json.loads(read_checksummed_json(path)) | {"older": 1}
     write_checksummed_json(path, json.dumps(hello).encode())
     running.start()
     text = list_problems(running)

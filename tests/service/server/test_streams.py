@@ -13,13 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.frames import FRAME_COLUMNS, FrameBatch
-from service.protocol.link import PROTOCOL, EarlierStream, Hello
+from service.protocol.link import EarlierStream, Hello
 from service.server.node import ServerNode
 from storage.intervals import NO_END, Intervals
 from storage.schema import wire_schema
 from storage.wire import encode_frames
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.frames import make_frames
+from tests.service.fake_node import make_hello
 
 PER_MESSAGE = 5
 OLD, NEW = "a" * 32, "b" * 32
@@ -49,18 +50,8 @@ class Told:
         self.node = ServerNode(self.folder / "node", self.folder / "journal", self.hello())
 
     def hello(self, **changes: Any) -> Hello:
-        content: dict[str, Any] = {
-            "protocol": PROTOCOL,
-            "array_info": self.info[NEW],
-            "stored": (),
-            "next_seq": 0,
-            "t_mono_ns": 10**12,
-            "scene": {},
-            "emulated": False,
-            "calibration": None,
-            "calibration_problem": "for this test",
-        }
-        return Hello(**(content | changes))
+        facts: dict[str, Any] = {"info": self.info[NEW], "t_mono_ns": 10**12}
+        return make_hello(**(facts | changes))
 
     def earlier(self, **changes: Any) -> EarlierStream:
         content: dict[str, Any] = {"array_info": self.info[OLD], "stored": (), "next_seq": 0}
@@ -173,21 +164,16 @@ def test_frames_of_two_streams_in_any_order_and_any_number_of_times_are_each_hel
         told.close()
 
 
-def test_what_is_missing_and_still_with_the_node_is_backlog_and_not_lost(told: Told) -> None:
+def test_missing_frames_are_backlog_until_the_node_has_lost_them(told: Told) -> None:
     told.connect(stored=((0, 99),), next_seq=100)
     told.take(100, 104)
     assert told.node.present_stream_backlog_frames == 100
     assert told.node.present_stream_lost_by_reason == {}
-    told.take(50, 54)
-    assert told.node.present_stream_backlog_frames == 95
-
-
-def test_what_the_node_has_lost_is_counted_by_its_reason_and_no_backlog(told: Told) -> None:
-    told.connect(stored=((0, 99),), next_seq=100)
-    told.take(100, 104)
     told.node.present_stream.set_node_losses({"evicted": ((0, 9),), "disk_full": ((20, 24),)})
     assert told.node.present_stream_lost_by_reason == {"evicted": 10, "disk_full": 5}
     assert told.node.present_stream_backlog_frames == 85
+    told.take(50, 54)
+    assert told.node.present_stream_backlog_frames == 80
 
 
 def test_a_loss_that_came_all_the_same_is_none(told: Told) -> None:
@@ -266,20 +252,15 @@ def test_frames_of_an_earlier_stream_are_kept_and_never_shown(told: Told) -> Non
     assert told.node.journals[OLD].stored == Intervals([(5, 9)])
 
 
-def test_a_stream_that_the_node_does_not_mention_cannot_come(told: Told) -> None:
+def test_a_stream_can_come_until_the_node_does_not_mention_it(told: Told) -> None:
     told.connect(earlier=(told.earlier(stored=((0, 9),), next_seq=10),))
     told.take(0, 4, OLD)
     assert told.node.streams[OLD].obtainable == Intervals([(0, 9)])
+    told.synced()
+    told.restart()  # a new server has heard nothing
+    assert told.node.streams[OLD].obtainable == Intervals([(0, NO_END)])
     told.connect()
     assert not told.node.streams[OLD].obtainable
-
-
-def test_before_the_node_has_said_anything_everything_may_come(told: Told) -> None:
-    told.connect(earlier=(told.earlier(stored=((0, 9),), next_seq=10),))
-    told.take(0, 4, OLD)
-    told.synced()
-    told.restart()
-    assert told.node.streams[OLD].obtainable == Intervals([(0, NO_END)])
 
 
 def test_what_the_node_said_of_a_stream_outlives_the_server(told: Told) -> None:
@@ -306,7 +287,11 @@ def test_what_was_damaged_here_is_known_after_a_restart_until_it_comes_again(tol
     told.connect(stored=((0, 9),), next_seq=10)
     told.take(0, 4)
     told.take(5, 9)
-    told.node.present_stream.invalidate(Intervals([(0, 4)]), are_corrupt=True)
+    stream = told.node.present_stream
+    stream.invalidate(Intervals([(0, 4)]), are_corrupt=True)
+    assert not stream.lost
+    told.connect(stored=((5, 9),), next_seq=10)  # the node has them no more
+    assert stream.lost.to_pairs() == {"corrupt": ((0, 4),)}
     told.synced()
     told.restart()
     assert told.node.streams[NEW].make_session_stream(None).damaged == Intervals([(0, 4)])
@@ -325,17 +310,6 @@ def test_slots_that_a_killed_node_has_forgotten_are_still_counted(told: Told) ->
     assert (stream.missed_slots, stream.notes.missed_slots) == (4, 4)
     stream.apply_end_report(told.earlier(stored=((0, 9),), next_seq=10, missed_slots=5))
     assert (stream.missed_slots, stream.notes.missed_slots) == (5, 5)
-
-
-def test_frames_that_are_damaged_here_may_come_again_while_the_node_has_them(told: Told) -> None:
-    told.connect(stored=((0, 9),), next_seq=10)
-    told.take(0, 4)
-    told.take(5, 9)
-    stream = told.node.present_stream
-    stream.invalidate(Intervals([(0, 4)]), are_corrupt=True)
-    assert not stream.lost
-    told.connect(stored=((5, 9),), next_seq=10)
-    assert stream.lost.to_pairs() == {"corrupt": ((0, 4),)}
 
 
 @settings(max_examples=40, deadline=None)

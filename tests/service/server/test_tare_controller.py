@@ -13,7 +13,6 @@ import pytest
 from devices.errors import StorageError, TareError
 from devices.flags import FrameFlag, TileFlag
 from devices.frames import FrameBatch
-from service.protocol.link import PROTOCOL, Hello
 from service.server.node import ServerNode
 from storage.intervals import Intervals
 from storage.schema import wire_schema
@@ -21,6 +20,7 @@ from storage.wire import encode_frames
 from tests.builders.arrays import COUNT_KPA, UNLOADED_KPA, UTC_NS, make_array
 from tests.builders.calibrations import make_calibration
 from tests.builders.frames import make_frames
+from tests.service.fake_node import make_hello
 from tests.storage.faulty_disk import NO_SPACE, refusing
 
 PERIOD_NS = 10_000_000  # 100 Hz
@@ -36,16 +36,8 @@ class Foot:
         self.seq = 0
         self.due: list[int] = []
         info = make_array(nominal_rate_hz=100.0)
-        self.hello = Hello(
-            protocol=PROTOCOL,
-            array_info=info,
-            stored=(),
-            next_seq=0,
-            t_mono_ns=0,
-            scene={"name": "test", **scene},
-            emulated=True,
-            calibration=make_calibration(*info.serials),
-            calibration_problem=None,
+        self.hello = make_hello(
+            info, make_calibration(*info.serials), scene={"name": "test", **scene}, emulated=True
         )
         self.node: ServerNode
         self.restart()
@@ -116,17 +108,28 @@ class Foot:
         return self.node.estimator.tare_controller.auto_tare_state
 
     @property
+    def warnings(self) -> list[str]:
+        return self.node.estimator.tare_controller.list_reasons_to_tare_again()
+
+    @property
+    def problem(self) -> str | None:
+        return self.node.estimator.tare_controller.missing_tare_reason
+
+    @property
+    def tare(self) -> Any:
+        return self.node.estimator.live.tare_in_use_unless_lost
+
+    @property
+    def tares(self) -> list[Any]:
+        return [*self.node.estimator.tare_history.all_tares_with_undone]
+
+    @property
     def history(self) -> list[tuple[str, bool]]:
-        return [
-            (t.tare.source, t.undone)
-            for t in self.node.estimator.tare_history.all_tares_with_undone
-        ]
+        return [(each.tare.source, each.undone) for each in self.tares]
 
     @property
     def offset_counts(self) -> list[float]:
-        tare = self.node.estimator.live.tare_in_use_unless_lost
-        assert tare is not None
-        return list((tare.baseline_kpa - UNLOADED_KPA) / COUNT_KPA)
+        return list((self.tare.baseline_kpa - UNLOADED_KPA) / COUNT_KPA)
 
 
 @pytest.fixture
@@ -160,17 +163,14 @@ def test_a_lead_that_comes_after_what_followed_it_is_tared_all_the_same(foot_of:
     lead = foot.frames(1.0, 1.0, lead=True)
     foot.live(2.0, 20.0)
     assert foot.history == []
-    assert (
-        foot.node.estimator.tare_controller.missing_tare_reason
-        == "not tared: lift the foot, hold it still, and tare"
-    )
+    assert foot.problem == "not tared: lift the foot, hold it still, and tare"
     foot.send(lead.slice_rows(0, 50))
     assert foot.history == []
     foot.send(lead.slice_rows(50, 100))
     assert foot.history == [("lead", False)]
-    assert foot.node.estimator.live.tare_in_use_unless_lost.frames == 100
+    assert foot.tare.frames == 100
     assert foot.offset_counts == pytest.approx([1.0, 1.0], abs=0.4)
-    assert foot.node.estimator.tare_controller.missing_tare_reason is None
+    assert foot.problem is None
 
 
 def test_a_lead_of_which_a_part_never_comes_is_tared_from_the_rest(foot_of: Any) -> None:
@@ -182,7 +182,7 @@ def test_a_lead_of_which_a_part_never_comes_is_tared_from_the_rest(foot_of: Any)
     assert foot.history == []
     foot.live(2.0, 20.0)
     assert foot.history == [("lead", False)]
-    assert foot.node.estimator.live.tare_in_use_unless_lost.frames == 75
+    assert foot.tare.frames == 75
 
 
 def test_a_server_that_is_restarted_in_the_lead_tares_from_all_of_it_and_not_twice(
@@ -194,11 +194,11 @@ def test_a_server_that_is_restarted_in_the_lead_tares_from_all_of_it_and_not_twi
     foot.live(0.5, lead=True)
     foot.live(1.0, 20.0)
     assert foot.history == [("lead", False)]
-    assert foot.node.estimator.live.tare_in_use_unless_lost.frames == 100
+    assert foot.tare.frames == 100
     foot.restart()
     foot.live(1.0, 20.0)
     assert foot.history == [("lead", False)]
-    assert foot.node.estimator.live.tare_in_use_unless_lost is not None
+    assert foot.tare is not None
 
 
 def test_a_lead_that_is_no_tare_is_said_with_its_reason(foot_of: Any) -> None:
@@ -206,15 +206,15 @@ def test_a_lead_that_is_no_tare_is_said_with_its_reason(foot_of: Any) -> None:
     foot.live(1.0, lead=True, silent=1)
     foot.live(1.0, 20.0)
     assert foot.history == []
-    problem = foot.node.estimator.tare_controller.missing_tare_reason
-    assert "the lead gave no tare (tile T02 has 0 readable frames" in problem
-    assert "lift the foot" in problem
+    assert foot.problem is not None
+    assert "the lead gave no tare (tile T02 has 0 readable frames" in foot.problem
+    assert "lift the foot" in foot.problem
 
 
 def test_without_a_lead_that_could_be_used_the_tare_of_before_stays_and_that_is_said(
     foot: Foot,
 ) -> None:
-    before = foot.node.estimator.live.tare_in_use_unless_lost
+    before = foot.tare
     again = {"stream_id": "1" * 32}
     info = foot.hello.array_info.model_copy(update=again)
     foot.hello = foot.hello.model_copy(update={"array_info": info})
@@ -222,12 +222,8 @@ def test_without_a_lead_that_could_be_used_the_tare_of_before_stays_and_that_is_
     foot.seq = 0
     foot.live(1.0, lead=True, silent=0)
     foot.live(1.0)
-    assert foot.node.estimator.live.tare_in_use_unless_lost is not None
-    assert before is not None
-    assert foot.node.estimator.live.tare_in_use_unless_lost.t_ns == before.t_ns
-    assert "tile T01 has 0 readable frames" in str(
-        foot.node.estimator.tare_controller.missing_tare_reason
-    )
+    assert foot.tare.t_ns == before.t_ns
+    assert "tile T01 has 0 readable frames" in str(foot.problem)
 
 
 def test_a_lead_whose_tare_cannot_be_kept_is_a_storage_problem_and_tried_again(
@@ -240,12 +236,12 @@ def test_a_lead_whose_tare_cannot_be_kept_is_a_storage_problem_and_tried_again(
         foot.live(1.0)
         assert "No space left" in foot.node.storage_problem
         assert foot.history == []
-        assert foot.node.estimator.live.tare_in_use_unless_lost is None
+        assert foot.tare is None
         foot.live(1.0)
     foot.node.storage_problem = None  # as the server does once it can write again
     foot.live(1.0)
     assert foot.history == [("lead", False)]
-    assert foot.node.estimator.live.tare_in_use_unless_lost is not None
+    assert foot.tare is not None
 
 
 # --- in flight ------------------------------------------------------------------------------------
@@ -257,8 +253,8 @@ def test_a_foot_whose_lead_failed_is_tared_as_soon_as_it_steps(foot_of: Any) -> 
     foot.step(4, rest=2.0)
     assert foot.history == [("flight", False)]
     assert foot.offset_counts == pytest.approx([2.0, 2.0], abs=0.6)
-    assert foot.node.estimator.tare_controller.missing_tare_reason is None
-    assert "between two steps" in foot.node.estimator.tare_history.all_tares_with_undone[0].reason
+    assert foot.problem is None
+    assert "between two steps" in foot.tares[0].reason
 
 
 def test_a_foot_that_stands_from_the_beginning_is_never_tared_unasked(foot_of: Any) -> None:
@@ -266,7 +262,7 @@ def test_a_foot_that_stands_from_the_beginning_is_never_tared_unasked(foot_of: A
     foot.live(1.0, lead=True, silent=1)
     foot.live(60.0, 8.0)
     assert foot.history == []
-    assert foot.node.estimator.tare_controller.missing_tare_reason is not None
+    assert foot.problem is not None
 
 
 def test_a_dome_that_warms_is_followed_between_steps_and_each_time_is_in_the_history(
@@ -277,16 +273,9 @@ def test_a_dome_that_warms_is_followed_between_steps_and_each_time_is_in_the_his
         for _ in range(20):
             foot.live(2.0, COUNTS_PER_K * warmer_k, warmer_k=warmer_k)
             foot.live(1.0, COUNTS_PER_K * warmer_k + 40.0, warmer_k=warmer_k)
-    flights = [
-        t
-        for t in foot.node.estimator.tare_history.all_tares_with_undone
-        if t.tare.source == "flight"
-    ]
+    flights = [each for each in foot.tares if each.tare.source == "flight"]
     assert 3 <= len(flights) <= 5
-    t_s = (
-        np.array([t.tare.t_ns for t in foot.node.estimator.tare_history.all_tares_with_undone])
-        * 1e-9
-    )
+    t_s = np.array([each.tare.t_ns for each in foot.tares]) * 1e-9
     assert (np.diff(t_s) >= 60.0 - 1e-6).all()
     assert all(" kPa from the tare before" in t.reason for t in flights)
     assert foot.offset_counts == pytest.approx([COUNTS_PER_K * 2.0] * 2, abs=COUNTS_PER_K * 0.6)
@@ -318,10 +307,10 @@ def test_a_foot_in_contact_is_left_alone_however_long(foot: Foot) -> None:
 def test_a_light_load_that_stays_is_said_and_not_tared_away(foot: Foot) -> None:
     foot.live(90.0, 2.0)  # below contact: two newtons on each of two tiles
     assert foot.history == [("lead", False)]
-    (warning,) = foot.node.estimator.tare_controller.list_reasons_to_tare_again()
+    (warning,) = foot.warnings
     assert "a light load, or a baseline that has moved" in warning
     foot.live(20.0)
-    assert foot.node.estimator.tare_controller.list_reasons_to_tare_again() == []
+    assert foot.warnings == []
 
 
 def test_a_scene_can_turn_it_off(foot_of: Any) -> None:
@@ -341,9 +330,7 @@ def test_an_automatic_tare_that_is_undone_does_not_come_back_until_somebody_tare
     foot.live(70.0, 0.9)
     assert foot.history == [("lead", False), ("flight", False)]
     assert foot.auto_tare == "on"
-    foot.node.estimator.tare_controller.undo_tare(
-        foot.node.estimator.tare_history.all_tares_with_undone[-1].id
-    )
+    foot.node.estimator.tare_controller.undo_tare(foot.tares[-1].id)
     assert foot.offset_counts == pytest.approx([0.0, 0.0], abs=0.4)
     assert foot.auto_tare == "paused"
     foot.live(200.0, 0.9)
@@ -360,11 +347,11 @@ def test_an_automatic_tare_that_is_undone_does_not_come_back_until_somebody_tare
 def test_an_automatic_tare_that_cannot_be_kept_is_not_in_force(
     foot: Foot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before = foot.node.estimator.live.tare_in_use_unless_lost
+    before = foot.tare
     monkeypatch.setattr("service.sessions.tares.write_tares", refusing(StorageError, "full"))
     foot.live(70.0, 0.9)
     assert foot.history == [("lead", False)]
-    assert foot.node.estimator.live.tare_in_use_unless_lost is before
+    assert foot.tare is before
     assert foot.node.storage_problem == "full"
 
 
@@ -372,15 +359,17 @@ def test_an_automatic_tare_that_cannot_be_kept_is_not_in_force(
 
 
 def test_a_foot_that_has_warmed_up_since_its_tare_is_told_of_in_newtons(foot: Foot) -> None:
-    assert foot.node.estimator.tare_controller.list_reasons_to_tare_again() == []
+    assert foot.warnings == []
     foot.live(2.0, 20.0, warmer_k=5.0)
-    (warning,) = foot.node.estimator.tare_controller.list_reasons_to_tare_again()
+    (warning,) = foot.warnings
     # 5 K of 0.336 kPa/K are 13.2 N on each of two tiles of a newton a count
     assert warning.startswith("the tiles are 5.0 K warmer than when tared")
     assert "about +26." in warning
     foot.live(2.0, 20.0, warmer_k=-2.0)
-    (warning,) = foot.node.estimator.tare_controller.list_reasons_to_tare_again()
+    (warning,) = foot.warnings
     assert "2.1 K colder" in warning
+    foot.live(2.0, warmer_k=0.0, silent=0)
+    assert foot.warnings == []  # where a temperature is not known
 
 
 def test_an_old_tare_is_told_of(foot_of: Any) -> None:
@@ -389,14 +378,7 @@ def test_an_old_tare_is_told_of(foot_of: Any) -> None:
     foot.live(1.0)
     foot.seq += 31 * 60 * 100
     foot.live(1.0)
-    assert foot.node.estimator.tare_controller.list_reasons_to_tare_again() == [
-        "tared 31 min ago: lift the foot, hold it still, and tare"
-    ]
-
-
-def test_a_tile_whose_temperature_is_not_known_warns_of_nothing(foot: Foot) -> None:
-    foot.live(2.0, warmer_k=0.0, silent=0)
-    assert foot.node.estimator.tare_controller.list_reasons_to_tare_again() == []
+    assert foot.warnings == ["tared 31 min ago: lift the foot, hold it still, and tare"]
 
 
 def test_a_node_without_calibration_is_not_tared_and_frames_pass(foot_of: Any) -> None:

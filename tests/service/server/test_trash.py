@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import shutil
 import subprocess
 import sys
 import threading
@@ -19,15 +19,13 @@ from storage.intervals import Intervals
 from storage.sessions.folder import DELETED_PREFIX, SessionsFolder
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
-from tests.service.running import Running, assert_refused, closed
-from tests.storage.faulty_disk import refusing
-from tests.waiting import PATIENCE_S, until
+from tests.service.running import Running, assert_refused, closed, receive_live
+from tests.storage.faulty_disk import flip_byte, refusing
+from tests.waiting import until
 
 
 def seal(node: FakeNode) -> Recording:
-    session = node.record()
-    node.deliver(20)
-    node.finish(session)
+    session = node.record_sealed(20)
     return session
 
 
@@ -48,11 +46,17 @@ def list_ids(running: Running, path: str) -> list[str]:
 # --- the trash ------------------------------------------------------------------------------------
 
 
-def test_a_deleted_session_is_restored_unchanged(running: Running, tared: FakeNode) -> None:
+def test_pages_are_told_of_a_deleted_session_and_it_is_restored_unchanged(
+    running: Running, tared: FakeNode
+) -> None:
     session = seal(tared)
     before = session.now()
-    answer = running.http.delete(session.url)
-    assert (answer.status_code, answer.content) == (204, b"")
+    with running.socket("/api/v1/live") as live:
+        receive_live(live, lambda each: each["type"] == "hello")
+        answer = running.http.delete(session.url)
+        assert (answer.status_code, answer.content) == (204, b"")
+        notice = receive_live(live, lambda each: each["type"] == "deleted")
+    assert notice["session_id"] == session.id
     assert list_ids(running, "/sessions") == []
     running.restart()
     assert running.http.get("/trash").json()["items"] == [before]
@@ -102,18 +106,15 @@ def test_a_session_is_not_deleted_during_its_seal(
     session.sealed()
 
 
-@pytest.mark.parametrize(
-    ("method", "path"),
-    [
+def test_an_unknown_session_is_not_found(running: Running) -> None:
+    for method, path in (
         ("DELETE", "/sessions/20200101T000000Z-000000"),
         ("POST", "/sessions/20200101T000000Z-000000/abandon-missing"),
         ("POST", "/trash/20200101T000000Z-000000/restore"),
         ("POST", "/trash/..%2fx/restore"),
         ("POST", "/trash/x/restore"),
-    ],
-)
-def test_an_unknown_session_is_not_found(running: Running, method: str, path: str) -> None:
-    assert running.http.request(method, path).status_code == 404
+    ):
+        assert running.http.request(method, path).status_code == 404, path
 
 
 def test_a_pending_session_needs_its_frames_until_the_trash_is_emptied(
@@ -181,16 +182,6 @@ def test_a_half_deleted_session_is_removed_at_the_next_start(
     assert list((running.data / "trash").iterdir()) == []
 
 
-def test_pages_get_a_notice_of_a_deletion(running: Running, tared: FakeNode) -> None:
-    session = seal(tared)
-    with running.socket("/api/v1/live") as live:
-        assert json.loads(live.recv(timeout=PATIENCE_S))["type"] == "hello"
-        running.http.delete(session.url)
-        while (message := json.loads(live.recv(timeout=PATIENCE_S)))["type"] != "deleted":
-            pass
-    assert message["session_id"] == session.id
-
-
 # --- abandoned ------------------------------------------------------------------------------------
 
 
@@ -237,16 +228,16 @@ def test_a_recording_session_is_neither_deleted_nor_abandoned(
 # --- damage ---------------------------------------------------------------------------------------
 
 
-def damage(running: Running, node: FakeNode, at: float = 0.5) -> None:
+def damage(running: Running, node: FakeNode) -> None:
     """Flip a bit in the middle of the node's journal."""
     [path] = (running.data / "journal" / "bench" / node.stream_id).glob("*.arrows")
-    content = bytearray(path.read_bytes())
-    content[int(len(content) * at)] ^= 0x10
-    with path.open("r+b") as file:
-        file.write(content)
+    flip_byte(path, bits=0x10)
 
 
-def test_damaged_frames_are_requested_again(running: Running, tared: FakeNode) -> None:
+@pytest.mark.parametrize("is_deleted", [False, True], ids=["sent again", "deleted by the node"])
+def test_damaged_frames_are_requested_again_and_else_lost(
+    running: Running, tared: FakeNode, is_deleted: bool
+) -> None:
     session = tared.record()
     tared.deliver(200)
     damage(running, tared)
@@ -254,26 +245,16 @@ def test_damaged_frames_are_requested_again(running: Running, tared: FakeNode) -
     tared.send(10, now=True)
     code, reason = closed(tared.socket)
     assert (code, "damaged" in reason) == (1012, True)
-    first, last = tared.connect()[0]
-    assert last is not None
-    assert 70 <= first <= last <= 269
-    tared.send_again(tared.all_sent().slice_rows(first, last + 1))
+    if is_deleted:
+        tared.connect(stored=((270, 279),))
+    else:
+        first, last = tared.connect()[0]
+        assert last is not None
+        assert 70 <= first <= last <= 269
+        tared.send_again(tared.all_sent().slice_rows(first, last + 1))
     done = session.sealed()
-    assert (done["complete"], done["frames"], done["lost"]) == (True, 200, {})
-
-
-def test_damaged_frames_that_the_node_has_deleted_are_lost(
-    running: Running, tared: FakeNode
-) -> None:
-    session = tared.record()
-    tared.deliver(200)
-    damage(running, tared)
-    session.stop()
-    tared.send(10, now=True)
-    closed(tared.socket)
-    tared.connect(stored=((270, 279),))  # it has deleted the others
-    done = session.sealed()
-    assert (done["complete"], done["frames"], done["lost"]) == ("lossy", 190, {"corrupt": 10})
+    expected = ("lossy", 190, {"corrupt": 10}) if is_deleted else (True, 200, {})
+    assert (done["complete"], done["frames"], done["lost"]) == expected
 
 
 # --- starting -------------------------------------------------------------------------------------
@@ -352,3 +333,68 @@ def test_unneeded_journals_are_deleted_one_at_a_time(running: Running, tared: Fa
         left.append(sorted(path.name for path in folder.iterdir()))
     assert left == [sorted(streams[1:]), streams[2:]]
     assert node.present_stream.stored
+
+
+# --- abandoned: a stream that server or node has lost ---------------------------------------------
+
+
+@pytest.fixture
+def unsent(tared: FakeNode) -> Recording:
+    """A recording of fifty stored frames, and of thirty that the node has not sent."""
+    recording = tared.record()
+    tared.deliver(50)
+    tared.frames(30)
+    return recording
+
+
+def lose_node(running: Running, tared: FakeNode) -> None:
+    """Delete all files of the node on the server but its sessions."""
+    running.stop()
+    for folder in ("nodes", "journal"):
+        shutil.rmtree(running.data / folder / tared.name)
+    running.start()
+
+
+@pytest.mark.real_time
+def test_abandoned_frames_of_a_stream_with_a_known_end_are_counted(
+    tared: FakeNode, unsent: Recording
+) -> None:
+    tared.restart()
+    unsent.stop()
+    tared.connect(earlier=tuple(each.said() for each in tared.before))
+    assert unsent.now()["pending_reason"] == "end"
+    answer = unsent.running.http.post(f"{unsent.url}/abandon-missing")
+    assert answer.status_code == 200, answer.text
+    sealed = unsent.sealed()
+    assert sealed["lost"] == {"abandoned": 30}
+    counts = (sealed["frames"], sealed["max_lost_tail_frames"], sealed["complete"])
+    assert counts == (50, 0, "lossy")
+
+
+@pytest.mark.real_time
+def test_a_session_waits_for_a_stream_that_is_not_announced(
+    running: Running, tared: FakeNode, unsent: Recording
+) -> None:
+    tared.leave()
+    lose_node(running, tared)
+    (listed,) = running.sessions()
+    assert (listed["state"], listed["frames"], listed["complete"]) == ("recording", 0, False)
+    assert unsent.stop()["pending_reason"] == "end"
+    tared.reboot()
+    tared.come_back()
+    sealed = unsent.sealed()
+    assert (sealed["frames"], sealed["complete"]) == (80, True)
+
+
+@pytest.mark.real_time
+def test_a_stream_lost_on_both_sides_seals_its_session(
+    running: Running, tared: FakeNode, unsent: Recording
+) -> None:
+    tared.leave()
+    lose_node(running, tared)
+    unsent.stop()
+    tared.reboot()
+    tared.connect()
+    sealed = unsent.sealed()
+    assert (sealed["frames"], sealed["complete"]) == (0, "lossy")
+    assert sealed["max_lost_tail_frames"] > 0

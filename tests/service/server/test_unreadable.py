@@ -33,6 +33,7 @@ from tests.builders.calibrations import make_calibration, make_tare
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
 from tests.service.running import Running
+from tests.storage.faulty_disk import IO_ERROR, failing_if, refusing
 from tests.waiting import until
 
 INFO = make_array()
@@ -43,12 +44,18 @@ NEEDED = RetentionRequest(streams={"a": ((0, 9),)})
 def unreadable(monkeypatch: pytest.MonkeyPatch, number: int) -> Iterator[None]:
     """No file of ours can be opened to be read: descriptors or memory are used up, or another's."""
 
-    def refuse(*_: object) -> int:
-        raise OSError(number, os.strerror(number))
-
     with monkeypatch.context() as patched:
+        refuse = refusing(OSError, number, os.strerror(number))
         patched.setattr(durable_files, "_without_following", refuse)
         yield
+
+
+def refuse_opening(monkeypatch: pytest.MonkeyPatch, path: Path, number: int) -> None:
+    """Let this one file not be opened."""
+    facts = (OSError, number, os.strerror(number))
+    opened = durable_files._without_following
+    refuse = failing_if(lambda name, _: name == str(path), opened, *facts)
+    monkeypatch.setattr(durable_files, "_without_following", refuse)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -141,11 +148,8 @@ def test_tares_that_are_damaged_and_cannot_be_set_aside_are_not_written_over(
     path.write_bytes(path.read_bytes()[:-1])
     before = contents(tmp_path)
 
-    def refuse(*_: object) -> None:
-        raise OSError(errno.EMFILE, "Too many open files")
-
     with monkeypatch.context() as patched:
-        patched.setattr(Path, "rename", refuse)
+        patched.setattr(Path, "rename", refusing(OSError, errno.EMFILE, "Too many open files"))
         with pytest.raises(StorageError, match="Move it away by hand"):
             TareHistory(path)
     assert contents(tmp_path) == before
@@ -159,15 +163,8 @@ def test_a_node_whose_files_cannot_be_read_is_left_out_until_it_connects(
     running.stop()
     folder = running.data / "nodes" / "bench"
     before = contents(folder)
-    really = durable_files._without_following
-
-    def refuse(path: str, flags: int) -> int:
-        if path == str(folder / name):
-            raise OSError(errno.EACCES, "Permission denied")
-        return really(path, flags)
-
     with monkeypatch.context() as patched:
-        patched.setattr(durable_files, "_without_following", refuse)
+        refuse_opening(patched, folder / name, errno.EACCES)
         found = NodeRegistry(running.data)
     assert (list(found), contents(folder)) == ([], before)
     assert name in found.file_problems[0]
@@ -180,12 +177,9 @@ def test_a_node_whose_files_cannot_be_read_is_left_out_until_it_connects(
 def refused_journals(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The disk does not give what journals hold."""
 
-    def refuse(*_: object) -> None:
-        raise OSError(errno.EIO, "Input/output error")
-
     monkeypatch.setattr(sealer, "_RETRY_S", 0.1)
     with monkeypatch.context() as disk:
-        disk.setattr(journal_module, "recover_or_delete_segment", refuse)
+        disk.setattr(journal_module, "recover_or_delete_segment", refusing(*IO_ERROR))
         yield
 
 
@@ -261,20 +255,11 @@ def test_frames_of_a_stream_whose_notes_another_version_wrote_are_not_lost(
 def test_a_session_that_cannot_be_read_stays_as_it_is_and_is_named(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recording = tared.record()
-    tared.deliver(100, 5.0)
-    tared.finish(recording)
+    recording = tared.record_sealed(100, 5.0)
     running.stop()
     before = contents(running.data / "sessions")
-    really = durable_files._without_following
-
-    def refuse(path: str, flags: int) -> int:
-        if path.endswith("session.json"):
-            raise OSError(errno.ENFILE, "Too many open files in system")
-        return really(path, flags)
-
     with monkeypatch.context() as patched:
-        patched.setattr(durable_files, "_without_following", refuse)
+        refuse_opening(patched, recording.folder / "session.json", errno.ENFILE)
         server = Server(running.data)
         said = " ".join(server.sessions.problems)
         server.data_folder.release_lock()

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from devices.frames import FrameBatch
 from service.estimation.foot import CONTACT_UNKNOWN
 from service.protocol.live import SessionProgress
-from service.server.broadcast.history import nan_min, reduce_tiles, summarize_force
+from service.server.broadcast.history import reduce_tiles, summarize_force
 from service.server.broadcast.summary import (
     SUMMARY_NS,
     FrameSummary,
@@ -154,14 +154,6 @@ def test_joining_pieces_is_summing_up_their_frames_and_in_any_grouping(sizes: li
         np.testing.assert_array_equal(joined.span, whole.span)
         assert joined.newest == whole.newest
         np.testing.assert_array_equal(joined.tiles, whole.tiles)
-
-
-@pytest.mark.parametrize(
-    ("a", "b", "smaller"), [(1.0, 2.0, 1.0), (np.nan, 2.0, 2.0), (1.0, np.nan, 1.0)]
-)
-def test_not_a_number_is_no_smaller_number(a: float, b: float, smaller: float) -> None:
-    assert nan_min(a, b) == nan_min(b, a) == smaller
-    assert np.isnan(nan_min(np.nan, np.nan))
 
 
 # --- what is not told -----------------------------------------------------------------------------

@@ -11,6 +11,7 @@ import pytest
 from devices.errors import DamagedFramesError, FileFormatError, StorageError
 from service.protocol.codec import CloseConnection, LinkCloseCode
 from service.protocol.live import Policy
+from service.server.live_feed.encoder import EncodeCache
 from service.server.live_feed.events import FeedEvent, FrameRows, Gap, Position, StreamStart
 from service.server.live_feed.reader import FeedReader, RecomputedFrames
 from storage.journal.journal import Journal
@@ -315,3 +316,15 @@ def test_one_who_comes_back_in_the_middle_of_a_piece_has_each_frame_once(
     following = world.read(world.reader(policy, Position(FIRST, middle)))
     assert (following.first_seq, following.last_seq) == (middle, item.last_seq)
     assert following.batch[0].pressure_raw.tolist() == item.batch[0].pressure_raw[middle:].tolist()
+
+
+def test_what_was_used_least_lately_goes_and_no_more_is_kept_than_is_allowed() -> None:
+    shared = EncodeCache(bytes_max=30)
+    for key in range(3):
+        shared.put(key, bytes(10))
+    assert shared.get(0) is not None
+    shared.put(3, bytes(10))
+    assert [shared.get(key) is not None for key in range(4)] == [True, False, True, True]
+    assert shared.size_bytes == 30
+    shared.put("too much", bytes(100))
+    assert shared.size_bytes == 0

@@ -16,7 +16,7 @@ import numpy as np
 
 from devices.errors import DamagedFramesError
 from devices.frames import ArrayInfo, FrameBatch
-from service.protocol.link import PROTOCOL, EarlierStream, Hello
+from service.protocol.link import EarlierStream, Hello
 from service.protocol.live import Policy
 from service.server.live_feed.buffer import FeedBuffer
 from service.server.live_feed.events import Position
@@ -29,6 +29,7 @@ from storage.wire import encode_frames
 from tests.builders.arrays import COUNT_KPA, PERIOD_NS, UNLOADED_KPA, UTC_NS, make_array
 from tests.builders.calibrations import make_calibration, make_tare
 from tests.builders.frames import make_frames
+from tests.service.fake_node import make_hello
 
 LOST = "disk_full"
 WAITING = 6
@@ -213,7 +214,7 @@ class World:
     def _hello(self) -> Hello:
         def said(each: Taken) -> dict[str, Any]:
             return {
-                "array_info": each.info,
+                "info" if each is present else "array_info": each.info,
                 "stored": tuple(each.held),
                 "next_seq": each.taken,
                 "lost": {LOST: tuple(each.lost)} if each.lost else {},
@@ -221,16 +222,13 @@ class World:
             }
 
         *earlier, present = self.streams.values()
-        return Hello(
-            protocol=PROTOCOL,
-            t_mono_ns=10**15,
-            scene={"auto_tare": False},
-            emulated=False,
-            calibration=self._calibration,
-            calibration_problem=None,
-            earlier=tuple(EarlierStream(**said(each)) for each in earlier),
-            **said(present),
-        )
+        told_before = tuple(EarlierStream(**said(each)) for each in earlier)
+        facts: dict[str, Any] = {
+            "t_mono_ns": 10**15,
+            "scene": {"auto_tare": False},
+            "earlier": told_before,
+        }
+        return make_hello(calibration=self._calibration, **facts, **said(present))
 
     # --- readers ----------------------------------------------------------------------------------
 
