@@ -56,9 +56,7 @@ def shared_tared(shared: Running) -> Iterator[FakeNode]:
 def sealed(shared_tared: FakeNode) -> Sealed:
     """A sealed session of 300 frames, and one of 50 frames that is still recorded."""
     node = shared_tared
-    session = node.record()
-    node.deliver(300, [20.0, 60.0])
-    node.finish(session)
+    session = node.record_sealed(300, [20.0, 60.0])
     recording = node.record(name="Ünder/..\\ 3rd trial")
     node.deliver(50, [5.0, 0.0])
     content = (session.folder / "frames.parquet").read_bytes()

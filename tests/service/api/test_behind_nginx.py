@@ -22,7 +22,6 @@ from service.protocol.link import INGEST_PATH
 from service.protocol.live import LIVE_PATH
 from tests.service.fake_node import NodeOf
 from tests.service.running import Running, ServeWith, assert_refused
-from tests.tokens import SHARED_BEARER
 from tests.waiting import PATIENCE_S, until
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -32,7 +31,6 @@ pytestmark = [
     pytest.mark.skipif(NGINX is None, reason="no nginx; on Debian: sudo apt-get install nginx"),
 ]
 Proxy = Callable[..., int]
-BARE = "server { listen 127.0.0.1:{listen}; location / { proxy_pass http://127.0.0.1:{port}; } }"
 
 
 def free_port() -> int:
@@ -88,27 +86,6 @@ def make_configuration(folder: Path, *, listen: int, port: int) -> str:
         assert found.count(old) == 1, old
         found = found.replace(old, new)
     return str(found)
-
-
-@pytest.fixture
-def bare(running: Running, nginx: Proxy) -> str:
-    """Address of a bare `proxy_pass` to the server."""
-    port = free_port()
-    servers = BARE.replace("{listen}", str(port)).replace("{port}", str(running.port))
-    return f"http://127.0.0.1:{nginx(servers, port)}"
-
-
-def test_a_bare_proxy_gives_no_right(running: Running, bare: str) -> None:
-    with httpx.Client(base_url=f"{bare}/api/v1", trust_env=False) as client:
-        assert_refused(client.delete("/trash"), 401, "token", "foottile invite")
-        assert client.post("/sessions", json={"node": "x", "name": "x"}).status_code == 401
-        assert client.post("/tickets", json={}).status_code == 401
-        assert client.get("/sessions").status_code == 200
-        # A page's change names the proxy's own address, which the proxy does not pass on.
-        headers = SHARED_BEARER | {"Origin": bare}
-        assert_refused(client.delete("/trash", headers=headers), 403, "Host header")
-        assert client.delete("/trash", headers=SHARED_BEARER).status_code == 200
-    assert running.http.get("/trash").json()["items"] == []
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from tests.builders.calibrations import make_calibration
 from tests.service import benches
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.recording import Recording
-from tests.service.running import Running, ServeWith, assert_refused
+from tests.service.running import Running, ServeWith, assert_refused, content_of
 from tests.waiting import until
 
 UNKNOWN = "0" * 16
@@ -148,9 +148,7 @@ def test_an_assigned_calibration_counts_for_later_sessions(
     tared.deliver(300, [0.0, 0.0], alive=True)
     tared.deliver(100, [20.0, 60.0], alive=True)
     calibration = stiffer("T01", "T02")
-    answer = assign(running, calibration)
-    assert answer.status_code == 200, answer.text
-    view = answer.json()
+    view = content_of(assign(running, calibration))
     ids = (view["source"], view["calibration"]["id"], view["own_id"])
     assert ids == ("server", calibration.id, own)
     node = running.node()

@@ -27,7 +27,7 @@ from tests.builders.arrays import PERIOD_NS
 from tests.service.command import command
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording, read_table
-from tests.service.running import Running, assert_refused
+from tests.service.running import Running, assert_refused, content_of
 from tests.storage.faulty_disk import refusing
 from tests.waiting import until
 
@@ -294,10 +294,7 @@ def read_rows(session: Recording, **query: Any) -> dict[str, list[str]]:
 
 
 def get_overview(session: Recording, **query: Any) -> dict[str, Any]:
-    answer = session.running.http.get(f"{session.url}/timeseries", params=query)
-    assert answer.status_code == 200, answer.text
-    content: dict[str, Any] = answer.json()
-    return content
+    return dict(content_of(session.running.http.get(f"{session.url}/timeseries", params=query)))
 
 
 def assert_one_axis(session: Recording) -> None:

@@ -17,7 +17,7 @@ from tests.service.fake_node import FakeNode
 from tests.service.patient import patient_server
 from tests.service.plates import LAG_S, ZERO_N, compare, hopped, write_plate
 from tests.service.recording import Recording
-from tests.service.running import assert_refused
+from tests.service.running import assert_refused, content_of
 
 NAME = "plate 1"
 
@@ -50,9 +50,7 @@ def compared(compared_once: Recording, tmp_path: Path) -> Iterator[Recording]:
 
 
 def get(session: Recording, path: str = "", **query: Any) -> Any:
-    answer = session.running.http.get(f"{session.url}/comparisons{path}", params=query)
-    assert answer.status_code == 200, answer.text
-    return answer.json()
+    return content_of(session.running.http.get(f"{session.url}/comparisons{path}", params=query))
 
 
 def test_a_comparison_has_figures_limits_and_the_reference_at_any_zoom(compared: Recording) -> None:

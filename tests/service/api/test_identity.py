@@ -83,18 +83,6 @@ def test_an_overheard_proof_is_refused(node: FakeNode, stranger: FakeNode) -> No
     assert closed(stranger.socket)[0] == 4013
 
 
-def test_a_node_is_known_after_restarts_of_both_ends(
-    running: Running, node: FakeNode, stranger: FakeNode
-) -> None:
-    node.connect()
-    node.deliver(10)
-    node.restart()
-    running.restart()
-    assert is_refused(stranger)
-    node.come_back()
-    node.deliver(10)
-
-
 def test_a_machine_without_a_secret_displaces_no_other(node: FakeNode, stranger: FakeNode) -> None:
     node.secret = stranger.secret = None
     node.connect()

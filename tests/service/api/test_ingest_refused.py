@@ -7,12 +7,10 @@ import json
 import math
 import struct
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
 import pytest
-from websockets.exceptions import ConnectionClosed
 
 from devices.frames import FrameBatch
 from service.protocol.link import INGEST_PATH, MESSAGE_BYTES_MAX, PROTOCOL
@@ -120,22 +118,15 @@ def test_each_step_of_the_handshake_is_needed_once(healthy: FakeNode, odd: FakeN
     ("place", "value"),
     [
         (("stored",), [[-1, 5]]),
-        (("stored",), [[0, 2**62]]),
         (("stored",), [[0]]),
         (("lost",), {"Evicted!": [[0, 1]]}),
-        (("lost",), {"x": [[0, 2**62 - 1]]}),
         (("earlier",), [{}]),
-        (("next_seq",), 1.5),
         (("protocol",), "one"),
         (("surprise",), 1),
         (("calibration",), {"version": 1}),
         (("scene",), []),
-        (("scene", "name"), math.nan),
         (("array_info", "tiles"), ()),
-        (("array_info", "tiles", 0, "conversion_ms"), math.nan),
         (("array_info", "tiles", 0, "x_m"), math.inf),
-        (("array_info", "tiles", 0, "coefficient_words", 0), 70_000),
-        (("array_info", "nominal_rate_hz"), math.nan),
         *[
             (("array_info", "stream_id"), stream_id)
             for stream_id in ("../x", "", "0" * 31, "G" * 32, "0" * 32 + "/..")
@@ -252,20 +243,6 @@ def test_a_damaged_batch_is_refused_and_asked_for_again(
     assert odd.connect() == [(10, None)]
     odd.send_again(odd.sent[-1])
     odd.acknowledged(19, first=10)
-
-
-def test_flipped_bits_of_a_batch_are_refused(healthy: FakeNode, odd: FakeNode) -> None:
-    random = np.random.default_rng(7)
-    for _ in range(40):
-        odd.reboot()
-        odd.connect()
-        spoilt = bytearray(odd.payload(odd.frames(10)))
-        spoilt[random.integers(0, 400)] ^= 1 << int(random.integers(8))  # in its description
-        odd.socket.send(bytes(spoilt))
-        with suppress(ConnectionClosed):
-            odd.socket.send("no JSON")  # closes the connection in any case
-        assert closed(odd.socket)[0] in (4001, 4004)
-    assert_goes_on(healthy)
 
 
 @pytest.mark.parametrize("t_mono_ns", [2**60, 2**62, 2**63 - 100, -(2**63)])

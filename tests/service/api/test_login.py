@@ -16,7 +16,7 @@ from service.protocol.link import INGEST_PATH
 from service.protocol.live import LIVE_PATH
 from tests.service.api.access import BEARER, CHANGES, TOKEN
 from tests.service.patient import patient_server
-from tests.service.running import Running, assert_refused
+from tests.service.running import Running, assert_refused, content_of
 from tests.waiting import PATIENCE_S
 
 
@@ -86,10 +86,7 @@ def private(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
 
 
 def create_ticket(running: Running, role: str = "operator") -> dict[str, Any]:
-    answer = running.http.post("/tickets", json={"role": role}, headers=BEARER)
-    assert answer.status_code == 201, answer.text
-    ticket: dict[str, Any] = answer.json()
-    return ticket
+    return dict(content_of(running.http.post("/tickets", json={"role": role}, headers=BEARER), 201))
 
 
 def browser(running: Running) -> httpx.Client:

@@ -22,7 +22,7 @@ from storage.verify.session import verify_session
 from tests.service.command import command
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
-from tests.service.running import Running, assert_refused
+from tests.service.running import Running, assert_refused, content_of
 from tests.storage.faulty_disk import failing_once
 from tests.waiting import until
 
@@ -69,10 +69,7 @@ def mark(session: Recording, label: str, **body: Any) -> dict[str, Any]:
     """Mark a frame of the middle, in the server's time."""
     t_ns = int(session.column("t_ns")[MARKED]) + HOUR_NS
     body = {"label": label, "t_ns": t_ns} | body
-    answer = session.running.http.post(f"{session.url}/markers", json=body)
-    assert answer.status_code == 201, answer.text
-    marker: dict[str, Any] = answer.json()
-    return marker
+    return dict(content_of(session.running.http.post(f"{session.url}/markers", json=body), 201))
 
 
 def labels_in(answer: httpx.Response, to: str) -> dict[int, str]:

@@ -18,8 +18,8 @@ from storage.sessions.overview import open_overview
 from storage.verify.session import verify_session
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.recording import Recording
-from tests.service.running import Running, assert_refused
-from tests.storage.faulty_disk import refusing
+from tests.service.running import Running, assert_refused, content_of
+from tests.storage.faulty_disk import flip_byte, refusing
 from tests.waiting import until
 
 ARROW = "application/vnd.apache.arrow.stream"
@@ -33,10 +33,7 @@ def request(session: Recording, headers: dict[str, str] | None = None, **query: 
 
 
 def get(session: Recording, **query: Any) -> dict[str, Any]:
-    answer = request(session, **query)
-    assert answer.status_code == 200, answer.text
-    content: dict[str, Any] = answer.json()
-    return content
+    return dict(content_of(request(session, **query)))
 
 
 def read_frames(session: Recording, *names: str) -> dict[str, Any]:
@@ -57,20 +54,6 @@ def hopped(shared_tared: FakeNode) -> Recording:
     node.deliver(199, [0.0, 0.0])
     node.finish(session)
     return session
-
-
-@pytest.mark.parametrize(("points", "in_bin"), [(1, 64), (20, 64), (100, 4), (1400, 1), (8000, 1)])
-def test_no_zoom_hides_a_peak(hopped: Recording, points: int, in_bin: int) -> None:
-    true = read_frames(hopped, "grf_n", "force_n")
-    overview = get(hopped, points=points)
-    columns = overview["columns"]
-    assert overview["frames_in_bin"] == in_bin
-    assert sum(columns["frames"]) == 1400
-    assert len(columns["frames"]) >= min(points, 1400)
-    highest = max(value for value in columns["grf_n_max"] if value is not None)
-    assert highest == pytest.approx(float(np.nanmax(true["grf_n"])), abs=1e-5)
-    lowest = min(columns["force_n_1_min"])
-    assert lowest == pytest.approx(float(true["force_n"][:, 1].min()), abs=1e-5)
 
 
 def test_bins_of_the_full_zoom_are_the_frames(hopped: Recording) -> None:
@@ -142,9 +125,7 @@ def test_a_missing_or_damaged_overview_is_rebuilt(
     path.unlink()
     assert get(hopped, points=20) == before
     assert path.read_bytes() == written
-    damaged = bytearray(written)
-    damaged[len(written) // 2] ^= 1
-    path.write_bytes(damaged)
+    flip_byte(path)
     assert any("overview.arrow" in text for text in verify_session(hopped.folder).problems)
     assert get(hopped, points=20) == before
     assert path.read_bytes() == written

@@ -65,9 +65,7 @@ def test_a_download_before_the_seal_has_its_rounded_estimates(tared: FakeNode) -
 
 
 def test_tiles_in_one_row_have_no_cop_across_it(tared: FakeNode) -> None:
-    session = tared.record()
-    tared.deliver(200, [20.0, 60.0])
-    tared.finish(session)
+    session = tared.record_sealed(200, [20.0, 60.0])
     sealed = pq.ParquetFile(session.folder / "frames.parquet")
     frames = sealed.read(["cop_x_m", "cop_y_m", "cop_sigma_y_m"])
     assert np.isfinite(frames["cop_x_m"].to_numpy()).any()
@@ -91,9 +89,7 @@ def test_an_exact_server_does_not_round(serve_with: ServeWith, node_of: NodeOf) 
     node.connect()
     node.tared()
     node.acknowledged(69)
-    session = node.record()
-    node.deliver(200, [20.0, 60.0], noise=1)
-    node.finish(session)
+    session = node.record_sealed(200, [20.0, 60.0], noise=1)
     schema = pq.read_schema(session.folder / "frames.parquet")
     assert not any(b"rounded_to" in (field.metadata or {}) for field in schema)
     with session.reader() as file:
@@ -163,9 +159,7 @@ def test_a_session_without_tare_is_sealed_raw(node: FakeNode) -> None:
     node.deliver(10, 50.0)
     session = node.record()
     node.deliver(50, 50.0)
-    session.stop()
-    node.send(10, 50.0, now=True)
-    sealed = session.sealed()
+    sealed = node.finish(session)
     assert "no estimates" in sealed["problem"]
     assert sealed["frames"] == 50
 

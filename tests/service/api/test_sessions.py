@@ -30,6 +30,7 @@ from storage.verify.session import verify_session
 from tests.service.api.sealed import Sealed
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import Running, assert_refused
+from tests.storage.faulty_disk import flip_byte
 from tests.waiting import PATIENCE_S
 
 JSON = {"Content-Type": "application/json"}
@@ -226,9 +227,7 @@ def test_tiles_without_a_calibration_have_no_scale(running: Running, node_of: No
     node = node_of(running, calibration=None)
     node.connect()
     node.deliver(10)
-    session = node.record()
-    node.deliver(50, [0.0, 30.0])
-    node.finish(session)
+    session = node.record_sealed(50, [0.0, 30.0])
     found = running.http.get(f"{session.url}/tiles").json()
     assert (found["calibration"], found["lag_ms"]) == (None, None)
     assert found["estimates_problem"] == "the node had no calibration"
@@ -237,13 +236,6 @@ def test_tiles_without_a_calibration_have_no_scale(running: Running, node_of: No
 
 
 # --- verification, damage, permissions ------------------------------------------------------------
-
-
-def flip_byte(path: Path, bits: int = 1) -> None:
-    """Change the byte in the middle of a file."""
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= bits
-    path.write_bytes(content)
 
 
 def test_a_session_is_verified_and_not_changed(running: Running, tared: FakeNode) -> None:
@@ -295,14 +287,12 @@ def test_a_damaged_description_is_rebuilt_or_named(running: Running, node: FakeN
 def test_no_answer_names_the_data_folder(
     running: Running, tared: FakeNode, caplog: pytest.LogCaptureFixture
 ) -> None:
-    session = tared.record()
-    tared.deliver(100, [20.0, 60.0])
-    tared.finish(session)
+    session = tared.record_sealed(100, [20.0, 60.0])
     running.stop()
     folders = [session.folder, running.data / "nodes" / "bench"]
     for path in (path for folder in folders for path in folder.rglob("*") if path.is_file()):
         if path.name != "session.json":
-            flip_byte(path, 0xFF)
+            flip_byte(path, bits=0xFF)
     other = session.folder.with_name("20200101T000000Z-00000a")
     other.mkdir()
     (other / "session.json").write_text("{")
@@ -350,9 +340,7 @@ def umask() -> Iterator[None]:
 @pytest.mark.usefixtures("umask")
 def test_a_used_data_folder_is_closed_to_others(running: Running, tared: FakeNode) -> None:
     load_or_create_token(None, running.data)
-    session = tared.record()
-    tared.deliver(10)
-    tared.finish(session)
+    session = tared.record_sealed(10)
     assert running.http.delete(session.url).status_code == 204
     assert running.http.get("/ready").status_code == 200
     running.stop()

@@ -145,9 +145,7 @@ def test_a_session_without_stances_has_a_reason(
     bare = node_of(running, "bare", calibration=None)
     bare.connect()
     bare.deliver(10)
-    raw = bare.record()
-    bare.deliver(20)
-    bare.finish(raw)
+    raw = bare.record_sealed(20)
     assert not (raw.folder / "stances.parquet").exists()
     for rest in ("", "/overlay"):
         assert_refused(get(raw, rest), 404, "no estimates: the node had no calibration")

@@ -7,7 +7,7 @@ import pytest
 
 from tests.builders.arrays import COUNT_KPA
 from tests.service.fake_node import FakeNode
-from tests.service.running import Running, assert_refused, receive_live
+from tests.service.running import Running, assert_refused, content_of, receive_live
 
 URL = "/nodes/bench/tare"
 
@@ -34,9 +34,7 @@ def test_a_tare_is_in_force_until_it_is_undone(running: Running, tared: FakeNode
     tared.next_t_mono_ns += 11_000_000_000
     tared.send(300, 2.0, alive=True)  # warmer by two counts
     tared.taken_in()
-    answer = running.http.post(URL, json={})
-    assert answer.status_code == 201, answer.text
-    tare = answer.json()
+    tare = content_of(running.http.post(URL, json={}), 201)
     assert tare["source"] == "unloaded"
     rise = np.subtract(tare["baseline_kpa"], by_lead["baseline_kpa"])
     assert rise == pytest.approx([2 * COUNT_KPA] * 2, abs=1e-6)

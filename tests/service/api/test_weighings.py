@@ -18,7 +18,7 @@ from tests.builders.calibrations import make_calibration, newton_tile
 from tests.service.api.access import BEARER, TOKEN
 from tests.service.api.sealed import Sealed
 from tests.service.fake_node import FakeNode, Play
-from tests.service.running import Running, assert_refused
+from tests.service.running import Running, assert_refused, content_of
 from tests.waiting import until
 
 URL = "/nodes/bench/weighing"
@@ -33,10 +33,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def start(running: Running, **body: object) -> dict[str, Any]:
-    answer = running.http.post(URL, json=BODY | body)
-    assert answer.status_code == 201, answer.text
-    content: dict[str, Any] = answer.json()
-    return content
+    return dict(content_of(running.http.post(URL, json=BODY | body), 201))
 
 
 def get(running: Running) -> dict[str, Any]:
