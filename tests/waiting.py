@@ -28,11 +28,13 @@ def in_a_loop(test: Callable[P, Coroutine[Any, Any, None]]) -> Callable[P, None]
     return run
 
 
-def until(condition: Callable[[], T], timeout_s: float = PATIENCE_S) -> T:
-    """What `condition` gives, as soon as that is true."""
+def until(
+    condition: Callable[[], T], timeout_s: float = PATIENCE_S, *, every_s: float = 0.005
+) -> T:
+    """What `condition` gives, as soon as that is true; it is asked for every so many seconds."""
     end_s = time.monotonic() + timeout_s
     while not (found := condition()):
         if time.monotonic() > end_s:
             pytest.fail(f"not true within {timeout_s} s; last: {found!r}", pytrace=True)
-        time.sleep(0.005)
+        time.sleep(every_s)
     return found

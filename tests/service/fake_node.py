@@ -410,7 +410,9 @@ NodeOf = Callable[..., FakeNode]
 class Play:
     """A node that streams in real time until it is told to stop."""
 
-    def __init__(self, node: FakeNode, force_n: float = 0.0, *, alive: bool = False) -> None:
+    def __init__(
+        self, node: FakeNode, force_n: float | Sequence[float] = 0.0, *, alive: bool = False
+    ) -> None:
         self.node = node
         self.force_n = force_n
         self.alive = alive

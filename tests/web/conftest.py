@@ -6,7 +6,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any
 
 import httpx
 import pytest
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, Route, expect, sync_playwright
 
 from tests.service.patient import be_patient, patient_server
 from tests.service.running import Running
@@ -41,15 +40,6 @@ CHROMIUM_OPTIONS = [
 ]
 
 expect.set_options(timeout=1e3 * PATIENCE_S)
-
-
-def wait_until(true: Callable[[], bool], what: str, timeout_s: float = PATIENCE_S) -> None:
-    end = time.monotonic() + timeout_s
-    while time.monotonic() < end:
-        if true():
-            return
-        time.sleep(0.05)
-    pytest.fail(f"waited {timeout_s} s in vain for {what}")
 
 
 @dataclass
@@ -127,12 +117,22 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture
 def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
-    """Opens the page at a size, a script of the test first; fails if its console complains."""
+    """Opens a page at a size, with a script and answers of the test's own.
+
+    The test fails if a console complains, unless it may.
+    """
     complaints: list[str] = []
     contexts = []
 
     def open_(
-        url: str, width: int = 1366, height: int = 768, first: str = "", **options: Any
+        url: str,
+        width: int = 1366,
+        height: int = 768,
+        *,
+        first: str = "",
+        answers: dict[str, Callable[[Route], object]] | None = None,
+        may_complain: bool = False,
+        **options: Any,
     ) -> Page:
         context = browser.new_context(
             viewport={"width": width, "height": height}, accept_downloads=True, **options
@@ -143,11 +143,14 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
         page.set_default_timeout(1e3 * PATIENCE_S)
         if first:
             page.add_init_script(first)
-        page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on(
-            "console",
-            lambda m: complaints.append(m.text) if m.type in ("error", "warning") else None,
-        )
+        for part, answer in (answers or {}).items():
+            page.route(part, answer)
+        if not may_complain:
+            page.on("pageerror", lambda error: complaints.append(str(error)))
+            page.on(
+                "console",
+                lambda m: complaints.append(m.text) if m.type in ("error", "warning") else None,
+            )
         page.goto(url)
         return page
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import Any
 
 from tests.service.fake_node import FakeNode, Play
 from tests.service.recording import Recording
@@ -26,6 +27,11 @@ class Scripted:
     def url(self) -> str:
         return self.running.url
 
+    def ticket(self, role: str = "viewer") -> str:
+        """A ticket that logs a browser in, once."""
+        answer = self.running.http.post("/tickets", json={"role": role})
+        return str(answer.json()["ticket"])
+
     def recorded(self, name: str) -> Recording:
         """A sealed session."""
         with Play(self.node):
@@ -45,6 +51,17 @@ class Scripted:
         session.stop()
         self.node.send(10, now=True)
         return session
+
+    def tell(self, *warnings: str) -> None:
+        """Have the server warn of the node's troubles."""
+
+        def change() -> None:
+            server: Any = self.running.server
+            node = server.nodes.get("bench")
+            node.warnings = warnings
+            server.notify_node_changed(node)
+
+        self.running.call(change)
 
     def close(self) -> None:
         self.node.close()

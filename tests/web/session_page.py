@@ -11,6 +11,8 @@ from playwright.sync_api import Page, expect
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
 from tests.service.running import Running
+from tests.web.pages import box_of
+from tests.web.scripted import Scripted
 
 LOST = 40
 LABEL = "a <b>stone</b>"
@@ -67,3 +69,32 @@ def grf(session: Recording) -> tuple[np.ndarray, np.ndarray]:
     table = pq.read_table(session.folder / "frames.parquet", columns=["t_ns", "grf_n"])
     t_ns = table["t_ns"].to_numpy()
     return (t_ns - t_ns[0]) * 1e-9, table["grf_n"].to_numpy().astype(float)
+
+
+def with_marker(scripted: Scripted) -> Recording:
+    """A sealed session with a marker in its middle."""
+    session = scripted.recorded("walk")
+    t_ns = session.column("t_ns")
+    clock = session.clock()["streams"][0]["stretches"][0]
+    middle = int(t_ns[len(t_ns) // 2]) + clock["offset_ns"]
+    answer = session.running.http.post(
+        f"{session.url}/markers", json={"label": "a stone", "t_ns": middle}
+    )
+    assert answer.status_code == 201
+    return session
+
+
+def left_px(page: Page) -> float:
+    """Where plots begin."""
+    px: float = page.locator("#plots").evaluate("(plots) => plots.clientWidth < 600 ? 40 : 56")
+    return px
+
+
+def drag_in_plots(page: Page, from_px: float, to_px: float) -> None:
+    """Drag at the height of markers' flags."""
+    page.locator("#plots").evaluate("(plots) => plots.scrollIntoView()")
+    box = box_of(page.locator("#plots"))
+    page.mouse.move(box["x"] + from_px, box["y"] + 8)
+    page.mouse.down()
+    page.mouse.move(box["x"] + to_px, box["y"] + 8, steps=3)
+    page.mouse.up()

@@ -3,103 +3,69 @@
 from __future__ import annotations
 
 import re
-import subprocess
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import expect
 
 from service.server import weighing, weighings
-from tests.service.cli.outcome import scene_text, static_only
-from tests.service.fake_node import Play
+from tests.service.fake_node import FakeNode, Play
 from tests.service.running import Running
 from tests.waiting import until
-from tests.web.conftest import COMMAND
+from tests.web.pages import DESK, PHONE, OpenPage, complaints, complaints_at, width_of
 from tests.web.scripted import Scripted
-from tests.web.test_accessible import SIZES, complaints
 
 pytestmark = pytest.mark.real_time
 
-OpenPage = Callable[..., Page]
-TOKEN = "a-token-of-this-test"  # noqa: S105  # of this test
-STEP_S = 3.0
-"""A fit requires steps of at least 2 s."""
-LEAD_S = 25
-EACH_S = 14.0
-"""A rest and a weight: each settles for about 3 s and is held for 3 s."""
-FORCES_N = (2.0, 5.0, 10.0, 15.0, 20.0)
-SLOW_MS = 1e3 * (LEAD_S + EACH_S + 60)
+FORCES_N = (10, 20, 40, 60, 80)
+"""A count of the chip is a newton: what the form offers would be too near each other."""
 
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("REST_S", "HOLD_S"):
-        monkeypatch.setattr(weighing, name, STEP_S)
-
-
-@contextmanager
-def foot_with_weights(
-    running: Running, folder: Path, environment: dict[str, str]
-) -> Iterator[None]:
-    """Run an emulated foot of one tile, loaded with five forces after a lead-in."""
-    (folder / "one.toml").write_text(static_only(scene_text("standing", 1)))
-    rows = ["time_s,cell1_n"]
-    for number, force_n in enumerate(FORCES_N):
-        begin_s = EACH_S * number
-        on_s, off_s = begin_s + 0.5 * EACH_S, begin_s + EACH_S - 0.4
-        rows += [f"{begin_s},0", f"{on_s},0", f"{on_s + 0.4},{force_n}", f"{off_s},{force_n}"]
-    rows += [f"{EACH_S * len(FORCES_N)},0", f"{EACH_S * len(FORCES_N) + 60},0", ""]
-    (folder / "weights.csv").write_text("\n".join(rows))
-    command = [
-        *(*COMMAND, "node", "--scene", "one.toml", "--server", running.url, "--name", "bench"),
-        *("--load", "weights.csv", "--lead-s", str(LEAD_S), "--journal", "journal"),
-    ]
-    token = {"FOOTTILE_TOKEN": running.shown["Authorization"].split()[-1]}
-    node = subprocess.Popen(command, cwd=folder, env=environment | token)
-    try:
-        yield
-    finally:
-        node.terminate()
-        node.wait(20)
+        monkeypatch.setattr(weighing, name, 2.5)  # a fit needs steps of 2 s or more
 
 
 @pytest.mark.slow
 def test_a_tile_is_calibrated_and_used_by_its_node(
-    server: Running,
-    open_page: OpenPage,
-    tmp_path: Path,
-    field_environment: dict[str, str],
-    quick: None,
+    server: Running, open_page: OpenPage, quick: None
 ) -> None:
-    with foot_with_weights(server, tmp_path, field_environment):
-        page = open_page(f"{server.url}/calibrate", 390, 844)
+    node = FakeNode(server, tiles=1)
+    node.connect()
+    node.tared()
+    with Play(node, alive=True) as play:
+        page = open_page(f"{server.url}/calibrate", *PHONE)
         expect(page.locator("#tiles input")).to_have_count(1)
         assert complaints(page) == []
         page.check("input[value=sensor]")
         expect(page.locator("#weights")).to_have_value("2 N, 5 N, 10 N, 15 N, 20 N")
+        page.fill("#weights", ", ".join(f"{force_n} N" for force_n in FORCES_N))
         page.fill("#within", "0.5")
         page.fill("#name", "left heel")
         page.click("#start")
-        prompt, steps = page.locator("#prompt"), page.locator("#steps li li[data-state=done]")
-        expect(prompt).to_have_text("Press T01 until the sensor reads 2 N, and clamp it")
-        assert complaints(page) == []
-        expect(steps).to_have_count(1, timeout=SLOW_MS)
-        expect(page.locator("#repeat")).to_have_text("Repeat 2 N")
-        page.reload()  # the server holds the state
-        expect(steps).to_have_count(1)
-        for count in range(2, 5):
-            expect(steps).to_have_count(count, timeout=SLOW_MS)
-        assert page.evaluate("document.documentElement.scrollWidth") <= 390
-        expect(page.locator("#result-title")).to_have_text("left heel", timeout=SLOW_MS)
+        steps = page.locator("#steps li li[data-state=done]")
+        for count, force_n in enumerate(FORCES_N):
+            expect(page.locator("#prompt")).to_have_text(
+                f"Press T01 until the sensor reads {force_n} N, and clamp it"
+            )
+            if not count:
+                assert complaints(page) == []
+            play.force_n = force_n
+            expect(steps).to_have_count(count + 1)
+            play.force_n = 0.0
+            if not count:
+                expect(page.locator("#repeat")).to_have_text(f"Repeat {force_n} N")
+                page.reload()  # the server holds the state
+                expect(steps).to_have_count(1)
+            if count == len(FORCES_N) - 2:
+                assert width_of(page) <= PHONE[0]
+        expect(page.locator("#result-title")).to_have_text("left heel")
         expect(page.locator("#about")).to_contain_text("force sensor, 5 weights within ±0.5 %")
         expect(page.locator("#result tbody tr")).to_have_count(len(FORCES_N))
         for heading in ("Noise", "Settled"):
             expect(page.get_by_role("columnheader", name=heading)).to_be_in_viewport(ratio=1)
         expect(page.locator("#result svg.curve circle")).to_have_count(len(FORCES_N))
         assert complaints(page) == []
-        assert page.evaluate("document.documentElement.scrollWidth") <= 390
         page.click("#accept")
         expect(page.locator("#notices")).to_contain_text(
             "bench uses this calibration from the next frame"
@@ -107,17 +73,14 @@ def test_a_tile_is_calibrated_and_used_by_its_node(
         expect(page.locator("#setup")).to_be_visible()
         used = server.http.get("/nodes/bench/calibration").json()
         assert (used["source"], used["calibration"]["name"]) == ("server", "left heel")
+    node.close()
 
 
-@SIZES
 def test_a_failed_calibration_shows_its_reason_and_can_be_repeated(
-    scripted: Scripted,
-    open_page: OpenPage,
-    size: tuple[int, int],
-    monkeypatch: pytest.MonkeyPatch,
+    scripted: Scripted, open_page: OpenPage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with Play(scripted.node, 5.0, alive=True):
-        page = open_page(f"{scripted.url}/calibrate?node=bench", *size)
+        page = open_page(f"{scripted.url}/calibrate?node=bench", *PHONE)
         for field in ("#reference", "#name"):
             expect(page.locator(field)).to_have_attribute(
                 "placeholder", re.compile("^for example ")
@@ -134,8 +97,7 @@ def test_a_failed_calibration_shows_its_reason_and_can_be_repeated(
         expect(page.locator("#progress")).to_have_text("T02, weight 1 of 5, tile 1 of 2")
         expect(page.locator("#problem")).to_contain_text("no step was completed")
         expect(page.locator("#accept")).to_be_hidden()
-        assert complaints(page) == []
-        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+        assert complaints_at(page, DESK, PHONE) == []
         page.click("#restart")
         expect(page.locator("#guide")).to_be_visible()
         page.reload()
@@ -146,21 +108,3 @@ def test_a_failed_calibration_shows_its_reason_and_can_be_repeated(
         expect(page.locator("#weights")).to_have_value("200 g, 500 g, 1 kg, 1.5 kg, 2.2 kg")
         expect(page.locator("#within")).to_have_value("2.5")
         until(lambda: not scripted.running.node()["recording"])
-
-
-def test_a_viewer_sees_the_calibration_and_cannot_change_it(
-    script: Callable[..., Scripted], open_page: OpenPage
-) -> None:
-    server = script(token=TOKEN)
-    ticket = server.running.http.post("/tickets", json={"role": "viewer"}).json()["ticket"]
-    plan = {"tiles": ["T01"], "weights": ["10 N", "20 N", "30 N", "40 N", "50 N"]}
-    with Play(server.node, alive=True):
-        page = open_page(f"{server.url}/calibrate#ticket={ticket}")
-        expect(page.locator("#setup-viewer")).to_be_visible()
-        expect(page.locator("#start")).to_be_hidden()
-        server.running.http.post("/nodes/bench/weighing", json=plan)
-        expect(page.locator("#prompt")).to_contain_text("T01")
-        for button in ("#repeat", "#cancel"):
-            expect(page.locator(button)).to_be_hidden()
-        server.running.http.delete("/nodes/bench/weighing")
-        expect(page.locator("#setup")).to_be_visible()

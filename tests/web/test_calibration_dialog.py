@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -14,14 +13,12 @@ from service.sessions.calibration_file import encode_calibration
 from tests.builders.calibrations import make_calibration
 from tests.service.fake_node import Play
 from tests.web.login import log_in
+from tests.web.pages import DESK, PHONE, OpenPage, complaints, complaints_at
 from tests.web.received import Received
 from tests.web.scripted import Scripted
-from tests.web.test_accessible import SIZES, complaints
 
 pytestmark = pytest.mark.real_time
 
-OpenPage = Callable[..., Page]
-TOKEN = "a-token-of-this-test"  # noqa: S105  # of this test
 JSON = {"Content-Type": "application/json"}
 
 
@@ -43,15 +40,14 @@ def row(page: Page, calibration: Calibration) -> str:
     return f'#calibrations li[data-id="{calibration.id}"]'
 
 
-@SIZES
 def test_another_calibration_is_chosen_and_the_nodes_own_again(
-    scripted: Scripted, open_page: OpenPage, size: tuple[int, int]
+    scripted: Scripted, open_page: OpenPage
 ) -> None:
     fits = kept(scripted, "T01", "T02", name="left leg, November")
     lacks = kept(scripted, "T01", name="one tile")
     own = used(scripted)
     with Play(scripted.node, 5.0):
-        page = open_page(scripted.url, *size)
+        page = open_page(scripted.url, *PHONE)
         expect(page.locator("#calibration-name")).to_have_text(f"Calibration “{own[1]}”")
         page.click("#calibration")
         expect(page.locator("#calibration-used")).to_contain_text("from the node")
@@ -61,14 +57,13 @@ def test_another_calibration_is_chosen_and_the_nodes_own_again(
         expect(page.locator(row(page, lacks))).to_contain_text("Does not fit: no curve for T02")
         expect(page.locator(f"{row(page, lacks)} button")).to_have_count(0)
         expect(page.locator(row(page, fits))).to_contain_text(f"{fits.date}, T01, T02, scale")
-        assert complaints(page) == []
+        assert complaints_at(page, DESK, PHONE) == []
         page.click(f"{row(page, fits)} button")
         expect(page.locator(row(page, fits))).to_have_attribute("data-used", "true")
         expect(page.locator("#calibration-used")).to_contain_text("“left leg, November”")
         expect(page.locator("#calibration-used")).to_contain_text("assigned on")
         assert used(scripted) == ("server", "left leg, November")
-        assert complaints(page) == []
-        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+        assert complaints_at(page, DESK, PHONE) == []
         page.click("#calibration-back")
         expect(page.locator("#calibration-used")).to_contain_text("from the node")
         assert used(scripted) == own
@@ -107,20 +102,6 @@ def test_a_choice_that_somebody_else_has_made_meanwhile_is_not_overwritten(
     page.click(f"{row(page, mine)} button")
     expect(page.locator("#calibration-said")).to_contain_text(re.compile("Not done: .*bench"))
     assert used(scripted) == ("server", "theirs")
-
-
-def test_a_viewer_sees_calibrations_and_cannot_press(
-    script: Callable[..., Scripted], open_page: OpenPage
-) -> None:
-    server = script(token=TOKEN)
-    calibration = kept(server, "T01", "T02", name="left leg")
-    ticket = server.running.http.post("/tickets", json={"role": "viewer"}).json()["ticket"]
-    page = open_page(f"{server.url}#ticket={ticket}")
-    expect(page.locator("#login")).to_have_text("viewer (read-only)")
-    page.click("#calibration")
-    expect(page.locator(row(page, calibration))).to_be_visible()
-    for button in (f"{row(page, calibration)} button", "#calibration-file", "#calibration-back"):
-        expect(page.locator(button)).to_be_hidden()
 
 
 def test_the_dialog_is_loaded_when_it_is_opened(scripted: Scripted, open_page: OpenPage) -> None:

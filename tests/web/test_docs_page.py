@@ -9,10 +9,9 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from tests.service.running import Running
+from tests.web.pages import TOKEN
 
 pytestmark = pytest.mark.real_time
-
-TOKEN = "a-token-of-this-test"  # noqa: S105  # of this test
 
 
 @pytest.fixture

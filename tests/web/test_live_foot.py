@@ -3,23 +3,31 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Page, expect
 
+from devices.frames import ArrayInfo, TileInfo
 from service.api.app import find_page_folder
 from tests.builders.arrays import make_array, make_tile
 from tests.service.fake_node import FakeNode, Play
+from tests.waiting import until
+from tests.web.pages import (
+    LIVE,
+    PHONE,
+    OpenPage,
+    at_sizes,
+    blue_px,
+    box_of,
+    complaints,
+    live,
+    width_of,
+)
 from tests.web.scripted import Scripted
-from tests.web.test_accessible import complaints
-from tests.web.test_live_notes import tell
+from tests.web.session_page import settled
 
 pytestmark = pytest.mark.real_time
 
-OpenPage = Callable[..., Page]
-LIVE = "body[data-live=true]"
 
 OF_THEIR_FORCE = """async () => {
   const { shadesOf, shadeOf } = await import("/static/common/heat.js");
@@ -34,89 +42,79 @@ OF_THEIR_FORCE = """async () => {
 }"""
 """Is each tile of the picture of the colour of its force? One step of the colours is let pass."""
 
-TOES_UP = """async () => {
-  const { FootLayout, isGrid } = await import("/static/common/foot_layout.js");
-  const at = (x, y) => ({ serial: "", x_m: x, y_m: y, z_m: 0 });
-  const box = { widthPx: 300, heightPx: 300, roomPx: 0, toesUp: true };
-  const square = [at(0, 0), at(0.01, 0), at(0, 0.01), at(0.01, 0.01)];
-  const [heel, toe, left] = new FootLayout(square, box).points;
-  return {
-    toesAbove: toe.y < heel.y && toe.x === heel.x,
-    leftLeft: left.x < heel.x && left.y === heel.y,
-    grid: isGrid(square), diamond: isGrid([at(0, 0), at(0.01, 0.01), at(0.02, 0), at(0.01, -0.01)]),
-    line: isGrid([at(0, 0), at(0.01, 0)]),
-  };
-}"""
-
-TRACED = """() => {
-  const canvas = document.querySelector("#tile-traces");
-  const { width, height } = canvas;
-  // A copy: of one that is read again and again Chromium complains.
-  const copy = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
+BARS_OF_THEIR_FORCE = """() => {
+  const canvas = document.querySelector("#tracks");
+  const copy = new OffscreenCanvas(canvas.width, canvas.height)
+    .getContext("2d", { willReadFrequently: true });
   copy.drawImage(canvas, 0, 0);
-  const { data } = copy.getImageData(width / 2, 0, width / 2, height);
-  let blue = 0;
-  for (let i = 0; i < data.length; i += 4) blue += data[i + 2] - data[i] > 60 && data[i + 3] > 100;
-  return blue;
+  const origin = canvas.getBoundingClientRect();
+  return [...document.querySelectorAll("#bars .tile")].every((tile) => {
+    const track = tile.querySelector(".track");
+    const box = track.getBoundingClientRect();
+    const full = Number.parseFloat(tile.querySelector(".scale").textContent.split("-")[1]);
+    const left = Math.round(box.left - origin.left + 0.1 * box.width);
+    const [top, height] = [Math.round(box.top - origin.top), Math.round(box.height)];
+    const column = copy.getImageData(left, top, 1, height).data;
+    let blue = 0;
+    for (let i = 0; i < column.length; i += 4) blue += column[i + 2] - column[i] > 60;
+    const longPx = Number(tile.dataset.value) / full / 1.1 * track.clientHeight - 4;
+    return longPx > 2 && Math.abs(blue - longPx) < 3;
+  });
 }"""
+"""Is each bar as long as its value says? Two pixels at each end are under lines."""
+
+
+class Arranged(FakeNode):
+    """A node with tiles in places of the test's own."""
+
+    placed: list[TileInfo]
+
+    @property
+    def info(self) -> ArrayInfo:
+        facts = {"node": self.name, "stream_id": self.stream_id}
+        return make_array(self.placed, **facts, utc_offset_ns=self.utc_offset_ns)
+
+
+def arranged(scripted: Scripted, name: str, tiles: list[TileInfo]) -> FakeNode:
+    """A node with these tiles that is ready to play."""
+    node = Arranged(scripted.running, name, tiles=len(tiles))
+    node.placed = tiles
+    node.connect()
+    node.tared()
+    return node
 
 
 def top_of(page: Page, selector: str) -> float:
-    box = page.locator(selector).bounding_box()
-    assert box is not None, selector
-    return box["y"]
+    return box_of(page.locator(selector))["y"]
 
 
 def bottom_of(page: Page, selector: str) -> float:
-    box = page.locator(selector).bounding_box()
-    assert box is not None, selector
+    box = box_of(page.locator(selector))
     return box["y"] + box["height"]
 
 
-def test_tiles_have_the_colour_of_their_force_and_the_range_says_which_it_is(
+def test_bars_and_tiles_show_their_force_in_both_ranges_and_on_any_screen(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     with Play(scripted.node, 15.0):
-        page = open_page(scripted.url)
-        expect(page.locator(LIVE)).to_have_count(1)
+        page = live(open_page(scripted.url))
         top = page.locator("#foot .heat-legend text").first
+        scale = page.locator("#bars .scale").first
         expect(page.locator("#range")).to_have_text("Range: fixed")
-        fixed = page.locator("#bars .scale").first.inner_text()
-        page.wait_for_function(OF_THEIR_FORCE)
-        before = top.text_content()
+        before, fixed = top.text_content() or "", scale.inner_text()
+        for of_their_force in (OF_THEIR_FORCE, BARS_OF_THEIR_FORCE):
+            page.wait_for_function(of_their_force)
         page.click("#range")
         expect(page.locator("#range")).to_have_text("Range: auto")
-        expect(top).not_to_have_text(before or "")
-        expect(page.locator("#bars .scale").first).not_to_have_text(fixed)
-        page.wait_for_function(OF_THEIR_FORCE)
+        expect(top).not_to_have_text(before)
+        expect(scale).not_to_have_text(fixed)
+        for of_their_force in (OF_THEIR_FORCE, BARS_OF_THEIR_FORCE):
+            page.wait_for_function(of_their_force)
+        for size in at_sizes(page, PHONE, *((width, 800) for width in (320, 600, 1000, 2560))):
+            page.wait_for_function(BARS_OF_THEIR_FORCE)
+            assert width_of(page) == size[0]
         page.reload()
         expect(page.locator("#range")).to_have_text("Range: auto")
-
-
-def test_the_centre_of_pressure_draws_a_trail_of_two_seconds(
-    scripted: Scripted, open_page: OpenPage
-) -> None:
-    with Play(scripted.node, 15.0):
-        page = open_page(scripted.url)
-        expect(page.locator("#cop")).to_contain_text("COP x")
-        paths = """() => [...document.querySelectorAll("#foot .cop-trail")]
-          .every((part) => part.getAttribute("d").length > 40)"""
-        page.wait_for_function(paths)  # the oldest part, too, is there
-        kept = page.get_attribute("#foot .cop-span", "data-trail")
-        assert 4 <= int(kept or 0) <= 121  # at 60 pictures a second at most
-
-
-def test_from_above_toes_are_up_and_only_a_grid_is_drawn_of_squares(
-    scripted: Scripted, open_page: OpenPage
-) -> None:
-    page = open_page(scripted.url)
-    assert page.evaluate(TOES_UP) == {
-        "toesAbove": True,
-        "leftLeft": True,
-        "grid": True,
-        "diamond": False,
-        "line": False,
-    }
 
 
 def test_a_grid_is_a_heat_map_with_readable_numbers_on_a_phone(
@@ -127,16 +125,7 @@ def test_a_grid_is_a_heat_map_with_readable_numbers_on_a_phone(
         for i in range(64)
     ]
 
-    class Grid(FakeNode):
-        @property
-        def info(self) -> Any:
-            facts = {"node": self.name, "stream_id": self.stream_id}
-            return make_array(tiles, **facts, utc_offset_ns=self.utc_offset_ns)
-
-    scripted.node.close()
-    node = Grid(scripted.running, "grid", tiles=64)
-    node.connect()
-    node.tared()
+    node = arranged(scripted, "grid", tiles)
     with Play(node, 12.0):
         page = open_page(scripted.url, 390, 844)
         page.select_option("#node-select", "grid")
@@ -156,8 +145,7 @@ def test_a_grid_is_a_heat_map_with_readable_numbers_on_a_phone(
         expect(number).to_have_text(f"{float(kpa):.1f}")
         expect(page.locator("#foot .heat-legend")).to_contain_text("kPa")
         page.click("#unit-n")
-        cell = page.locator("#foot rect.dome").first.bounding_box()
-        assert cell is not None
+        cell = box_of(page.locator("#foot rect.dome").first)
         assert cell["width"] >= 26
         assert bottom_of(page, "#foot") < top_of(page, "#actions")
         assert page.evaluate("document.documentElement.scrollWidth") == 390
@@ -165,67 +153,49 @@ def test_a_grid_is_a_heat_map_with_readable_numbers_on_a_phone(
     node.close()
 
 
-@pytest.mark.parametrize(
-    ("places_m", "text"),
-    [
-        # A reference tile beside the row: drawn from above.
-        (
-            [(0.0, 0.012), (0.014, 0.012), (0.0, 0.04)],
-            r"COP x .+ ± .+ mm \(95\s%\), y not measured",
-        ),
-        (
-            [(0.02, -0.01), (0.02, 0.01), (0.05, 0.0)],
-            r"COP y .+ ± .+ mm \(95\s%\), x not measured",
-        ),
-    ],
-)
 def test_a_row_of_tiles_draws_the_cop_on_the_row_and_gives_no_number_across_it(
-    scripted: Scripted, open_page: OpenPage, places_m: list[tuple[float, float]], text: str
+    scripted: Scripted, open_page: OpenPage
 ) -> None:
-    tiles = [
-        make_tile(i, x_m=x_m, y_m=y_m, reference=i == 2) for i, (x_m, y_m) in enumerate(places_m)
-    ]
+    rows = {  # each with a reference tile beside it: drawn from above
+        r"COP x .+ ± .+ mm \(95\s%\), y not measured": [(0.0, 0.012), (0.014, 0.012), (0.0, 0.04)],
+        r"COP y .+ ± .+ mm \(95\s%\), x not measured": [(0.02, -0.01), (0.02, 0.01), (0.05, 0.0)],
+    }
+    page = open_page(scripted.url)
+    for text, places_m in rows.items():
+        tiles = [
+            make_tile(i, x_m=x_m, y_m=y_m, reference=i == 2)
+            for i, (x_m, y_m) in enumerate(places_m)
+        ]
+        node = arranged(scripted, f"row-{text[4]}", tiles)
+        with Play(node, 15.0):
+            page.goto(scripted.url)
+            page.select_option("#node-select", node.name)
+            expect(page.locator("#cop")).to_have_text(re.compile(f"^{text}$"))
+            expect(page.locator("#foot .cop-symbol")).to_be_visible()
+            page.goto(f"{scripted.url}/nodes")
+            expect(page.locator(f'.node[data-node="{node.name}"][data-live="true"]')).to_have_count(
+                1
+            )
+        node.close()
 
-    class Row(FakeNode):
-        @property
-        def info(self) -> Any:
-            facts = {"node": self.name, "stream_id": self.stream_id}
-            return make_array(tiles, **facts, utc_offset_ns=self.utc_offset_ns)
 
-    scripted.node.close()
-    node = Row(scripted.running, "row", tiles=3)
-    node.connect()
-    node.tared()
-    with Play(node, 15.0):
-        page = open_page(scripted.url)
-        page.select_option("#node-select", "row")
-        expect(page.locator("#cop")).to_have_text(re.compile(f"^{text}$"))
-        expect(page.locator("#foot .cop-symbol")).to_be_visible()
-        page.goto(f"{scripted.url}/nodes")
-        expect(page.locator('.node[data-node="row"][data-live="true"]')).to_have_count(1)
-    node.close()
-
-
-@pytest.mark.parametrize("height", [844, 740])
 def test_the_first_screen_of_a_phone_has_what_matters(
-    scripted: Scripted, open_page: OpenPage, height: int
+    scripted: Scripted, open_page: OpenPage
 ) -> None:
     with Play(scripted.node, 15.0):
-        page = open_page(scripted.url, 390, height)
-        expect(page.locator(LIVE)).to_have_count(1)
+        page = live(open_page(scripted.url, *PHONE))
         trouble = [f"trouble {i} that is long enough for two lines of a phone" for i in range(9)]
-        tell(scripted, *trouble)
+        scripted.tell(*trouble)
         expect(page.locator("#notes-more")).to_have_text("8 more")
         expect(page.locator("#tared")).to_have_text(re.compile("^Tared .+ ago$"))
         expect(page.locator("#fields")).to_have_text("Names …")
-        bar = page.locator("#actions").bounding_box()
-        assert bar is not None
-        assert bar["height"] < 110  # a line of what is recorded, and the buttons
-        assert bar["y"] + bar["height"] <= height
-        for part in ("#notes-box", "#grf", "#tared", "#trace", "#foot", "#record"):
-            assert bottom_of(page, part) <= height, part
-        if height == 844:
-            assert bottom_of(page, "#bars") <= bar["y"]
+        for _, height in at_sizes(page, (390, 740), PHONE):
+            bar = box_of(page.locator("#actions"))
+            assert bar["height"] < 110  # a line of what is recorded, and the buttons
+            assert bar["y"] + bar["height"] <= height
+            for part in ("#notes-box", "#grf", "#tared", "#trace", "#foot", "#record"):
+                assert bottom_of(page, part) <= height, part
+        assert bottom_of(page, "#bars") <= bar["y"]  # on the higher one
         rows = {
             round(top_of(page, f"#{name}"))
             for name in ("tare", "record", "undo", "marker", "fields")
@@ -271,29 +241,15 @@ def test_eight_tiles_are_on_one_screen_of_a_laptop(scripted: Scripted, open_page
     node.close()
 
 
-def test_tiles_are_shown_as_traces_and_this_is_remembered(
-    scripted: Scripted, open_page: OpenPage
-) -> None:
-    with Play(scripted.node, 15.0):
-        page = open_page(scripted.url)
-        expect(page.locator(LIVE)).to_have_count(1)
-        page.click("#as-traces")
-        expect(page.locator("#bars")).to_be_hidden()
-        page.wait_for_function(f"() => ({TRACED})() > 50")
-        assert complaints(page) == []
-        page.reload()
-        expect(page.locator("#tile-traces")).to_be_visible()
-        page.click("#as-bars")
-        expect(page.locator("#bars .tile")).to_have_count(2)
-
-
-def test_the_automatic_range_covers_the_traces_in_view(
+def test_tiles_are_shown_as_traces_whose_range_covers_what_is_in_view_and_this_is_remembered(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     with Play(scripted.node, 15.0) as play:
-        page = open_page(scripted.url)
-        expect(page.locator(LIVE)).to_have_count(1)
+        page = live(open_page(scripted.url))
         page.click("#as-traces")
+        expect(page.locator("#bars")).to_be_hidden()
+        until(lambda: blue_px(page, "#tile-traces", 0.5, 1.0) > 50)
+        assert complaints(page) == []
         page.click("#range")
         expect(page.locator("#range")).to_have_text("Range: auto")
         top = page.locator("#foot .heat-legend text").first
@@ -302,19 +258,18 @@ def test_the_automatic_range_covers_the_traces_in_view(
         page.wait_for_timeout(6000)  # of the ten seconds in view
         expect(top).to_have_text("15 N")
         expect(top).to_have_text("2 N")  # slowly, once the step has left the view
+        page.reload()
+        expect(page.locator("#tile-traces")).to_be_visible()
+        page.click("#as-bars")
+        expect(page.locator("#bars .tile")).to_have_count(2)
 
 
 def test_in_the_sun_every_page_is_black_on_white_whatever_the_machine_prefers(
-    scripted: Scripted, browser: Browser
+    scripted: Scripted, open_page: OpenPage
 ) -> None:
     session = scripted.recorded("walk")
-    with (
-        Play(scripted.node, 15.0),
-        browser.new_context(color_scheme="dark", viewport={"width": 390, "height": 844}) as context,
-    ):
-        page = context.new_page()
-        page.goto(scripted.url)
-        expect(page.locator(LIVE)).to_have_count(1)
+    with Play(scripted.node, 15.0):
+        page = live(open_page(scripted.url, *PHONE, color_scheme="dark"))
         colours = """() => {
           const { color, backgroundColor } = getComputedStyle(document.body);
           return [color, backgroundColor];
@@ -337,7 +292,7 @@ def test_in_the_sun_every_page_is_black_on_white_whatever_the_machine_prefers(
         page.goto(f"{scripted.url}/nodes")
         assert page.evaluate(colours) == ["rgb(0, 0, 0)", "rgb(255, 255, 255)"]
         page.goto(f"{scripted.url}/sessions/{session.id}")
-        expect(page.locator("#plots[data-settled=true]")).to_have_count(1)
+        settled(page)
         assert page.evaluate(colours) == ["rgb(0, 0, 0)", "rgb(255, 255, 255)"]
         assert complaints(page) == []
         page.click("#sun")
@@ -346,16 +301,6 @@ def test_in_the_sun_every_page_is_black_on_white_whatever_the_machine_prefers(
         expect(page.locator(LIVE)).to_have_count(1)
         page.emulate_media(contrast="more")
         assert complaints(page) == []
-
-
-@pytest.mark.parametrize("width", [320, 600, 1000, 2560])
-def test_nothing_is_wider_than_the_screen(
-    scripted: Scripted, open_page: OpenPage, width: int
-) -> None:
-    with Play(scripted.node, 15.0):
-        page = open_page(scripted.url, width, 800)
-        expect(page.locator(LIVE)).to_have_count(1)
-        assert page.evaluate("document.documentElement.scrollWidth") == width
 
 
 def test_the_colours_of_forces_are_said_once() -> None:

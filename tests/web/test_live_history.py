@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import expect
 
 from tests.builders.arrays import PERIOD_NS
 from tests.service.fake_node import Play
 from tests.waiting import until
+from tests.web.pages import LIVE, OpenPage, blue_px, live
 from tests.web.scripted import Scripted
 
 pytestmark = pytest.mark.real_time
 
-OpenPage = Callable[..., Page]
-LIVE = "body[data-live=true]"
 
 JOINED = """async () => {
   const { Points } = await import("/static/live/points.js");
@@ -46,17 +44,8 @@ JOINED = """async () => {
 }"""
 """The page's own parts, with a socket and an answer of the server."""
 
-DRAWN = """() => {
-  const canvas = document.querySelector("#trace");
-  const { width, height } = canvas;
-  const copy = new OffscreenCanvas(width, height).getContext("2d");
-  copy.drawImage(canvas, -60, 0);
-  const box = copy.getImageData(0, 0, width / 2 - 60, height).data;
-  let blue = 0;
-  for (let i = 0; i < box.length; i += 4) blue += box[i + 2] - box[i] > 60 && box[i + 3] > 200;
-  return blue;
-}"""
-"""How much of the trace's older half has its colour."""
+OLDER = (0.1, 0.5)
+"""Shares of a trace's width, right of its axis."""
 
 PICTURE = """() => ["trace", "tracks"].map((id) => document.getElementById(id).toDataURL())
   + document.querySelector("#bars").outerHTML"""
@@ -73,8 +62,7 @@ def test_what_was_before_joins_what_is_heard_without_a_seam(
 ) -> None:
     streamed(scripted)
     with Play(scripted.node, 20.0):
-        page = open_page(scripted.url)
-        expect(page.locator(LIVE)).to_have_count(1)
+        page = live(open_page(scripted.url))
         spans: list[Any] = page.evaluate(JOINED)
     assert len(spans) > 30
     assert spans[0][1] < scripted.node.seq - 1000
@@ -82,29 +70,21 @@ def test_what_was_before_joins_what_is_heard_without_a_seam(
     assert all(n == last - first + 1 for first, last, n, _ in spans)
 
 
-def test_traces_of_tiles_begin_with_what_was_before(
+def test_a_page_that_is_opened_has_a_trace_and_traces_of_tiles_at_once(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     streamed(scripted)
     with Play(scripted.node, 20.0):
-        page = open_page(scripted.url)
-        expect(page.locator(LIVE)).to_have_count(1)
+        page = live(open_page(scripted.url))
+        opened_s = time.monotonic()
+        until(lambda: blue_px(page, "#trace", *OLDER) > 100)
+        assert time.monotonic() - opened_s < 3.0  # it would take five by itself
         with page.expect_response("**/history?*tiles=force_n") as asked:
             page.click("#as-traces")
         assert len(asked.value.json()["tiles"]["seq"]) > 50
-        until(lambda: page.evaluate(DRAWN.replace("#trace", "#tile-traces")) > 100)
-
-
-def test_a_page_that_is_opened_has_a_trace_at_once(scripted: Scripted, open_page: OpenPage) -> None:
-    streamed(scripted)
-    with Play(scripted.node, 20.0):
-        page = open_page(scripted.url)
-        expect(page.locator(LIVE)).to_have_count(1)
-        opened_s = time.monotonic()
-        until(lambda: page.evaluate(DRAWN) > 100)
-        assert time.monotonic() - opened_s < 3.0  # it would take five by itself
+        until(lambda: blue_px(page, "#tile-traces", *OLDER) > 100)
         page.select_option("#trace-window", "60")
-        until(lambda: page.evaluate(DRAWN) == 0)  # no minute was played
+        until(lambda: blue_px(page, "#trace", *OLDER) == 0)  # no minute was played
         page.reload()
         expect(page.locator("#trace-window")).to_have_value("60")
 
@@ -113,8 +93,7 @@ def test_a_paused_picture_stands_still_says_so_and_goes_on(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     with Play(scripted.node, 20.0) as play:
-        page = open_page(scripted.url)
-        expect(page.locator(LIVE)).to_have_count(1)
+        page = live(open_page(scripted.url))
         expect(page.locator("#paused")).to_be_hidden()
         page.keyboard.press("p")
         expect(page.locator("#paused")).to_contain_text("Acquisition and recording continue")
@@ -130,13 +109,3 @@ def test_a_paused_picture_stands_still_says_so_and_goes_on(
         page.keyboard.press("p")
         expect(page.locator("#paused")).to_be_hidden()
         expect(page.locator("#grf")).to_contain_text("100")
-
-
-def test_help_names_every_key(scripted: Scripted, open_page: OpenPage) -> None:
-    page = open_page(scripted.url)
-    page.keyboard.press("?")
-    expect(page.locator("#help-dialog")).to_be_visible()
-    keys = page.locator("#help-dialog kbd").all_inner_texts()
-    assert {"t", "r", "s", "m", "p", "?"} <= set(keys)
-    page.keyboard.press("Escape")
-    expect(page.locator("#help-dialog")).to_be_hidden()

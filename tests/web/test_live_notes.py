@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import expect
 
 from tests.service.fake_node import Play
+from tests.web.pages import OpenPage, complaints, live
 from tests.web.scripted import Scripted
-from tests.web.test_accessible import complaints
 
 LIVE_JS = Path(__file__).resolve().parents[2] / "web" / "live"
-OpenPage = Callable[..., Page]
 
 
 def reasons() -> dict[str, str]:
@@ -52,8 +49,7 @@ def test_a_warning_says_since_when_and_why_and_stays_open(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     with Play(scripted.node):
-        page = open_page(scripted.url)
-        expect(page.locator("body[data-live=true]")).to_have_count(1)
+        page = live(open_page(scripted.url))
         page.wait_for_timeout(3200)
         tare_id = scripted.running.node()["tare"]["id"]
         assert scripted.running.http.delete(f"/nodes/bench/tares/{tare_id}").status_code == 204
@@ -66,20 +62,10 @@ def test_a_warning_says_since_when_and_why_and_stays_open(
             note.get_by_role("link", name="Troubleshooting").click()
         expect(opened.value.locator("#a-force-in-the-air")).to_be_in_viewport()
         assert complaints(opened.value) == []
-        tell(scripted, "another trouble")
+        scripted.tell("another trouble")
         expect(page.locator("#notes")).to_contain_text("Another trouble.")
         expect(note.locator("p")).to_be_visible()
         assert note.locator("time").text_content() == since
         assert complaints(page) == []
         page.reload()
         expect(note.locator("time")).to_contain_text("or earlier")
-
-
-def tell(scripted: Scripted, *warnings: str) -> None:
-    def change() -> None:
-        server: Any = scripted.running.server
-        node = server.nodes.get("bench")
-        node.warnings = warnings
-        server.notify_node_changed(node)
-
-    scripted.running.call(change)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 
+import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
@@ -14,13 +14,12 @@ from service.protocol.link import LINK_TIMEOUT_S
 from tests.service.fake_node import Play
 from tests.service.recording import Recording
 from tests.waiting import until
+from tests.web.pages import LIVE, OpenPage, live
 from tests.web.scripted import Scripted
 from tests.web.session_rows import choose, open_menu, row_of
 
 pytestmark = pytest.mark.real_time
 
-OpenPage = Callable[..., Page]
-LIVE = "body[data-live=true]"
 NOTE_WHAT_IS_FROZEN = """() => {
   const place = document.querySelector("#frozen");
   window.frozen = [];
@@ -94,42 +93,43 @@ def test_a_node_out_of_reach_is_silent_on_the_page_and_then_away(
 ) -> None:
     monkeypatch.setattr(service.api.routes.sockets.ingest, "LINK_TIMEOUT_S", LINK_TIMEOUT_S)
     with Play(scripted.node):
-        page = open_page(scripted.url)
-        expect(page.locator(LIVE)).to_have_count(1)
+        page = live(open_page(scripted.url))
         page.evaluate(NOTE_WHAT_IS_FROZEN)
     # Nothing comes any more, and nobody says goodbye: as when a cable is pulled.
     expect(page.locator("#frozen")).to_contain_text("Node bench is offline.")
     assert any("connected but sends no frames" in text for text in page.evaluate("window.frozen"))
 
 
-def test_what_follows_a_labelled_marker_is_a_shortcut_again(
+def test_keys_record_mark_and_stop_and_letters_in_a_field_are_no_shortcuts(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
-    session = scripted.node.record(name="walk")
     with Play(scripted.node):
-        page = open_page(scripted.url)
-        expect(page.locator("#marker")).to_be_enabled()
+        page = live(open_page(scripted.url))
+        page.keyboard.press("r")
+        expect(page.locator("#stop")).to_be_enabled()
+        for field in ("#session-name", "#marker-label"):
+            page.focus(field)
+            page.keyboard.type("rest")
+            assert page.input_value(field) == "rest"
+            page.keyboard.press("Escape")  # empties the field, and leaves it
+            assert page.input_value(field) == ""
+            assert page.evaluate("document.activeElement === document.body")
+        page.keyboard.press("?")
+        expect(page.locator("#help-dialog")).to_be_visible()
+        keys = page.locator("#help-dialog kbd").all_inner_texts()
+        assert {"t", "r", "s", "m", "p", "?"} <= set(keys)
+        page.keyboard.press("Escape")
+        expect(page.locator("#help-dialog")).to_be_hidden()
         page.focus("#marker-label")
         page.keyboard.type("a stone")
         page.keyboard.press("Enter")
         page.keyboard.press("s")
         expect(page.locator("#recordings")).to_be_hidden()
         assert page.input_value("#marker-label") == ""
+        session = scripted.running.only_session()
         session.sealed()
     events = scripted.running.http.get(f"{session.url}/markers").json()["items"]
     assert [event["label"] for event in events] == ["a stone"]
-
-
-@pytest.mark.parametrize("field", ["#marker-label", "#session-name"])
-def test_escape_empties_a_field_and_leaves_it(
-    scripted: Scripted, open_page: OpenPage, field: str
-) -> None:
-    page = open_page(scripted.url)
-    page.focus(field)
-    page.keyboard.type("rest")
-    page.keyboard.press("Escape")
-    assert page.input_value(field) == ""
-    assert page.evaluate("document.activeElement === document.body")
 
 
 def ends_open(scripted: Scripted) -> Recording:
@@ -183,3 +183,53 @@ def test_while_models_are_compiled_the_page_says_so_and_shows_pressures(
         expect(page.locator("#bars .tile").first).to_have_attribute("data-unit", "kPa")
         expect(page.locator("#unit-kpa")).to_have_attribute("aria-pressed", "true")
         expect(page.locator("#unit-n")).to_have_attribute("aria-pressed", "false")
+
+
+NOTE_NUMBERS = """() => {
+  window.seen = [];
+  const at = (id) => document.getElementById(id);
+  const note = () => {
+    requestAnimationFrame(note);
+    const tiles = [...document.querySelectorAll("#bars .tile")];
+    const written = tiles.map((tile) => Number(tile.querySelector(".value").textContent));
+    const sum = (all) => all.reduce((a, b) => a + b, 0);
+    window.seen.push([Number(at("grf").textContent), sum(written)]);
+  };
+  note();
+}"""
+NOTE_CARD_AND_FOOT = """
+  const write = CanvasRenderingContext2D.prototype.fillText;
+  let numbers = [];
+  window.seen = [];
+  CanvasRenderingContext2D.prototype.fillText = function (text, ...where) {
+    if (this.canvas.className === "node-foot" && this.textAlign === "center") numbers.push(text);
+    return write.call(this, text, ...where);
+  };
+  addEventListener("load", function note() {
+    requestAnimationFrame(note);
+    const force = document.querySelector(".node .value")?.textContent;
+    const drawn = numbers.slice(-2).reduce((a, b) => a + Number(b), 0);
+    if (numbers.length) window.seen.push([Number(force), drawn]);
+  });
+"""
+
+
+def test_force_and_numbers_and_foot_are_of_one_frame(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    with Play(scripted.node, 15.0) as play:
+        page = live(open_page(scripted.url))
+        page.evaluate(NOTE_NUMBERS)
+        cards = open_page(f"{scripted.url}/nodes", first=NOTE_CARD_AND_FOOT)
+        expect(cards.locator(".node[data-live=true]")).to_have_count(1)
+        within = {page: 0.16, cards: 1.1}  # of rounding: tenths on the page, newtons on a card
+        for one in within:
+            one.wait_for_function("window.seen.length > 0")
+        for force_n in (5.0, 15.0) * 10:  # it changes all the time
+            play.force_n = force_n
+            page.wait_for_timeout(170)
+    for one, within_n in within.items():
+        seen = np.array(one.evaluate("window.seen.slice(1)"))  # in each picture
+        force_n, sum_n = seen.T
+        assert np.ptp(force_n) > 15.0
+        assert sum_n == pytest.approx(force_n, abs=within_n)

@@ -3,43 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page, Route, expect
+from playwright.sync_api import Route, expect
 
 from service.node_identity import compute_fingerprint
 from tests.service.fake_node import FakeNode, Play
 from tests.service.running import closed
 from tests.waiting import until
-from tests.web.conftest import Field, wait_until
+from tests.web.pages import DESK, PHONE, OpenPage, blue_px, complaints, complaints_at
 from tests.web.scripted import Scripted
-from tests.web.test_accessible import SIZES, complaints
-from tests.web.test_live_notes import tell
-from tests.web.test_page import PRESSED_N, load_file, scene_file
 
 pytestmark = pytest.mark.real_time
-
-OpenPage = Callable[..., Page]
-TOKEN = "a-token-of-this-test"  # noqa: S105  # of this test
-
-
-@pytest.fixture
-def two(tmp_path: Path, field_environment: dict[str, str]) -> Iterator[Field]:
-    """Two feet of four emulated tiles under a load; slow ones, as a busy machine can take."""
-    field = Field(tmp_path, field_environment)
-    field.serve()
-    scene, load = scene_file(tmp_path), load_file(tmp_path, PRESSED_N)
-    of_paper = 'calibration = "paper-eq2-shape"\nrate_hz = 100\n'
-    scene.write_text(of_paper + scene.read_text())
-    for name in ("left", "right"):
-        options = ("--load", str(load), "--lead-s=2", "--journal", str(tmp_path / name))
-        field.start_node(str(scene), *options, "--name", name)
-    try:
-        yield field
-    finally:
-        field.close()
 
 
 def card(node: str) -> str:
@@ -51,61 +26,61 @@ def live(node: str) -> str:
 
 
 def test_two_feet_are_recorded_marked_and_stopped_together_and_one_is_lost_in_between(
-    two: Field, open_page: OpenPage
+    scripted: Scripted, open_page: OpenPage
 ) -> None:
-    wait_until(
-        lambda: sum(bool(node["tare"]) for node in two.get("/nodes")["items"]) == 2, "two tares", 90
-    )
-    page = open_page(two.url)
-    page.click("#all-nodes")
-    for name in ("left", "right"):
-        expect(page.locator(live(name))).to_have_count(1)
-        expect(page.locator(f"{live(name)} .value")).to_have_attribute(
-            "data-value", re.compile(".")
-        )
-    page.fill("#take-name", "both feet")
-    page.press("#take-name", "Enter")
-    expect(page.locator('.node[data-recording="true"]')).to_have_count(2)
-    expect(page.locator("#take-running")).to_contain_text("“both feet” on 2 nodes")
-    expect(page.locator("#take-running")).to_contain_text("0 frames lost")
-    page.fill("#take-label", "a stone")
-    page.press("#take-label", "Enter")
-    expect(page.locator("#notices")).to_contain_text("Marker “a stone” set on 2 nodes")
-
-    two.others[1].kill()  # the right one
-    expect(page.locator(f"{card('right')} .state")).to_have_text("offline")
-    page.fill("#take-label", "one is lost")
-    page.press("#take-label", "Enter")
-    expect(page.locator("#notices")).to_contain_text("Marker “one is lost” set on 2 nodes")
-    page.keyboard.press("s")
-    expect(page.locator("#take-text")).to_be_hidden()
-    expect(page.locator(f"{card('left')} .node-session")).to_contain_text("complete")
-    expect(page.locator(f"{card('right')} .node-session")).to_contain_text("pending")
-
-    left, right = sorted(two.get("/sessions")["items"], key=lambda session: str(session["node"]))
-    assert (left["node"], right["node"]) == ("left", "right")
-    assert left["name"] == right["name"] == "both feet"
-    assert left["take"] == right["take"] is not None
-    markers = [two.get(f"/sessions/{session['id']}/markers")["items"] for session in (left, right)]
+    right = FakeNode(scripted.running, "right")
+    right.connect()
+    right.tared()
+    http = scripted.running.http
+    with Play(scripted.node, 5.0):
+        page = open_page(scripted.url)
+        page.click("#all-nodes")
+        with Play(right, 5.0):
+            for name in ("bench", "right"):
+                expect(page.locator(f"{live(name)} .value")).to_have_attribute(
+                    "data-value", re.compile(".")
+                )
+            page.fill("#take-name", "both feet")
+            page.press("#take-name", "Enter")
+            expect(page.locator('.node[data-recording="true"]')).to_have_count(2)
+            expect(page.locator("#take-running")).to_contain_text("“both feet” on 2 nodes")
+            expect(page.locator("#take-running")).to_contain_text("0 frames lost")
+            page.fill("#take-label", "a stone")
+            page.press("#take-label", "Enter")
+            expect(page.locator("#notices")).to_contain_text("Marker “a stone” set on 2 nodes")
+        right.leave()
+        expect(page.locator(f"{card('right')} .state")).to_have_text("offline")
+        page.fill("#take-label", "one is lost")
+        page.press("#take-label", "Enter")
+        expect(page.locator("#notices")).to_contain_text("Marker “one is lost” set on 2 nodes")
+        page.keyboard.press("s")
+        expect(page.locator("#take-text")).to_be_hidden()
+        expect(page.locator(f"{card('bench')} .node-session")).to_contain_text("complete")
+        expect(page.locator(f"{card('right')} .node-session")).to_contain_text("pending")
+    bench, other = sorted(scripted.running.sessions(), key=lambda session: str(session["node"]))
+    assert (bench["node"], other["node"]) == ("bench", "right")
+    assert bench["name"] == other["name"] == "both feet"
+    assert bench["take"] == other["take"] is not None
+    markers = [http.get(f"/sessions/{one['id']}/markers").json()["items"] for one in (bench, other)]
     assert markers[0] == markers[1]
     assert [marker["label"] for marker in markers[0]] == ["a stone", "one is lost"]
+    right.close()
 
 
-@SIZES
 def test_a_node_that_sends_nothing_is_not_recorded_and_its_card_says_why(
-    scripted: Scripted, open_page: OpenPage, size: tuple[int, int]
+    scripted: Scripted, open_page: OpenPage
 ) -> None:
     silent = FakeNode(scripted.running, "silent")
     try:
         silent.connect()
         with Play(scripted.node, 5.0):
-            page = open_page(f"{scripted.url}/nodes", *size)
+            page = open_page(f"{scripted.url}/nodes", *PHONE)
             expect(page.locator(live("bench"))).to_have_count(1)
             expect(page.locator(f"{card('silent')} .state")).to_have_text("no data yet")
-            assert complaints(page) == []
+            assert complaints_at(page, DESK, PHONE) == []
             page.keyboard.press("?")
             expect(page.locator("#help-dialog")).to_contain_text("Record all connected nodes")
-            assert complaints(page) == []
+            assert complaints_at(page, DESK, PHONE) == []
             page.keyboard.press("Escape")
             expect(page.locator("#help-dialog")).to_be_hidden()
             expect(page.locator("#record-all")).to_be_enabled()  # axe has held it up
@@ -115,8 +90,7 @@ def test_a_node_that_sends_nothing_is_not_recorded_and_its_card_says_why(
             expect(refused).to_contain_text("Not recorded: node 'silent' sends no frames")
             expect(page.locator("#notices")).to_contain_text("silent not recorded")
             expect(page.locator("#stop-all")).to_be_enabled()
-            assert complaints(page) == []
-            assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+            assert complaints_at(page, DESK, PHONE) == []
             page.keyboard.press("r")
             expect(page.locator("#notices")).to_contain_text("stop the running recording first")
             page.keyboard.press("s")
@@ -190,31 +164,21 @@ COLOURS = """async () => {
 """How light tiles of 0, 10, 17 and 21 N are on a card."""
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_tiles_of_17_and_21_n_differ_from_each_other_and_are_far_from_white(
-    scripted: Scripted, open_page: OpenPage, scheme: str
+    scripted: Scripted, open_page: OpenPage
 ) -> None:
     with Play(scripted.node, 5.0):
-        page = open_page(f"{scripted.url}/nodes", color_scheme=scheme)
+        page = open_page(f"{scripted.url}/nodes")
         expect(page.locator(live("bench"))).to_have_count(1)
-        found = page.evaluate(COLOURS)
-    none, *loaded = found["light"]
-    assert found["top"] == 29
-    assert all(0.04 < light < 0.85 for light in loaded[1:])
-    steps = [abs(a - b) for a, b in zip(found["light"], loaded, strict=False)]
-    assert min(steps) > 0.02
-    assert abs(loaded[-1] - none) > 0.3
-
-
-TRACED = """([name]) => {
-  const { width, height } = document.querySelector(name);
-  const copy = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
-  copy.drawImage(document.querySelector(name), 0, 0);
-  const { data } = copy.getImageData(width / 2, 0, width / 2, height);
-  let blue = 0;
-  for (let i = 0; i < data.length; i += 4) blue += data[i + 2] - data[i] > 60 && data[i + 3] > 100;
-  return blue > 50;
-}"""
+        for scheme in ("light", "dark"):
+            page.emulate_media(color_scheme=scheme)
+            found = page.evaluate(COLOURS)
+            none, *loaded = found["light"]
+            assert found["top"] == 29
+            assert all(0.04 < light < 0.85 for light in loaded[1:]), scheme
+            steps = [abs(a - b) for a, b in zip(found["light"], loaded, strict=False)]
+            assert min(steps) > 0.02, scheme
+            assert abs(loaded[-1] - none) > 0.3, scheme
 
 
 def test_a_card_has_the_trace_contact_and_warnings_of_its_node(
@@ -225,8 +189,8 @@ def test_a_card_has_the_trace_contact_and_warnings_of_its_node(
         bench = page.locator(card("bench"))
         expect(bench.locator(".contact")).to_have_attribute("data-contact", "true")
         expect(bench.locator(".contact")).to_have_text("contact")
-        page.wait_for_function(TRACED, arg=[".node-trace"])
-        tell(scripted, "tile S0 (mux 0x70 channel 0) does not answer")
+        until(lambda: blue_px(page, ".node-trace", 0.5, 1.0) > 50)
+        scripted.tell("tile S0 (mux 0x70 channel 0) does not answer")
         expect(bench.locator(".node-notes")).to_contain_text("Tile S0 (mux 0x70 channel 0)")
         play.force_n = 0.0
         expect(bench.locator(".contact")).to_have_text("flight")
@@ -254,24 +218,6 @@ def test_the_page_says_that_a_node_or_the_server_is_away_and_goes_on_by_itself(
         expect(page.locator(live("bench"))).to_have_count(1)
 
 
-def test_a_viewer_sees_all_nodes_and_is_offered_no_button(
-    script: Callable[..., Scripted], open_page: OpenPage
-) -> None:
-    server = script(token=TOKEN)
-    ticket = server.running.http.post("/tickets", json={"role": "viewer"}).json()["ticket"]
-    with Play(server.node):
-        page = open_page(f"{server.url}/nodes#ticket={ticket}")
-        expect(page.locator(live("bench"))).to_have_count(1)
-        expect(page.locator("#login")).to_have_text("viewer (read-only)")
-        expect(page.locator("#record-all")).to_be_hidden()
-        page.keyboard.press("r")
-        expect(page.locator("#notices")).to_contain_text("viewers cannot tare")
-        assert complaints(page) == []
-        server.running.http.post("/takes", json={"name": "by another one"})
-        expect(page.locator("#take-running")).to_contain_text("“by another one” on 1 node")
-        until(lambda: len(server.running.sessions()) == 1)
-
-
 @pytest.mark.parametrize("address", ["/nodes", "/"])
 def test_another_machine_that_asks_for_a_name_is_accepted_with_a_button(
     scripted: Scripted, open_page: OpenPage, address: str
@@ -287,7 +233,9 @@ def test_another_machine_that_asks_for_a_name_is_accepted_with_a_button(
 
     try:
         with Play(scripted.node, 5.0):
-            page = open_page(f"{scripted.url}{address}", *SIZES.args[1][0])
+            page = open_page(
+                f"{scripted.url}{address}",
+            )
             warning = page.locator(".replacement")
             expect(warning).to_be_hidden()
             assert ask() == 4013

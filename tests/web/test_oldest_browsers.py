@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import expect
 
 from tests.service.fake_node import Play
 from tests.service.running import Running
 from tests.tokens import SHARED_TOKEN
 from tests.waiting import until
+from tests.web.pages import SIZES, OpenPage, live
 from tests.web.scripted import Scripted
 from tests.web.session_page import settled
-from tests.web.test_accessible import SIZES
 
-OpenPage = Callable[..., Page]
 ROOT = Path(__file__).resolve().parents[2]
 OLDEST = json.loads((ROOT / "scripts" / "browsers.json").read_text("utf-8"))["oldest"]
 NEWER = (ROOT / "tests" / "web" / "newer_features.json").read_text("utf-8")
@@ -81,8 +79,7 @@ def test_an_old_browser_in_a_network_records_markers_and_looks_back(
     address = scripted.url.replace("127.0.0.1", "192.0.2.1")
     with Play(scripted.node, alive=True) as play:
         link = f"{address}/#token={SHARED_TOKEN}"
-        page = open_page(link, *size, first=WITHOUT_NEWER + WITHOUT_STORAGE)
-        expect(page.locator("body[data-live=true]")).to_have_count(1)
+        page = live(open_page(link, *size, first=WITHOUT_NEWER + WITHOUT_STORAGE))
         assert not page.evaluate("isSecureContext")
         page.click("#tare")
         expect(page.locator("#notices")).to_contain_text("Tared")

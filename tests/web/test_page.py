@@ -4,20 +4,27 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.web.conftest import Field, wait_until
+from devices.flags import TileFlag
+from devices.frames import NOT_READ, FrameBatch
+from tests.service.fake_node import FakeNode, Play
+from tests.waiting import until
+from tests.web.conftest import Field
 from tests.web.login import log_in
+from tests.web.pages import PHONE, OpenPage, at_sizes, box_of, live, width_of
+from tests.web.scripted import Scripted
 from tests.web.session_rows import choose
 
 pytestmark = pytest.mark.real_time
 
-OpenPage = Callable[..., Page]
 
 PRESSED_N = (0.0, 6.0, 12.0, 18.0)
 """A known load on the four tiles, held for ten minutes."""
@@ -56,7 +63,7 @@ def known(
     load = load_file(folder, PRESSED_N)
     field.start_node(str(scene_file(folder)), "--load", str(load), "--name", "bench", "--lead-s=2")
     try:
-        wait_until(field.is_tared, "a tared node", 60)
+        until(field.is_tared, every_s=0.05)
         yield field
     finally:
         field.close()
@@ -67,15 +74,15 @@ def value_of(page: Page, serial: str) -> float:
     return float(text) if text else float("nan")
 
 
-def test_bars_and_grf_follow_a_known_load(known: Field, open_page: OpenPage) -> None:
-    page = open_page(known.url)
-    expect(page.locator("body")).to_have_attribute("data-live", "true")
-    wait_until(
+def test_bars_and_grf_follow_a_known_load_and_fit_on_a_phone(
+    known: Field, open_page: OpenPage
+) -> None:
+    page = live(open_page(known.url))
+    until(
         lambda: all(
             abs(value_of(page, f"T0{i + 1}") - force_n) < TOLERANCE_N
             for i, force_n in enumerate(PRESSED_N)
-        ),
-        "the load to be shown",
+        )
     )
     grf_n = float(page.get_attribute("#grf", "data-value") or "nan")
     assert grf_n == pytest.approx(sum(PRESSED_N), abs=2 * TOLERANCE_N)
@@ -84,21 +91,24 @@ def test_bars_and_grf_follow_a_known_load(known: Field, open_page: OpenPage) -> 
     places_m = 0.014 * np.arange(4) - 0.021
     assert x_m == pytest.approx(float(places_m @ PRESSED_N) / sum(PRESSED_N), abs=0.002)
     page.click("#unit-kpa")
-    wait_until(lambda: value_of(page, "T04") < 15.0, "kilopascals")
+    until(lambda: value_of(page, "T04") < 15.0)
     assert value_of(page, "T04") > value_of(page, "T02") > value_of(page, "T01")
+    for size in at_sizes(page, PHONE):
+        assert width_of(page) == size[0]
+        for part in ('#bars [data-serial="T04"]', "#tare", "#record", "#undo", "#marker"):
+            expect(page.locator(part)).to_be_in_viewport()
 
 
 def test_record_marker_stop_download(known: Field, open_page: OpenPage, tmp_path: Path) -> None:
-    page = open_page(known.url)
-    expect(page.locator("body")).to_have_attribute("data-live", "true")
+    page = live(open_page(known.url))
     page.fill("#session-name", "mud & <b>stones</b>")
     page.click("#record")
     expect(page.locator("#stop")).to_be_enabled()
     page.fill("#marker-label", "a stone")
     page.press("#marker-label", "Enter")
-    wait_until(lambda: known.get("/sessions")["items"][0]["frames"] > 300, "some frames")
+    until(lambda: known.get("/sessions")["items"][0]["frames"] > 300, every_s=0.05)
     page.click("#stop")
-    wait_until(lambda: known.get("/sessions")["items"][0]["state"] == "sealed", "the sealed file")
+    until(lambda: known.get("/sessions")["items"][0]["state"] == "sealed", every_s=0.05)
     session = known.get("/sessions")["items"][0]
     expect(page.locator("#last-session")).to_contain_text("complete")
     page.click("#to-sessions")
@@ -117,36 +127,8 @@ def test_record_marker_stop_download(known: Field, open_page: OpenPage, tmp_path
     assert [event["label"] for event in events] == ["a stone"]
 
 
-def test_everything_can_be_done_with_the_keyboard(known: Field, open_page: OpenPage) -> None:
-    page = open_page(known.url)
-    expect(page.locator("body")).to_have_attribute("data-live", "true")
-    before = len(known.get("/sessions")["items"])
-    page.keyboard.press("r")
-    expect(page.locator("#stop")).to_be_enabled()
-    page.focus("#marker-label")
-    page.keyboard.type("rest")  # letters of shortcuts, in a field
-    assert page.input_value("#marker-label") == "rest"
-    page.keyboard.press("Escape")
-    page.locator("#marker-label").blur()
-    page.keyboard.press("s")
-    wait_until(lambda: known.get("/sessions")["items"][0]["state"] == "sealed", "the sealed file")
-    assert len(known.get("/sessions")["items"]) == before + 1
-
-
-def test_a_phone_shows_the_bars_and_needs_no_sideways_scrolling(
-    known: Field, open_page: OpenPage
-) -> None:
-    page = open_page(known.url, 390, 844)
-    expect(page.locator("body")).to_have_attribute("data-live", "true")
-    assert page.evaluate("document.documentElement.scrollWidth") <= 390
-    expect(page.locator('#bars [data-serial="T04"]')).to_be_in_viewport()
-    for button in ("#tare", "#record", "#undo", "#marker"):
-        expect(page.locator(button)).to_be_in_viewport()
-
-
 def test_a_tare_under_load_is_refused_on_the_page(known: Field, open_page: OpenPage) -> None:
-    page = open_page(known.url)
-    expect(page.locator("body")).to_have_attribute("data-live", "true")
+    page = live(open_page(known.url))
     tares = known.get("/nodes/bench/tares")["items"]
     # The lead must no longer be among the last ten seconds: it mostly is not after other tests.
     time.sleep(max(0.0, 10.5 + tares[0]["t_ns"] * 1e-9 - time.time()))
@@ -174,36 +156,53 @@ def test_a_killed_server_greys_the_page_within_a_second_and_it_comes_back(
     # What was recorded when the server was killed goes on, without a gap.
     expect(page.locator("#stop")).to_be_enabled()
     page.keyboard.press("s")
-    wait_until(lambda: known.get("/sessions")["items"][0]["state"] == "sealed", "the sealed file")
+    until(lambda: known.get("/sessions")["items"][0]["state"] == "sealed", every_s=0.05)
     session = known.get("/sessions")["items"][0]
     assert session["complete"] is True
     ledger = known.get(f"/sessions/{session['id']}/ledger")
     assert [part["pending"] for part in ledger["parts"]] == [0]
 
 
+class Silent(FakeNode):
+    """A node whose second tile does not answer, once it is silent."""
+
+    is_silent = False
+
+    def frames(self, n: int, *arguments: Any, **how: Any) -> FrameBatch:
+        batch = super().frames(n, *arguments, **how)
+        if not self.is_silent:
+            return batch
+        pressure_raw, tile_flags = batch.pressure_raw.copy(), batch.tile_flags.copy()
+        pressure_raw[:, 1], tile_flags[:, 1] = NOT_READ, TileFlag.NO_ANSWER
+        self.sent[-1] = replace(batch, pressure_raw=pressure_raw, tile_flags=tile_flags)
+        return self.sent[-1]
+
+
 def test_saturated_and_silent_tiles_cannot_be_mistaken_for_values(
-    tmp_path: Path, field_environment: dict[str, str], open_page: OpenPage
+    script: Callable[..., Scripted], open_page: OpenPage
 ) -> None:
-    field = Field(tmp_path, field_environment)
-    field.serve()
-    fault = '[[fault]]\nkind = "no_answer"\ntile = "T02"\nt_s = 5.0\nduration_s = 900.0\n'
-    load = load_file(tmp_path, (5.0, 5.0, 100.0, 5.0))
-    try:
-        field.start_node(str(scene_file(tmp_path, fault)), "--load", str(load), "--lead-s=2")
-        page = open_page(field.url)
-        silent = page.locator('#bars [data-serial="T02"]')
-        expect(silent).to_have_attribute("data-state", "no_answer")
-        expect(silent).to_have_attribute("data-value", "")
-        expect(silent).to_contain_text("no answer")
-        saturated = page.locator('#bars [data-serial="T03"]')
-        expect(saturated).to_have_attribute("data-state", "saturated")
-        expect(saturated).to_have_attribute("data-value", "")
-        expect(saturated).to_contain_text("saturated")
+    server = script()
+    server.node.close()
+    node = Silent(server.running, "silent", tiles=4)
+    node.connect()
+    node.tared()
+    node.is_silent = True
+    with Play(node, (5.0, 5.0, 200.0, 5.0)):
+        page = open_page(server.url)
+        page.select_option("#node-select", "silent")
+        for serial, state, said in (
+            ("T02", "no_answer", "no answer"),
+            ("T03", "saturated", "saturated"),
+        ):
+            bar = page.locator(f'#bars [data-serial="{serial}"]')
+            expect(bar).to_have_attribute("data-state", state)
+            expect(bar).to_have_attribute("data-value", "")
+            expect(bar).to_contain_text(said)
         expect(page.locator("#grf")).to_have_attribute("data-value", "")  # no sum without T02
         # What T01, T03 and T04 bear at least, and why it is no more.
         expect(page.locator("#grf-bound")).to_have_text("at least")
         at_least_n = float(page.inner_text("#grf"))
-        assert 20.0 < at_least_n < 110.0
+        assert 20.0 < at_least_n < 210.0
         expect(page.locator("#grf-sigma")).to_have_text("(T02 missing, T03 saturated)")
         expect(page.locator("#cop")).to_have_text("No COP: T02 missing, T03 saturated")
         for serial in ("T01", "T04"):  # the others go on
@@ -212,9 +211,6 @@ def test_saturated_and_silent_tiles_cannot_be_mistaken_for_values(
             )
         expect(page.locator("#contact")).to_have_attribute("data-contact", "true")
         expect(page.locator("#trace-bound-legend")).to_be_visible()
-        card, contact = (page.locator(name).bounding_box() for name in ("#grf-card", "#contact"))
-        assert card is not None
-        assert contact is not None
+        card, contact = (box_of(page.locator(name)) for name in ("#grf-card", "#contact"))
         assert contact["x"] + contact["width"] <= card["x"] + card["width"]
-    finally:
-        field.close()
+    node.close()

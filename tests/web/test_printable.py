@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import json
 import unicodedata
-from collections.abc import Callable
 
 import pytest
 from playwright.sync_api import Page, expect
 
 from tests.service.fake_node import Play
+from tests.web.pages import OpenPage, live
 from tests.web.scripted import Scripted
 from tests.web.session_page import settled
 
 pytestmark = pytest.mark.real_time
 
-OpenPage = Callable[..., Page]
 HOSTILE = "x\x1b[2J\x07\u202ecba\u2066\u200b\ufeff\u00ad\ud800\u2028end"
 SHOWN = r"x\x1b[2J\x07\u202ecba\u2066\u200b\ufeff\xad\ud800\u2028end"
 _READ = """() => [document.title, document.body.innerText,
@@ -51,8 +50,7 @@ def test_hostile_names_are_spelt_out_wherever_they_are_shown(
     """
 
     with Play(scripted.node, 5.0):
-        page = open_page(scripted.url, first=first)
-        expect(page.locator("body[data-live=true]")).to_have_count(1)
+        page = live(open_page(scripted.url, first=first))
         expect(page.locator("#last-session a")).to_have_text(SHOWN)
         expect(page.locator("#bars .serial").first).to_have_text(SHOWN)
         assert unprintable(page) == []
@@ -69,24 +67,3 @@ def test_hostile_names_are_spelt_out_wherever_they_are_shown(
         expect(page.locator("#markers-list")).to_contain_text(SHOWN)
         expect(page.locator("#about")).to_contain_text(f"#{SHOWN}")
         assert unprintable(page) == []
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "third trial, 20 °C",
-        "Anlauf über Kies",
-        "👩\u200d🔬 first",
-        "\u0645\u06cc\u200c\u062e\u0648\u0627",
-        "क्\u200dष",
-        "two\nlines",
-    ],
-)
-def test_what_people_write_stays_as_it_is(
-    scripted: Scripted, open_page: OpenPage, text: str
-) -> None:
-    page = open_page(f"{scripted.url}/nodes")
-    shown = page.evaluate(
-        "async (text) => (await import('/static/common/text.js')).printable(text)", text
-    )
-    assert shown == text

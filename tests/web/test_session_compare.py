@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from urllib.parse import urlencode
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import scipy.stats
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Page, expect
 
 from tests.service.fake_node import FakeNode
 from tests.service.plates import LAG_S, compare, hopped, write_plate
 from tests.service.recording import Recording
 from tests.service.running import Running
+from tests.web.pages import DESK, PHONE, OpenPage, complaints_at
 from tests.web.session_page import grf
-from tests.web.test_accessible import complaints
 
 pytestmark = pytest.mark.real_time
 
-OpenPage = Callable[..., Page]
 
 PLATE = "plate <b>1"
 STONE = "a stone"
@@ -166,8 +164,8 @@ def test_another_session_is_laid_over_by_start_contact_or_marker_and_says_how_fa
     again = open_page(page.url)
     assert beside(again) == pytest.approx((least_n, most_n, begin_s, end_s))
     assert float(says.get_attribute("data-shift-s") or "nan") == pytest.approx(shifts["contact"])
-    again.keyboard.press("+")
-    again.keyboard.press("+")
+    for _ in range(2):
+        again.keyboard.press("+")
     expect(again).to_have_url(re.compile(f"with={other.id}.*from="))
     beside(again)
 
@@ -230,24 +228,6 @@ def test_the_difference_of_two_sessions_has_the_interval_of_a_welch_test(
     assert not re.search(r"[0-9]", found["cell"])  # two stances do not bound their scatter
 
 
-def test_the_older_session_is_first_and_sessions_are_aligned_at_whole_stances(
-    compared: Recording, other: Recording, open_page: OpenPage
-) -> None:
-    page = open_page(url_of(other, **{"with": compared.id}))
-    head = page.locator("#differences-card thead")
-    expect(head).to_have_text(re.compile(r"hops.*others.*Newer"))
-    shift_s = page.evaluate(
-        """import("/static/session/align.js").then(({ alignments }) => {
-          const own = { beginNs: 0, durationS: 9, markers: [], offset: () => null,
-            stances: [{ from: 0, is_whole: false }, { from: 2, is_whole: true }] };
-          const other = { beginNs: 0, durationS: 9, events: [], clock: null,
-            stances: [{ begin_t_ns: 5e8, is_whole: true }] };
-          return alignments(own, other)[0].shiftS;
-        })"""
-    )
-    assert shift_s == 1.5
-
-
 def test_another_session_is_told_by_its_node_and_has_its_stances_and_tiles(
     compared: Recording, other: Recording, open_page: OpenPage
 ) -> None:
@@ -264,60 +244,32 @@ def test_another_session_is_told_by_its_node_and_has_its_stances_and_tiles(
     page.select_option("#beside", "")
     expect(panels).not_to_have_attribute("data-panels", re.compile("beside-tiles"))
     expect(spread).to_have_count(0)
-
-
-def test_tiles_are_compared_by_serial_and_those_of_another_foot_in_their_order(
-    server: Running, open_page: OpenPage
-) -> None:
-    asked = """import("/static/session/beside.js").then(({ Beside }) => {
-      const matched = (own, theirs) => {
-        const nobody = { ask: null, onChange: null, onError: null };
-        const beside = new Beside({ name: "", columns: {}, ...nobody });
-        const names = theirs.map((_, i) => [`force_n_${i}_max`, []]);
-        beside.answer = { serials: theirs, columns: Object.fromEntries(names) };
-        beside.matchTiles(own);
-        return Object.entries(beside.columns).map(([tile, [least]]) => `${tile}=${least}`);
-      };
-      return [
-        matched(["a", "b"], ["b", "a"]), matched(["a", "b"], ["c", "d"]),
-        matched(["a", "b"], ["c", "a"]), matched(["a", "b"], ["c"]),
-      ];
-    })"""
-    found = open_page(f"{server.url}/nodes").evaluate(asked)
-    assert found == [
-        ["tile-0=force_n_1_min", "tile-1=force_n_0_min"],
-        ["tile-0=force_n_0_min", "tile-1=force_n_1_min"],
-        ["tile-0=force_n_1_min"],
-        [],
-    ]
+    page.goto(url_of(other, **{"with": compared.id}))  # the older session is first here, too
+    expect(page.locator("#differences-card thead")).to_have_text(re.compile(r"hops.*others.*Newer"))
 
 
 def test_a_damaged_comparison_is_said_to_be_and_the_page_stays(
-    compared: Recording, browser: Browser
+    compared: Recording, open_page: OpenPage
 ) -> None:
     folder = compared.folder / "comparisons" / "damaged"
     folder.mkdir()
     (folder / "compare.json").write_text('{"reference": "x"}')
-    with browser.new_context() as context:  # its console says 422, and is right
-        page = context.new_page()
-        page.goto(url_of(compared, reference="damaged"))
-        expect(page.locator("#beside-summary")).to_contain_text(
-            "it has no hash: it was cut off or edited"
-        )
-        expect(page.locator("#plots[data-settled=true]")).to_have_count(1)
+    page = open_page(url_of(compared, reference="damaged"))
+    expect(page.locator("#beside-summary")).to_contain_text(
+        "it has no hash: it was cut off or edited"
+    )
+    expect(page.locator("#plots[data-settled=true]")).to_have_count(1)
     (folder / "compare.json").unlink()
     folder.rmdir()
 
 
-@pytest.mark.parametrize("size", [(390, 844), (1366, 768)])
 def test_axe_has_nothing_to_complain_of_with_something_beside(
-    compared: Recording, open_page: OpenPage, size: tuple[int, int]
+    compared: Recording, open_page: OpenPage
 ) -> None:
     name = compared.running.http.get(f"{compared.url}/comparisons").json()["items"][0]["name"]
-    page = open_page(url_of(compared, reference=name, **{"from": 2, "to": 3}), *size)
+    page = open_page(url_of(compared, reference=name, **{"from": 2, "to": 3}), *PHONE)
     beside(page)
     expect(page.locator("#report-rows tr").nth(5)).to_be_attached()
     page.keyboard.press("ArrowRight")
     expect(page.locator("#readout [data-key=beside]")).to_contain_text("N")
-    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
-    assert complaints(page) == []
+    assert complaints_at(page, PHONE, DESK) == []

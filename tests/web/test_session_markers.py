@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 from playwright.sync_api import Page, expect
 
 from tests.service.recording import Recording
-from tests.web.conftest import wait_until
+from tests.waiting import until
+from tests.web.pages import OpenPage, complaints
 from tests.web.scripted import Scripted
-from tests.web.test_accessible import complaints
+from tests.web.session_page import drag_in_plots, left_px, with_marker
 
 pytestmark = pytest.mark.real_time
-
-OpenPage = Callable[..., Page]
-
-
-TOKEN = "a-token-of-this-test"  # noqa: S105  # of this test
 
 
 @pytest.fixture
@@ -26,46 +21,16 @@ def session(scripted: Scripted) -> Recording:
     return with_marker(scripted)
 
 
-def with_marker(scripted: Scripted) -> Recording:
-    """A sealed session with a marker in its middle."""
-    session = scripted.recorded("walk")
-    t_ns = session.column("t_ns")
-    clock = session.clock()["streams"][0]["stretches"][0]
-    middle = int(t_ns[len(t_ns) // 2]) + clock["offset_ns"]
-    answer = session.running.http.post(
-        f"{session.url}/markers", json={"label": "a stone", "t_ns": middle}
-    )
-    assert answer.status_code == 201
-    return session
-
-
 def markers(session: Recording) -> list[dict[str, Any]]:
     items: list[dict[str, Any]] = session.running.http.get(f"{session.url}/markers").json()["items"]
     return items
 
 
-def opened(session: Recording, open_page: OpenPage, ticket: str = "") -> Page:
-    page = open_page(f"{session.running.url}/sessions/{session.id}#{ticket}")
+def opened(session: Recording, open_page: OpenPage) -> Page:
+    page = open_page(f"{session.running.url}/sessions/{session.id}")
     expect(page.locator("#plots[data-settled=true]")).to_have_count(1)
     expect(page.locator("#markers-list li")).to_have_count(len(markers(session)))
     return page
-
-
-def left_px(page: Page) -> float:
-    """Where plots begin."""
-    px: float = page.locator("#plots").evaluate("(plots) => plots.clientWidth < 600 ? 40 : 56")
-    return px
-
-
-def drag_in_plots(page: Page, from_px: float, to_px: float) -> None:
-    """Drag at the height of markers' flags."""
-    page.locator("#plots").evaluate("(plots) => plots.scrollIntoView()")
-    box = page.locator("#plots").bounding_box()
-    assert box is not None
-    page.mouse.move(box["x"] + from_px, box["y"] + 8)
-    page.mouse.down()
-    page.mouse.move(box["x"] + to_px, box["y"] + 8, steps=3)
-    page.mouse.up()
 
 
 def test_a_marker_is_renamed_moved_to_the_cursor_dragged_and_removed(
@@ -86,14 +51,14 @@ def test_a_marker_is_renamed_moved_to_the_cursor_dragged_and_removed(
     page.click("#markers-list [aria-label='Edit marker a boulder']")
     page.click("#marker-to-cursor")
     page.click("#marker-dialog [value=ok]")
-    wait_until(lambda: markers(session)[0]["t_ns"] != before["t_ns"], "the marker to move")
+    until(lambda: markers(session)[0]["t_ns"] != before["t_ns"])
     t_ns = session.column("t_ns")
     offset_ns = session.clock()["streams"][0]["stretches"][0]["offset_ns"]
     assert markers(session)[0]["t_ns"] - offset_ns == pytest.approx(int(t_ns[1]), abs=2e5)
 
     moved = markers(session)[0]["t_ns"]
     drag_in_plots(page, left_px(page) + 12, 200)
-    wait_until(lambda: markers(session)[0]["t_ns"] > moved, "the flag to be where it was let go")
+    until(lambda: markers(session)[0]["t_ns"] > moved)
     dragged_s = (markers(session)[0]["t_ns"] - offset_ns - int(t_ns[0])) * 1e-9
     shown = page.locator("#markers-list li").get_attribute("data-time-s")
     assert float(shown or "nan") == pytest.approx(dragged_s, abs=1e-4)
@@ -132,34 +97,3 @@ def test_what_people_say_is_changed_and_the_second_of_two_is_told(
     expect(one.locator("#notices")).to_contain_text("changed by another client")
     expect(one.locator("#markers-list")).to_contain_text("water")
     assert markers(session)[0]["label"] == "water"
-
-
-def test_a_viewer_drags_no_marker_and_is_offered_to_change_none(
-    script: Callable[..., Scripted], open_page: OpenPage
-) -> None:
-    server = script(token=TOKEN)
-    session = with_marker(server)
-    ticket = server.running.http.post("/tickets", json={"role": "viewer"}).json()["ticket"]
-    page = opened(session, open_page, f"ticket={ticket}")
-    expect(page.locator("#login")).to_have_text("viewer (read-only)")
-    expect(page.get_by_label("Edit marker a stone")).to_be_hidden()
-    expect(page.locator("#edit")).to_be_hidden()
-    before_s = page.locator("#markers-list li").get_attribute("data-time-s")
-    asked: list[str] = []
-    page.on("request", lambda request: asked.append(request.method))
-    middle = (left_px(page) + page.locator("#plots").evaluate("(plots) => plots.clientWidth")) / 2
-    drag_in_plots(page, middle + 12, middle + 160)
-    expect(page.locator("#plots")).to_have_attribute("data-whole", "false")  # a stretch is chosen
-    expect(page.locator("#markers-list li")).to_have_attribute("data-time-s", before_s or "")
-    assert set(asked) <= {"GET"}
-
-
-def test_it_says_what_became_of_every_frame(session: Recording, open_page: OpenPage) -> None:
-    page = opened(session, open_page)
-    page.click("#ledger-card summary")
-    said = page.locator("#ledger")
-    now = session.now()
-    expect(said).to_contain_text(f"{now['frames']:,} frames recorded.")
-    expect(said).to_contain_text("complete from first to last")
-    expect(said).to_contain_text(now["sha256"])
-    assert complaints(page) == []

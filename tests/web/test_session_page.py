@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, expect
 
 from tests.service.fake_node import FakeNode, Play
 from tests.service.recording import Recording
 from tests.service.running import Running
-from tests.web.conftest import wait_until
+from tests.waiting import until
+from tests.web.pages import DESK, LIVE, PHONE, SMALL_PHONE, OpenPage, complaints, complaints_at
 from tests.web.received import Received
 from tests.web.scripted import Scripted
 from tests.web.session_page import LABEL, LOST, grf, recorded_walk, settled, summary, url_of
-from tests.web.test_accessible import complaints
 
 pytestmark = pytest.mark.real_time
-
-OpenPage = Callable[..., Page]
 
 
 @pytest.fixture(scope="module")
@@ -60,22 +57,14 @@ def twice(server: Running) -> Recording:
     return session
 
 
-@pytest.fixture(scope="module")
-def live_page(server: Running, browser: Browser) -> Iterator[Page]:
-    """Any page of the server, to ask modules something."""
-    with browser.new_context() as context:
-        page = context.new_page()
-        page.goto(server.url)
-        yield page
-
-
 def test_the_page_says_what_the_session_is_and_what_is_drawn(
     walk: Recording, open_page: OpenPage
 ) -> None:
     page = open_page(url_of(walk))
     expect(page.locator("h1")).to_have_text("walk")
     about = page.locator("#about")
-    for fact in ("bench", "leg 2", "#wet", "Tared", f"{int(walk.now()['frames']):,}"):
+    frames = f"{int(walk.now()['frames']):,}"
+    for fact in ("bench", "leg 2", "#wet", "Tared", frames, " of 500 frames/s"):
         expect(about).to_contain_text(fact)
     expect(page.locator("header")).to_contain_text("40 frames: link down longer")
     plots = settled(page)
@@ -112,25 +101,6 @@ def test_where_the_node_was_started_again_is_shown(twice: Recording, open_page: 
     expect(plots).to_have_attribute("data-kinds", "restarted")
 
 
-@pytest.mark.parametrize(
-    ("time_s", "step", "said"),
-    [
-        (0.0, 0.001, "0.000 s"),
-        (59.99, 0.01, "59.99 s"),
-        (59.999, 0.01, "1:00.00 min"),
-        (75.123, 0.001, "1:15.123 min"),
-        (119.999, 0.01, "2:00.00 min"),
-        (3600.0, 20.0, "60:00 min"),
-        (70.0, 10.0, "1:10 min"),
-    ],
-)
-def test_instants_are_said_with_the_unit_that_they_are_in(
-    live_page: Page, time_s: float, step: float, said: str
-) -> None:
-    code = "async ([t, s]) => (await import('/static/session/overlay.js')).timeText(t, s)"
-    assert live_page.evaluate(code, [time_s, step]) == said
-
-
 def test_without_estimates_raw_counts_are_plotted(raw: Recording, open_page: OpenPage) -> None:
     page = open_page(url_of(raw))
     plots = settled(page)
@@ -154,11 +124,14 @@ def test_a_session_is_shown_while_it_is_recorded_and_as_it_was_sealed_afterwards
         expect(page.locator("#message")).to_contain_text("Recording")
         expect(page.locator("#message")).to_contain_text("provisional")
         settled(page)
-        wait_until(lambda: summary(page, "frames") >= 100, "the first frames")
+        until(lambda: summary(page, "frames") >= 100)
         before = summary(page, "frames")
-        wait_until(lambda: summary(page, "frames") > before, "more of them")
+        until(lambda: summary(page, "frames") > before)
         expect(page.locator("#replay-lag")).to_contain_text("Provisional forces")
         expect(page.locator("#download-parquet")).to_be_hidden()
+        page.click("#ledger-card summary")
+        expect(page.locator("#ledger")).to_contain_text("Not sealed yet")
+        expect(page.locator("#verify")).to_be_hidden()
         scripted.running.http.post(f"{session.url}/markers", json={"label": "a stone"})
         expect(page.locator("#markers-list")).to_contain_text("a stone")
         page.keyboard.press("ArrowRight")
@@ -204,7 +177,7 @@ def test_each_page_is_small_as_sent_and_the_live_page_does_not_carry_the_other(
         page = context.new_page()
         received = Received(page)
         page.goto(walk.running.url)
-        expect(page.locator("body")).to_have_attribute("data-live", "true")
+        expect(page.locator(LIVE)).to_have_count(1)
         expect(page.locator("#last-session")).to_contain_text("Not recording")
         received.wait_for("/history")
         assert received.bytes_in_all < 120_000, received.bytes_of
@@ -214,94 +187,33 @@ def test_each_page_is_small_as_sent_and_the_live_page_does_not_carry_the_other(
     node.close()
 
 
-def test_the_rate_that_was_reached_stands_beside_that_of_the_node(
-    walk: Recording, open_page: OpenPage
-) -> None:
-    page = open_page(url_of(walk))
-    expect(page.locator("#about")).to_contain_text(" of 500 frames/s")
-    asked = """Promise.all([import("/static/session/header.js"), import("/static/session/bins.js")])
-      .then(([{ rateText }, { Bins }]) => {
-        const whole = { rateHz: 434.2 };
-        const columns = {
-          t_first_s: [0, 1, 10], t_last_s: [0.9, 2, 11], part: [0, 0, 1],
-          frames: [90, 71, 101], missing: [0, 40, 0],
-        };
-        const bins = new Bins({ columns }, { from: 0, to: 11 });
-        return [rateText(whole, 449.1), bins.rateHz];
-      })"""
-    text, rate_hz = page.evaluate(asked)
-    assert text == "434 of 449 frames/s"
-    assert rate_hz == pytest.approx(100.0)  # 300 periods in two parts of two seconds and of one
-
-
-def test_of_tiles_in_one_row_the_page_says_that_y_is_not_measured(
+def test_a_session_that_is_not_there_is_said_not_to_be(
     server: Running, open_page: OpenPage
 ) -> None:
-    asked = """Promise.all(
-      ["panels", "readout", "bins"].map((name) => import(`/static/session/${name}.js`)),
-    ).then(([{ panelsOf }, { readingsOf }, { Bins }]) => {
-        const said = (y) => {
-          const columns = {
-            t_first_s: [0, 1], t_last_s: [0, 1], frames: [1, 1], missing: [0, 0], part: [0, 0],
-            contact: [2, 2], grf_lower_bound_n_max: [0, 0],
-          };
-          for (const name of ["grf_n", "angle_rad", "cop_x_m"]) {
-            for (const end of ["min", "max"]) columns[`${name}_${end}`] = [1, 2];
-          }
-          for (const axis of ["x", "y"]) {
-            columns[`cop_${axis}_low_m_min`] = [0.5, 1];
-            columns[`cop_${axis}_high_m_max`] = [1.5, 3];
-          }
-          columns.cop_y_m_min = columns.cop_y_m_max = y;
-          const columnsOf = (name) => ({ [`${name}_min`]: [1, 1], [`${name}_max`]: [1, 1] });
-          Object.assign(columns, columnsOf("grf_low_n"), columnsOf("grf_high_n"));
-          const bins = new Bins({ columns, serials: [], frames_in_bin: 1 }, { from: 0, to: 1 });
-          const panels = panelsOf(bins, null);
-          const y_read = readingsOf(bins, 0, panels).find(([key]) => key === "cop-y");
-          return [panels.map(({ key }) => key).includes("cop-y"), y_read?.[2] ?? null,
-            panels.find(({ key }) => key === "cop-x").note ?? null];
-        };
-        return [said([null, null]), said([1, 2])];
-      })"""
-    alone, plan = open_page(f"{server.url}/nodes").evaluate(asked)
-    assert alone == [False, "not measured: tiles in one row", "y not measured"]
-    assert plan == [True, "1000.0 mm ± 500.0", None]
+    page = open_page(f"{server.url}/sessions/none")
+    expect(page.locator("#message")).to_contain_text("Session not found")
+    expect(page.locator("#message")).to_contain_text("in the trash")
+    page.click("#back")
+    expect(page.locator("#sessions-card")).to_be_visible()
 
 
-def test_a_session_that_is_not_there_is_said_not_to_be(server: Running, browser: Browser) -> None:
-    with browser.new_context() as context:  # its console says 404, and is right
-        page = context.new_page()
-        page.goto(f"{server.url}/sessions/none")
-        expect(page.locator("#message")).to_contain_text("Session not found")
-        expect(page.locator("#message")).to_contain_text("in the trash")
-        page.click("#back")
-        expect(page.locator("#sessions-card")).to_be_visible()
-
-
-@pytest.mark.parametrize("size", [(390, 844), (320, 640), (1366, 768)])
 def test_axe_has_nothing_to_complain_of_and_nothing_is_wider_than_the_screen(
-    walk: Recording, open_page: OpenPage, size: tuple[int, int]
+    walk: Recording, open_page: OpenPage
 ) -> None:
-    page = open_page(url_of(walk, "?from=1&to=1.1"), *size)
+    page = open_page(url_of(walk, "?from=1&to=1.1"), *SMALL_PHONE)
     settled(page)
     page.keyboard.press("ArrowRight")
     page.click("#numbers-card summary")
     expect(page.locator("#numbers-rows tr").nth(11)).to_be_attached()
     page.locator("#overlay-card").scroll_into_view_if_needed()
     expect(page.locator("#overlay-legend")).to_contain_text("mean")
-    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
-    assert complaints(page) == []
+    assert complaints_at(page, SMALL_PHONE, PHONE, DESK) == []
 
 
 def test_an_answer_that_breaks_off_is_as_if_there_were_none(
-    walk: Recording, browser: Browser
+    walk: Recording, open_page: OpenPage
 ) -> None:
-    with browser.new_context() as context:
-        page = context.new_page()
-        wrong: list[str] = []
-        page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.route("**/comparisons", lambda route: route.fulfill(body='{"items": [', status=200))
-        page.goto(url_of(walk))
-        settled(page)
-        expect(page.locator("#compare")).to_be_visible()
-        assert wrong == []
+    broken = {"**/comparisons": lambda route: route.fulfill(body='{"items": [', status=200)}
+    page = open_page(url_of(walk), answers=broken)
+    settled(page)
+    expect(page.locator("#compare")).to_be_visible()

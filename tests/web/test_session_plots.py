@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 
 import numpy as np
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import expect
 
 from storage.formats.writers.registry import FORMATS
 from tests.service.recording import Recording
 from tests.service.running import Running
 from tests.waiting import until
+from tests.web.pages import OpenPage, box_of
 from tests.web.session_page import grf, recorded_walk, seen, settled, summary, url_of
 
 pytestmark = pytest.mark.real_time
-
-OpenPage = Callable[..., Page]
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +55,7 @@ def test_what_is_shown_is_in_the_link_and_comes_back_with_it(
 ) -> None:
     page = open_page(url_of(walk))
     all_s = seen(page)
-    box = page.locator("#plots").bounding_box()
-    assert box is not None
+    box = box_of(page.locator("#plots"))
     page.mouse.move(box["x"] + 300, box["y"] + 100)
     page.mouse.down()
     page.mouse.move(box["x"] + 600, box["y"] + 100, steps=4)
@@ -159,8 +156,7 @@ def test_whole_stances_lie_one_upon_another_and_a_click_on_one_goes_there(
     says = page.locator("#overlay-summary")
     expect(says).to_contain_text("6 whole stances")
     expect(says).to_contain_text("1 incomplete stance left out")
-    box = canvas.bounding_box()
-    assert box is not None
+    box = box_of(canvas)
     at = page.locator("#overlay-at")
     expect(at).to_have_text(
         re.compile(r"Mean has its maximum at \d+ %: [0-9.]+ N \(SD [0-9.]+ N\)")
@@ -227,6 +223,8 @@ def test_a_marker_is_set_at_the_cursor_and_what_is_in_view_can_be_downloaded(
     lines = download.value.path().read_text("utf-8").splitlines()
     assert len([line for line in lines if not line.startswith("#")]) == 101
     page.click("#downloads-more summary")
+    expect(page.locator("#download-xdf")).to_be_visible()
+    expect(page.locator("#download-take")).to_be_hidden()  # it is of none
     offered = page.locator("#download-list [data-format]")
     names = offered.evaluate_all("items => items.map((item) => item.dataset.format)")
     assert set(names) == set(FORMATS) - {"parquet", "arrow", "csv"}

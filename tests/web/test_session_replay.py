@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -17,10 +16,10 @@ from tests.builders.arrays import make_servo
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
 from tests.service.running import Running
+from tests.web.pages import OpenPage, box_of
 
 pytestmark = pytest.mark.real_time
 
-OpenPage = Callable[..., Page]
 
 ROLLED, SATURATED, UNREAD, LOST = 700, 50, 50, 300
 
@@ -286,8 +285,7 @@ def test_without_a_frame_near_the_cursor_no_other_one_is_shown(
     begin_s, end_s = (float(stored["since_s"][gap + i]) for i in (0, 1))
     assert end_s - begin_s == pytest.approx(2e-3 * (LOST + 1))
     page = opened(session, open_page, begin_s, end_s)
-    box = page.locator("#plots").bounding_box()
-    assert box is not None
+    box = box_of(page.locator("#plots"))
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 60)
     replay = page.locator("#replay")
     expect(replay).to_have_attribute("data-none", "true")

@@ -13,12 +13,11 @@ from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
 from tests.service.running import Running
 from tests.waiting import until
+from tests.web.pages import OpenPage, box_of, complaints, width_of
 from tests.web.session_page import settled
-from tests.web.test_accessible import complaints
 
 pytestmark = pytest.mark.real_time
 
-OpenPage = Callable[..., Page]
 
 STANCES = 12
 PHONE: dict[str, Any] = {"width": 390, "height": 844, "has_touch": True, "is_mobile": True}
@@ -110,13 +109,17 @@ def middle_of(
     return box["x"] + at, box["y"] + 100
 
 
-def test_a_stance_is_gone_to_from_its_row_and_by_keys(
+def test_a_laptop_shows_four_rows_and_a_stance_is_gone_to_from_its_row_and_by_keys(
     hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
 ) -> None:
     page = opened(open_page, hops)
     begin_ns = int(hops.column("t_ns")[0])
     rows = page.locator("#stances-rows tr")
     expect(rows).to_have_count(STANCES)
+    box, fourth = box_of(page.locator("#stances-scroll")), box_of(rows.nth(3))
+    assert fourth["y"] + fourth["height"] <= box["y"] + box["height"]
+    for part in ("#grf", "#contact", "#foot", "#cop"):
+        expect(page.locator(part)).to_be_in_viewport(ratio=1)
     expect(rows.nth(11)).to_contain_text(f"{stances[11]['peak_grf_n']:.1f} ±")
 
     def shows(number: int) -> None:
@@ -134,7 +137,7 @@ def test_a_stance_is_gone_to_from_its_row_and_by_keys(
     shows(1)
 
 
-def test_on_a_phone_the_peak_of_the_third_stance_is_three_taps_away(
+def test_on_a_phone_a_stance_is_three_taps_away_and_where_the_plots_are_touched_it_is_said(
     hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
 ) -> None:
     page = opened(open_page, hops, **PHONE)
@@ -147,29 +150,10 @@ def test_on_a_phone_the_peak_of_the_third_stance_is_three_taps_away(
     assert page.evaluate(_IN_SIGHT, ["#plots", FORCE_PX])
     assert page.evaluate("scrollY") == 0
     for button in ("#stance-before", "#stance-next"):
-        box = page.locator(button).bounding_box()
-        assert box is not None
+        box = box_of(page.locator(button))
         assert min(box["width"], box["height"]) >= 44
     assert complaints(page) == []
 
-
-def test_a_row_that_is_tapped_brings_its_plot_into_view(
-    hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
-) -> None:
-    page = opened(open_page, hops, **PHONE)
-    page.locator("#stances-rows tr").nth(2).tap()
-    says(page, stances[2])
-    in_view(page, stances[2], int(hops.column("t_ns")[0]))
-    assert page.evaluate(_IN_SIGHT, ["#stance-line", 44])
-    assert page.evaluate(_IN_SIGHT, ["#plots", FORCE_PX])
-
-
-def test_where_the_plots_are_touched_the_stance_is_said_and_the_next_one_follows_from_there(
-    hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
-) -> None:
-    page = opened(open_page, hops, **PHONE)
-    page.tap("#stance-next")
-    says(page, stances[0])
     page.tap("#zoom-all")
     page.touchscreen.tap(*middle_of(page, stances[6], hops))
     says(page, stances[6])
@@ -179,15 +163,20 @@ def test_where_the_plots_are_touched_the_stance_is_said_and_the_next_one_follows
     force_n = float((page.locator("#grf").text_content() or "").strip())
     assert f" {force_n:.1f} ±" in (page.locator("#replay-force").text_content() or "")
     expect(page.locator("#replay-frame")).to_be_hidden()
-    assert page.evaluate("document.documentElement.scrollWidth") == PHONE["width"]
-    page.tap("#stance-next")
+    assert width_of(page) == PHONE["width"]
+    page.tap("#stance-next")  # it goes on from there
     says(page, stances[7])
 
 
-def test_what_is_laid_one_upon_another_follows_the_cursor(
+def test_a_row_that_is_tapped_brings_its_plot_into_view_and_the_overlay_follows_the_cursor(
     hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
 ) -> None:
     page = opened(open_page, hops, **PHONE)
+    page.locator("#stances-rows tr").nth(2).tap()
+    says(page, stances[2])
+    in_view(page, stances[2], int(hops.column("t_ns")[0]))
+    assert page.evaluate(_IN_SIGHT, ["#stance-line", 44])
+    assert page.evaluate(_IN_SIGHT, ["#plots", FORCE_PX])
     page.locator("#overlay-card").scroll_into_view_if_needed()
     legend = page.locator("#overlay-legend")
     expect(legend).to_contain_text("mean")
@@ -251,37 +240,8 @@ def test_of_a_stance_that_was_not_seen_whole_the_line_says_so(
     expect(page.locator("#stance-which")).to_have_text("Stance 2 of 2")
     expect(page.locator("#stance-flags")).to_be_empty()
     expect(page.locator("#stance-figures")).not_to_contain_text("≥")
-    assert page.evaluate("document.documentElement.scrollWidth") == PHONE["width"]
-    # A COP travel without a sigma is a lower bound, too, and counts in no median.
-    code = """async (given) => {
-        const { FIGURES, valuesOf } = await import('/static/session/stances.js');
-        return valuesOf(given, FIGURES.find(({ key }) => key === "travel"));
-    }"""
-    whole: dict[str, Any] = {"begun": True, "ended": True, "cop_x_range_m": 0.02}
-    given = [whole | {"cop_x_range_sigma_m": sigma_m} for sigma_m in (0.001, None)]
-    assert page.evaluate(code, given) == [0.02]
+    assert width_of(page) == PHONE["width"]
     assert complaints(page) == []
-
-
-def test_of_a_cut_stance_a_bound_of_zero_is_left_out(server: Running, open_page: OpenPage) -> None:
-    asked = """import("/static/session/stances.js").then(({ FIGURES, figureOf }) =>
-      [0, 0.012].map((s) => ({ begun: false, duration_s: s, duration_sigma_s: 0.01 }))
-        .map((stance) => figureOf(stance, FIGURES[1])))"""
-    found = open_page(f"{server.url}/nodes").evaluate(asked)
-    assert found == [["\u2013", ""], ["≥\u00a012", "±\u00a020"]]
-
-
-def test_a_laptop_shows_four_rows_of_stances_and_the_foot(
-    hops: Recording, open_page: OpenPage
-) -> None:
-    page = opened(open_page, hops)
-    box = page.locator("#stances-scroll").bounding_box()
-    fourth = page.locator("#stances-rows tr").nth(3).bounding_box()
-    assert box is not None
-    assert fourth is not None
-    assert fourth["y"] + fourth["height"] <= box["y"] + box["height"]
-    for part in ("#grf", "#contact", "#foot", "#cop"):
-        expect(page.locator(part)).to_be_in_viewport(ratio=1)
 
 
 def test_a_phone_is_not_told_of_keys(hops: Recording, open_page: OpenPage) -> None:
@@ -301,31 +261,21 @@ def test_a_phone_is_not_told_of_keys(hops: Recording, open_page: OpenPage) -> No
     assert desk.evaluate(_KEYS_SHOWN) > 6
 
 
-@pytest.mark.parametrize("scheme", ["sunlight", "dark"])
-def test_axe_has_nothing_to_complain_of_in_the_sun_or_the_dark_with_a_stance_and_with_help(
-    hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage, scheme: str
+def test_axe_has_nothing_to_complain_of_in_the_dark_or_the_sun_with_a_stance_and_with_help(
+    hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
 ) -> None:
     page = opened(open_page, hops, color_scheme="dark")
-    if scheme == "sunlight":  # whatever the machine prefers
-        page.click("#sun")
     page.keyboard.press("]")
     says(page, stances[0])
-    assert complaints(page) == []
-    page.keyboard.press("?")
-    expect(page.locator("#help-dialog")).to_be_visible()
-    assert complaints(page) == []
-
-
-def test_the_neighbour_is_that_of_the_cursor_or_the_first_in_view(
-    server: Running, open_page: OpenPage
-) -> None:
-    asked = """import("/static/session/stances.js").then(({ neighbour }) => {
-      const all = [{ from: 0, to: 1 }, { from: 2, to: 3 }, { from: 4, to: 5 }];
-      const cursors = [null, 1.5, 2.5, 9];
-      return cursors.map((s) => [-1, 1].map((by) => neighbour(all, by, s, { from: 1.2, to: 4.5 })));
-    })"""
-    found = open_page(f"{server.url}/nodes").evaluate(asked)
-    assert found == [[2, 1], [0, 1], [0, 2], [2, -1]]  # before it and after it; -1: there is none
+    for scheme in ("dark", "sunlight"):
+        if scheme == "sunlight":  # whatever the machine prefers
+            page.click("#sun")
+        assert complaints(page) == [], scheme
+        page.keyboard.press("?")
+        expect(page.locator("#help-dialog")).to_be_visible()
+        assert complaints(page) == [], scheme
+        page.keyboard.press("Escape")
+        expect(page.locator("#help-dialog")).to_be_hidden()
 
 
 def test_a_selected_stance_stays_selected_until_all_or_escape_is_pressed(
@@ -334,8 +284,7 @@ def test_a_selected_stance_stays_selected_until_all_or_escape_is_pressed(
     page = opened(open_page, hops)
     medians = f"{STANCES} stances, median of {STANCES} whole"
     which = page.locator("#stance-which")
-    box = page.locator("#plots").bounding_box()
-    assert box is not None
+    box = box_of(page.locator("#plots"))
 
     def point(share: float) -> None:
         """Point there; wait until the values are read."""
@@ -433,16 +382,3 @@ def test_the_chosen_stance_is_exported_from_its_first_frame_to_its_last(
     assert download.value.suggested_filename.startswith(f"hops_{hops.id}_{begin_s:.3f}s-to-")
     choice.select_option("view")
     expect(page.locator("#download-csv")).to_have_attribute("href", re.compile("start_s="))
-
-
-def test_of_an_even_number_of_stances_the_median_is_between_the_two_in_the_middle(
-    server: Running, open_page: OpenPage
-) -> None:
-    asked = """import("/static/session/stances.js").then(({ medianOf }) => {
-      const of = (...peaks) =>
-        medianOf(peaks.map((peak) => ({ peak_grf_n: peak, duration_s: null })));
-      return [of(1, 5, 2), of(4, 1, 2, null, 9), of(null), of()]
-        .map((all) => [all.peak_grf_n, all.duration_s]);
-    })"""
-    found = open_page(f"{server.url}/nodes").evaluate(asked)
-    assert found == [[2, None], [3, None], [None, None], [None, None]]

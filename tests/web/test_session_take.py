@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
-from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Page, expect
+from playwright.sync_api import expect
 
 from storage.formats.writers.registry import MULTI_SESSION_FORMATS
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running
 from tests.service.takes import Take, frames_of_long_ago
 from tests.storage.formats.writers.readers import said_in
-
-OpenPage = Callable[..., Page]
+from tests.web.pages import OpenPage, complaints
 
 
 @pytest.fixture
@@ -38,7 +34,7 @@ def test_the_others_of_a_take_come_in_the_same_file(take: Take, open_page: OpenP
     names = offered.evaluate_all("items => items.map((item) => item.dataset.format)")
     assert set(names) == set(MULTI_SESSION_FORMATS)
     assert everything == len(names)  # the others stand in the page, and are of this session only
-    assert not Axe().run(page).response["violations"]
+    assert complaints(page) == []
     with page.expect_download() as download:
         page.click("#download-mcap")
     assert download.value.suggested_filename == f"both_take-{take.id}_0.000s-to-0.100s.mcap"
@@ -51,18 +47,3 @@ def test_the_others_of_a_take_come_in_the_same_file(take: Take, open_page: OpenP
     with page.expect_download() as one:
         page.click("#download-mcap")
     assert one.value.suggested_filename == f"both_{take.sessions[0].id}_0.000s-to-0.100s.mcap"
-
-
-def test_a_session_by_itself_offers_no_take(server: Running, open_page: OpenPage) -> None:
-    node = FakeNode(server, "alone")
-    node.connect()
-    node.tared()
-    session = node.record()
-    node.deliver(100, [20.0, 60.0], alive=True)
-    node.finish(session)
-    node.close()
-    page = open_page(f"{server.url}/sessions/{session.id}")
-    expect(page.locator("#plots[data-settled=true]")).to_have_count(1)
-    page.click("#downloads-more summary")
-    expect(page.locator("#download-xdf")).to_be_visible()
-    expect(page.locator("#download-take")).to_be_hidden()

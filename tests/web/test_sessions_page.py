@@ -5,29 +5,25 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import expect
 
 from tests.service.fake_node import FakeNode, Play
-from tests.web.conftest import wait_until
+from tests.waiting import until
+from tests.web.pages import DESK, PHONE, OpenPage, at_sizes, box_of, complaints_at, live
 from tests.web.scripted import Scripted
 from tests.web.session_rows import choose, open_menu, row_of
-from tests.web.test_accessible import SIZES, complaints
 
 pytestmark = pytest.mark.real_time
-
-OpenPage = Callable[..., Page]
 
 
 def test_recordings_that_run_at_once_are_all_shown_marked_and_stopped_one_by_one(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     with Play(scripted.node):
-        page = open_page(scripted.url)
-        expect(page.locator("body")).to_have_attribute("data-live", "true")
+        page = live(open_page(scripted.url))
         for name, button in (("first", "#record"), ("second", "#another")):
             page.fill("#session-name", name)
             page.click(button)
@@ -43,7 +39,7 @@ def test_recordings_that_run_at_once_are_all_shown_marked_and_stopped_one_by_one
         page.click("#stop")
         expect(page.locator("#recordings")).to_be_hidden()
         sessions = scripted.running.sessions
-        wait_until(lambda: {s["state"] for s in sessions()} == {"sealed"}, "both sealed")
+        until(lambda: {s["state"] for s in sessions()} == {"sealed"})
     for session in sessions():
         markers = scripted.running.http.get(f"/sessions/{session['id']}/markers").json()["items"]
         assert [event["label"] for event in markers] == ["a stone"]
@@ -54,8 +50,7 @@ def test_a_marker_that_is_set_while_the_server_is_away_has_the_instant_of_the_pr
 ) -> None:
     session = scripted.node.record(name="walk")
     with Play(scripted.node):
-        page = open_page(scripted.url)
-        expect(page.locator("body")).to_have_attribute("data-live", "true")
+        page = live(open_page(scripted.url))
         expect(page.locator("#marker")).to_be_enabled()
         time.sleep(1.5)  # a heartbeat says what time it is
     scripted.running.stop()
@@ -136,7 +131,7 @@ def test_a_complete_session_says_how_much_was_not_sampled(
         session = node.record(name="walk")
         time.sleep(0.5)
         node.socket.send(json.dumps({"type": "status", "missed_slots": 1000, "warnings": []}))
-        wait_until(lambda: scripted.running.node()["missed_slots"] == 1000, "the missed slots")
+        until(lambda: scripted.running.node()["missed_slots"] == 1000)
         during = open_page(f"{scripted.url}/sessions/{session.id}")
         expect(during.locator("#state")).to_have_text(re.compile("^recording, .+ not sampled$"))
         session.stop()
@@ -166,8 +161,7 @@ def test_losses_troubles_and_what_is_behind_are_said_in_words(
         node.say_lost(disk_full=[[first, first + 1]], evicted=[[first + 2, first + 101]])
         status = {"type": "status", "missed_slots": 3, "warnings": ["the node's disk is full"]}
         node.socket.send(json.dumps(status))
-        page = open_page(scripted.url)
-        expect(page.locator("body")).to_have_attribute("data-live", "true")
+        page = live(open_page(scripted.url))
         expect(page.locator("#lost")).to_have_text("102 lost, 3 not sampled")
         expect(page.locator("#backlog")).to_have_text("898 frames")
         notes = page.locator("#notes")
@@ -198,8 +192,7 @@ def test_a_double_tap_records_once_and_stop_ends_all_recordings_of_the_node(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     with Play(scripted.node):
-        page = open_page(scripted.url)
-        expect(page.locator("body")).to_have_attribute("data-live", "true")
+        page = live(open_page(scripted.url))
         page.dblclick("#record")
         page.keyboard.press("r")
         expect(page.locator("#recordings li")).to_have_count(1)
@@ -221,8 +214,7 @@ def test_a_phone_has_room_for_several_recordings_and_all_buttons(
     with Play(scripted.node):
         for name in ("first", "second", "third"):
             scripted.node.record(name=name)
-        page = open_page(scripted.url, 390, 844)
-        expect(page.locator("body")).to_have_attribute("data-live", "true")
+        page = live(open_page(scripted.url, 390, 844))
         expect(page.locator("#recordings li")).to_have_count(3)
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
         for button in ("#tare", "#another", "#stop", "#marker"):
@@ -248,9 +240,8 @@ def test_a_session_shows_how_many_markers_it_has_and_its_downloads_have_them(
         assert b"a stone" in content
 
 
-@SIZES
 def test_sessions_of_a_take_are_listed_together_and_compared_from_the_menu(
-    scripted: Scripted, open_page: OpenPage, size: tuple[int, int]
+    scripted: Scripted, open_page: OpenPage
 ) -> None:
     other = FakeNode(scripted.running, "other")
     other.connect()
@@ -261,29 +252,30 @@ def test_sessions_of_a_take_are_listed_together_and_compared_from_the_menu(
         scripted.node.record(name="alone").stop()
         scripted.running.http.post(f"/takes/{take['id']}/stop")
         sessions = scripted.running.sessions
-        wait_until(lambda: {s["state"] for s in sessions()} == {"sealed"}, "all sealed")
+        until(lambda: {s["state"] for s in sessions()} == {"sealed"})
     first, second = (one["id"] for one in sorted(take["sessions"], key=lambda one: one["node"]))
     fields = {"subject": "leg 2", "tags": ["wet"], "notes": "slow"}
     assert scripted.running.http.patch(f"/sessions/{first}", json=fields).status_code == 200
-    page = open_page(f"{scripted.url}/sessions", *size)
+    page = open_page(f"{scripted.url}/sessions", *PHONE)
     expect(page.locator("#sessions .session")).to_have_count(3)
     expect(page.locator("#sessions .take")).to_contain_text("2 nodes: bench, other")
     order = "rows => rows.map((row) => row.dataset.take ?? row.dataset.sessionId)"
     lines = page.locator("#sessions :is(.take, .session)").evaluate_all(order)
     at = lines.index(take["id"])
     assert lines[at : at + 3] == [take["id"], first, second]
-    assert complaints(page) == []
+    assert complaints_at(page, DESK, PHONE) == []
     page.get_by_role("checkbox", name="Select the take both").check()
     expect(page.locator("#chosen-text")).to_have_text("2 selected")
     page.locator(f'[data-session-id="{second}"] input').uncheck()
     expect(page.locator("#chosen-text")).to_have_text("1 selected")
     assert page.locator(".take input").evaluate("box => box.indeterminate")
     row = page.locator(f'#sessions [data-session-id="{first}"]')
-    menu = open_menu(page, row)
-    box = menu.bounding_box()
-    assert box is not None
-    assert box["x"] >= 0
-    assert box["x"] + box["width"] <= size[0]
+    for width, _ in at_sizes(page, DESK, PHONE):
+        menu = open_menu(page, row)
+        box = box_of(menu)
+        assert 0 <= box["x"] <= width - box["width"]
+        if width != PHONE[0]:
+            page.keyboard.press("Escape")
     expect(menu.get_by_role("menuitem").first).to_be_focused()
     page.keyboard.press("Escape")
     expect(menu).to_have_count(0)

@@ -1,0 +1,304 @@
+"""Modules of the pages that compute: all are asked in one page, without a node."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser
+
+from tests.service.running import Running
+
+pytestmark = pytest.mark.real_time
+
+Ask = Callable[..., Any]
+
+
+@pytest.fixture(scope="module")
+def ask(server: Running, browser: Browser) -> Iterator[Ask]:
+    """Calls a function of JavaScript with modules of the pages, and one value more."""
+    with browser.new_context() as context:
+        page = context.new_page()
+        page.goto(f"{server.url}/static/tile-reads-nonsense.html")
+
+        def evaluate(modules: str, function: str, value: object = None) -> Any:
+            addresses = [f"/static/{name}.js" for name in modules.split()]
+            return page.evaluate(
+                f"""async ([addresses, value]) => {{
+                  const all = await Promise.all(addresses.map((address) => import(address)));
+                  return ({function})(Object.assign({{}}, ...all), value);
+                }}""",
+                [addresses, value],
+            )
+
+        yield evaluate
+
+
+def test_what_people_write_stays_as_it_is(ask: Ask) -> None:
+    texts = [
+        "third trial, 20 °C",
+        "Anlauf über Kies",
+        "👩\u200d🔬 first",
+        "\u0645\u06cc\u200c\u062e\u0648\u0627",
+        "क्\u200dष",
+        "two\nlines",
+    ]
+    assert ask("common/text", "({ printable }, texts) => texts.map(printable)", texts) == texts
+
+
+def test_instants_are_said_with_the_unit_that_they_are_in(ask: Ask) -> None:
+    said = {
+        (0.0, 0.001): "0.000 s",
+        (59.99, 0.01): "59.99 s",
+        (59.999, 0.01): "1:00.00 min",
+        (75.123, 0.001): "1:15.123 min",
+        (119.999, 0.01): "2:00.00 min",
+        (3600.0, 20.0): "60:00 min",
+        (70.0, 10.0): "1:10 min",
+    }
+    function = "({ timeText }, all) => all.map((one) => timeText(...one))"
+    assert ask("session/overlay", function, [list(one) for one in said]) == list(said.values())
+
+
+def test_the_rate_that_was_reached_stands_beside_that_of_the_node(ask: Ask) -> None:
+    text, rate_hz = ask(
+        "session/header session/bins",
+        """({ rateText, Bins }) => {
+          const columns = {
+            t_first_s: [0, 1, 10], t_last_s: [0.9, 2, 11], part: [0, 0, 1],
+            frames: [90, 71, 101], missing: [0, 40, 0],
+          };
+          const bins = new Bins({ columns }, { from: 0, to: 11 });
+          return [rateText({ rateHz: 434.2 }, 449.1), bins.rateHz];
+        }""",
+    )
+    assert text == "434 of 449 frames/s"
+    assert rate_hz == pytest.approx(100.0)  # 300 periods in two parts of two seconds and of one
+
+
+def test_of_tiles_in_one_row_the_page_says_that_y_is_not_measured(ask: Ask) -> None:
+    alone, plan = ask(
+        "session/panels session/readout session/bins",
+        """({ panelsOf, readingsOf, Bins }) => {
+          const said = (y) => {
+            const columns = {
+              t_first_s: [0, 1], t_last_s: [0, 1], frames: [1, 1], missing: [0, 0], part: [0, 0],
+              contact: [2, 2], grf_lower_bound_n_max: [0, 0],
+            };
+            for (const name of ["grf_n", "angle_rad", "cop_x_m"]) {
+              for (const end of ["min", "max"]) columns[`${name}_${end}`] = [1, 2];
+            }
+            for (const axis of ["x", "y"]) {
+              columns[`cop_${axis}_low_m_min`] = [0.5, 1];
+              columns[`cop_${axis}_high_m_max`] = [1.5, 3];
+            }
+            columns.cop_y_m_min = columns.cop_y_m_max = y;
+            const columnsOf = (name) => ({ [`${name}_min`]: [1, 1], [`${name}_max`]: [1, 1] });
+            Object.assign(columns, columnsOf("grf_low_n"), columnsOf("grf_high_n"));
+            const bins = new Bins({ columns, serials: [], frames_in_bin: 1 }, { from: 0, to: 1 });
+            const panels = panelsOf(bins, null);
+            const y_read = readingsOf(bins, 0, panels).find(([key]) => key === "cop-y");
+            return [panels.map(({ key }) => key).includes("cop-y"), y_read?.[2] ?? null,
+              panels.find(({ key }) => key === "cop-x").note ?? null];
+          };
+          return [said([null, null]), said([1, 2])];
+        }""",
+    )
+    assert alone == [False, "not measured: tiles in one row", "y not measured"]
+    assert plan == [True, "1000.0 mm ± 500.0", None]
+
+
+def test_of_a_cut_stance_a_bound_of_zero_is_left_out(ask: Ask) -> None:
+    found = ask(
+        "session/stances",
+        """({ FIGURES, figureOf }) =>
+          [0, 0.012].map((s) => ({ begun: false, duration_s: s, duration_sigma_s: 0.01 }))
+            .map((stance) => figureOf(stance, FIGURES[1]))""",
+    )
+    assert found == [["\u2013", ""], ["≥\u00a012", "±\u00a020"]]
+
+
+def test_a_travel_without_a_sigma_is_a_lower_bound_and_counts_in_no_median(ask: Ask) -> None:
+    whole: dict[str, Any] = {"begun": True, "ended": True, "cop_x_range_m": 0.02}
+    found = ask(
+        "session/stances",
+        """({ FIGURES, valuesOf }, given) =>
+          valuesOf(given, FIGURES.find(({ key }) => key === "travel"))""",
+        [whole | {"cop_x_range_sigma_m": sigma_m} for sigma_m in (0.001, None)],
+    )
+    assert found == [0.02]
+
+
+def test_of_an_even_number_of_stances_the_median_is_between_the_two_in_the_middle(
+    ask: Ask,
+) -> None:
+    found = ask(
+        "session/stances",
+        """({ medianOf }) => {
+          const of = (...peaks) =>
+            medianOf(peaks.map((peak) => ({ peak_grf_n: peak, duration_s: null })));
+          return [of(1, 5, 2), of(4, 1, 2, null, 9), of(null), of()]
+            .map((all) => [all.peak_grf_n, all.duration_s]);
+        }""",
+    )
+    assert found == [[2, None], [3, None], [None, None], [None, None]]
+
+
+def test_the_neighbour_is_that_of_the_cursor_or_the_first_in_view(ask: Ask) -> None:
+    found = ask(
+        "session/stances",
+        """({ neighbour }) => {
+          const all = [{ from: 0, to: 1 }, { from: 2, to: 3 }, { from: 4, to: 5 }];
+          const view = { from: 1.2, to: 4.5 };
+          return [null, 1.5, 2.5, 9].map((s) => [-1, 1].map((by) => neighbour(all, by, s, view)));
+        }""",
+    )
+    assert found == [[2, 1], [0, 1], [0, 2], [2, -1]]  # before it and after it; -1: there is none
+
+
+def test_sessions_are_aligned_at_whole_stances(ask: Ask) -> None:
+    shift_s = ask(
+        "session/align",
+        """({ alignments }) => {
+          const own = { beginNs: 0, durationS: 9, markers: [], offset: () => null,
+            stances: [{ from: 0, is_whole: false }, { from: 2, is_whole: true }] };
+          const other = { beginNs: 0, durationS: 9, events: [], clock: null,
+            stances: [{ begin_t_ns: 5e8, is_whole: true }] };
+          return alignments(own, other)[0].shiftS;
+        }""",
+    )
+    assert shift_s == 1.5
+
+
+def test_tiles_are_compared_by_serial_and_those_of_another_foot_in_their_order(ask: Ask) -> None:
+    found = ask(
+        "session/beside",
+        """({ Beside }) => {
+          const matched = (own, theirs) => {
+            const nobody = { ask: null, onChange: null, onError: null };
+            const beside = new Beside({ name: "", columns: {}, ...nobody });
+            const names = theirs.map((_, i) => [`force_n_${i}_max`, []]);
+            beside.answer = { serials: theirs, columns: Object.fromEntries(names) };
+            beside.matchTiles(own);
+            return Object.entries(beside.columns).map(([tile, [least]]) => `${tile}=${least}`);
+          };
+          return [
+            matched(["a", "b"], ["b", "a"]), matched(["a", "b"], ["c", "d"]),
+            matched(["a", "b"], ["c", "a"]), matched(["a", "b"], ["c"]),
+          ];
+        }""",
+    )
+    assert found == [
+        ["tile-0=force_n_1_min", "tile-1=force_n_0_min"],
+        ["tile-0=force_n_0_min", "tile-1=force_n_1_min"],
+        ["tile-0=force_n_1_min"],
+        [],
+    ]
+
+
+def test_from_above_toes_are_up_and_only_a_grid_is_drawn_of_squares(ask: Ask) -> None:
+    found = ask(
+        "common/foot_layout",
+        """({ FootLayout, isGrid }) => {
+          const at = (x, y) => ({ serial: "", x_m: x, y_m: y, z_m: 0 });
+          const box = { widthPx: 300, heightPx: 300, roomPx: 0, toesUp: true };
+          const square = [at(0, 0), at(0.01, 0), at(0, 0.01), at(0.01, 0.01)];
+          const diamond = [at(0, 0), at(0.01, 0.01), at(0.02, 0), at(0.01, -0.01)];
+          const [heel, toe, left] = new FootLayout(square, box).points;
+          return {
+            toesAbove: toe.y < heel.y && toe.x === heel.x,
+            leftLeft: left.x < heel.x && left.y === heel.y,
+            grid: isGrid(square), diamond: isGrid(diamond), line: isGrid([at(0, 0), at(0.01, 0)]),
+          };
+        }""",
+    )
+    assert found == {
+        "toesAbove": True,
+        "leftLeft": True,
+        "grid": True,
+        "diamond": False,
+        "line": False,
+    }
+
+
+def test_a_frame_is_shown_ten_times_a_second_and_what_is_new_at_once(ask: Ask) -> None:
+    found = ask(
+        "live/pace",
+        """({ FramePace }) => {
+          const pace = new FramePace();
+          const node = {};
+          const of = (tile_flags, force_n) =>
+            ({ tile_flags, force_n, saturated: [false], frame_flags: 0, estimate_flags: 0 });
+          const steady = of([0], [1]);
+          return {
+            first: pace.isDue(node, steady, 1000),
+            same: pace.isDue(node, steady, 9000),
+            another: pace.isDue(node, of([0], [2]), 9010),
+            soonAfter: pace.isDue(node, of([0], [3]), 9040),
+            faultAtOnce: pace.isDue(node, of([1], [null]), 9043),
+            knownAgainAtOnce: pace.isDue(node, of([0], [4]), 9046),
+            nodeSaysMore: pace.isDue({}, of([0], [5]), 9049),
+            later: pace.isDue({}, of([0], [6]), 9300),
+          };
+        }""",
+    )
+    not_due = [what for what, is_due in found.items() if not is_due]
+    assert not_due == ["same", "soonAfter"]
+
+
+def test_whatever_asks_for_a_picture_there_is_one_in_a_display_frame(ask: Ask) -> None:
+    drawn = ask(
+        "live/pace",
+        """async ({ Pace }) => {
+          let drawn = 0;
+          const pace = new Pace(() => { drawn += 1; });
+          const frame = () => new Promise(requestAnimationFrame);
+          for (let i = 0; i < 5; i++) pace.request();
+          await frame();
+          const first = drawn;
+          pace.request();
+          await frame();
+          clearTimeout(pace.timer);
+          return [first, drawn];
+        }""",
+    )
+    assert drawn == [1, 2]
+
+
+def test_a_picture_that_moves_on_is_that_which_is_drawn_at_once(ask: Ask) -> None:
+    seen = ask(
+        "live/strip",
+        """({ Strip }) => {
+          const points = Array.from({ length: 400 }, (_, i) => ({ timeS: i / 20 }));
+          const draw = (context, i, x) => {
+            context.fillStyle = i % 7 ? "#000" : "#f00";
+            context.fillRect(x(points[i].timeS) - 2, 0, 2, 10);
+          };
+          const how = (endS) => ({ endS, windowS: 10, widthPx: 400, heightPx: 10, key: "one" });
+          const moved = new Strip();
+          let drawn = 0;
+          for (let n = 200; n <= 400; n += 3) {
+            moved.draw(points.slice(Math.max(0, n - 201), n), how(n / 20), (context, i, x) => {
+              const at = Math.max(0, n - 201) + i;
+              drawn += n > 200;
+              draw(context, at, x);
+            });
+          }
+          const once = new Strip();
+          const last = points.slice(197, 398);
+          once.draw(last, how(398 / 20), (context, i, x) => draw(context, 197 + i, x));
+          const red = ({ canvas, context }) => {
+            const row = context.getImageData(0, 5, canvas.width, 1).data;
+            return [...Array(canvas.width).keys()].filter((i) => row[4 * i] > 128);
+          };
+          return { drawn, moved: red(moved), once: red(once) };
+        }""",
+    )
+    assert seen["drawn"] == 198  # each point once
+    assert len(seen["once"]) > 20
+    moved, once = np.array(seen["moved"]), np.array(seen["once"])
+    for some, others in ((moved, once), (once, moved)):
+        inside = some[some > 4]
+        assert np.abs(inside[:, None] - others).min(axis=1).max() <= 1
