@@ -248,16 +248,24 @@ def test_a_frame_has_the_newest_position_and_its_age() -> None:
 
 def test_a_position_of_an_unknown_turn_is_flagged() -> None:
     servo = Servo((2048, 0))
-    one = four_tiles(start_ns=3_600_000_000_000)
+    one = four_tiles(start_ns=0)
     one.acquire(servo=servo)
-    for is_known in (False, True):
+    for is_known, flags in ((False, FrameFlag.SERVO_TURN_UNKNOWN), (True, 0)):
+        servo.reading = (2048, one.clock.now_ns())
         servo.is_turn_known = is_known
         batch = one.take(3)
         assert (batch.servo_counts == 2048).all(), "counts are stored as read"
-        assert (((batch.frame_flags & FrameFlag.SERVO_TURN_UNKNOWN) == 0) == is_known).all()
-        # An hour old: 2^31 us are 36 minutes, and the column is int32.
-        assert (batch.frame_flags & FrameFlag.SERVO_STALE).all()
-        assert (batch.servo_age_us > 30_000_000).all()
+        assert (batch.frame_flags == flags).all()
+
+
+def test_a_position_an_hour_old_is_stale() -> None:
+    # 2^31 us are 36 minutes, and the column is int32.
+    one = four_tiles(start_ns=3_600_000_000_000)
+    one.acquire(servo=Servo((2048, 0)))
+    batch = one.take(3)
+    assert (batch.servo_counts == 2048).all()
+    assert (batch.frame_flags & FrameFlag.SERVO_STALE).all()
+    assert (batch.servo_age_us > 30_000_000).all()
 
 
 def test_a_frame_has_the_reference_force_at_its_instant() -> None:
@@ -335,6 +343,14 @@ def test_every_reading_outside_50_to_115_kpa_is_over_range() -> None:
     # Above 1023 a count wraps: at face value 1000 is some 23 kPa.
     flags = batch.tile_flags[temperature_raw[:, 0] == 507, 0]
     assert np.flatnonzero(flags == 0).tolist() == list(range(264, 782))
+
+
+@pytest.mark.parametrize("flag", list(TileFlag))
+def test_an_unusable_reading_is_not_also_over_range(flag: TileFlag) -> None:
+    batch = make_frames(1, 1, pressure_raw=0, temperature_raw=507, tile_flags=flag)
+    RangeDetector((make_tile(coefficient_words=DATA_SHEET_CHIP),)).flag_out_of_range(batch)
+    added = 0 if flag & TileFlag.UNUSABLE else TileFlag.OVER_RANGE
+    assert batch.tile_flags[0, 0] == flag | added
 
 
 def test_a_tile_beyond_its_range_is_flagged_and_keeps_its_counts() -> None:

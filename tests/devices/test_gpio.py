@@ -108,6 +108,13 @@ def test_lines_are_requested_open_drain_and_released_and_then_driven_and_read(pi
     assert pi.calls == ["pinctrl set 22,23 a3"]
 
 
+def test_pins_are_returned_to_the_controller_after_an_error(pi: Pi) -> None:
+    with pytest.raises(ZeroDivisionError), GpioLines(RecoverySection()).request_scl_sda():
+        _ = 1 / 0
+    assert not pi.requests[0].is_open
+    assert pi.calls == ["pinctrl set 2,3 a0"]
+
+
 def test_an_older_system_returns_its_pins_with_raspi_gpio(pi: Pi) -> None:
     pi.install("raspi-gpio")
     for _ in range(2):

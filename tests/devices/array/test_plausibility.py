@@ -150,6 +150,7 @@ def test_impossible_counts_are_flagged_in_their_frame_and_the_tile_is_identified
     scan = array.scan_frame()
     assert scan.tile_flags == [0, flag, 0, 0]
     assert scan.pressure_raw[1] == int.from_bytes(counts[:2], "big") >> 6
+    assert scan.temperature_raw[1] == int.from_bytes(counts[2:], "big") >> 6
     is_disturbed = False
     wires.log.clear()
     array.scan_frame()

@@ -56,6 +56,12 @@ def test_the_wait_for_each_part_is_its_own_conversion_time(mode: ReadDuringConve
     assert ready.unmeasured_serials == ()
 
 
+def test_parts_of_a_scene_convert_in_the_time_that_it_says() -> None:
+    ready, *_ = started(make_scene(array={"conversion_ms": 2.5}, emulation=NOISY))
+    for tile in ready.tiles:
+        assert 2.5 <= tile.conversion_ms <= 1.015 * 2.5
+
+
 def test_a_wait_of_the_scene_is_not_measured() -> None:
     ready, _, clock, _ = started(make_scene(array={"wait_ms": 2.5, "conversion_ms": 1.6}))
     assert ready.timing.conversions_s == (2.5e-3,) * 4
@@ -99,6 +105,10 @@ def test_a_healthy_array_flags_nothing_from_its_first_frame_on(schedule: Schedul
 # Choice of a schedule
 
 
+def timing_of(scene: Scene) -> BusTiming:
+    return BusTiming(400_000, (1.6e-3,) * len(scene.tile), tuple(tile.mux for tile in scene.tile))
+
+
 def test_a_broadcast_of_sixteen_channels_is_refused_unless_the_scene_allows_it() -> None:
     array: dict[str, object] = {"schedule": "simultaneous", "wait_ms": 1.6}
     with pytest.raises(SceneError, match="opens 16 channels at once") as caught:
@@ -109,35 +119,46 @@ def test_a_broadcast_of_sixteen_channels_is_refused_unless_the_scene_allows_it()
 
 
 @pytest.mark.parametrize(
-    ("scene", "requested", "has_reference", "schedule", "reason"),
+    ("scene", "requested", "schedule", "reason"),
     [
-        ({"rate_hz": 300.0}, None, False, "simultaneous", "no skew.*300 frames/s"),
-        ({"rate_hz": 420.0}, None, False, "pipelined", ""),
-        ({"plugs": full(16)}, None, False, "per_mux", "^16 tiles on 2 muxes: per_mux gives "),
-        ({"array": {"schedule": "sequential"}}, None, False, "sequential", "^as the scene says$"),
-        ({"array": {"schedule": "sequential"}}, "pipelined", False, "pipelined", "^as requested$"),
-        # Tiles beside a reference force are sampled with it.
-        ({}, None, True, "simultaneous", ""),
-        ({}, "simultaneous", True, "simultaneous", ""),
-        ({}, "sequential", True, "sequential", ""),
-        ({}, "pipelined", True, None, "beside a reference sensor"),
-        ({}, "per_mux", True, None, "beside a reference sensor"),
+        ({"rate_hz": 300.0}, None, "simultaneous", "no skew.*300 frames/s"),
+        ({"rate_hz": 420.0}, None, "pipelined", "^4 tiles on 1 mux: pipelined gives 544 "),
+        ({"plugs": full(16)}, None, "per_mux", "^16 tiles on 2 muxes: per_mux gives "),
+        ({"array": {"schedule": "sequential"}}, None, "sequential", "^as the scene says$"),
+        ({"array": {"schedule": "sequential"}}, "pipelined", "pipelined", "^as requested$"),
     ],
 )
 def test_a_scene_has_the_schedule_that_was_asked_for_or_the_best(
     scene: dict[str, Any],
     requested: AnySchedule | None,
-    has_reference: bool,
-    schedule: ScheduleName | None,
+    schedule: ScheduleName,
     reason: str,
 ) -> None:
     made = make_scene(**scene)
-    timing = BusTiming(400_000, (1.6e-3,) * len(made.tile), tuple(tile.mux for tile in made.tile))
+    choice = choose_scene_schedule(made, timing_of(made), requested, has_reference=False)
+    assert choice.schedule == schedule
+    assert re.search(reason, choice.reason)
+
+
+@pytest.mark.parametrize(
+    ("asked", "schedule", "reason"),
+    [
+        ("auto", "simultaneous", "^the reference force is read while all tiles convert at once$"),
+        ("simultaneous", "simultaneous", "^the reference force is read while all tiles convert"),
+        ("sequential", "sequential", "^as the scene says$"),
+        ("pipelined", None, "beside a reference sensor"),
+        ("per_mux", None, "beside a reference sensor"),
+    ],
+)
+def test_tiles_beside_a_reference_force_are_sampled_with_it(
+    asked: AnySchedule, schedule: ScheduleName | None, reason: str
+) -> None:
+    scene = make_scene(array={"schedule": asked})
     if schedule is None:
         with pytest.raises(SceneError, match=reason):
-            choose_scene_schedule(made, timing, requested, has_reference=has_reference)
+            choose_scene_schedule(scene, timing_of(scene), has_reference=True)
     else:
-        choice = choose_scene_schedule(made, timing, requested, has_reference=has_reference)
+        choice = choose_scene_schedule(scene, timing_of(scene), has_reference=True)
         assert choice.schedule == schedule
         assert re.search(reason, choice.reason)
 
@@ -148,6 +169,10 @@ def test_a_ready_array_has_the_chosen_schedule_and_reads_the_reference_force() -
     assert ready.choice.schedule == "sequential"
     assert ready.array._schedule is schedules.SCHEDULES["sequential"]
     assert ready.array.scan_frame().reference_n == 7.0
+    ready, *_ = started(scene, schedule="auto", read_reference_n=lambda: 7.0)
+    assert ready.choice.schedule == "simultaneous", "sampled with the force"
+    with pytest.raises(SceneError, match="beside a reference sensor"):
+        started(scene, schedule="pipelined", read_reference_n=lambda: 7.0)
 
 
 def test_an_array_that_reads_less_temperature_is_faster() -> None:

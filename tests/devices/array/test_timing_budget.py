@@ -139,6 +139,9 @@ def test_a_schedule_opens_as_many_channels_as_its_broadcast(
 ) -> None:
     assert count_broadcast_channels(schedule, timing(16).muxes) == width
     check_broadcast_channels(schedule, timing(16).muxes, width)
+    if width > 1:
+        with pytest.raises(SceneError, match=f"opens {width} channels at once"):
+            check_broadcast_channels(schedule, timing(16).muxes, width - 1)
     uneven = [0x70, 0x71, 0x71, 0x71, 0x72]  # the fullest mux counts
     assert count_broadcast_channels(schedule, uneven) == {B: 5, D: 3}.get(schedule, 1)
 

@@ -141,6 +141,16 @@ def test_without_load_there_is_no_centre_of_pressure() -> None:
     np.testing.assert_allclose(truth.true_cop_y_m[2:], 0.0, atol=1e-12)
 
 
+def test_the_force_of_a_rolling_foot_is_the_vertical_sum() -> None:
+    world, _, _ = switched_on(load_scene("rolling"), lead_s=0.0)
+    truth = world.compute_truth(at(0.7, 1.0, 1.5, 2.0))
+    np.testing.assert_allclose(truth.true_grf_n, 8.92, atol=1e-3)
+    # Forces along the domes' axes are never less than what they bear vertically.
+    assert (truth.true_force_n.sum(axis=1) >= truth.true_grf_n - 1e-9).all()
+    assert (np.diff(truth.true_cop_x_m) > 0).all()
+    assert (np.diff(truth.true_angle_rad) > 0).all()
+
+
 @pytest.mark.parametrize("protocol", [1, 2])
 @pytest.mark.parametrize(("sign", "ratio"), [(1, 0.1), (-1, 0.1), (1, 1.0), (-1, 0.5)])
 def test_a_reader_of_the_servo_gets_the_true_angle(sign: int, ratio: float, protocol: int) -> None:

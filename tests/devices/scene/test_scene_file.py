@@ -104,7 +104,6 @@ def test_a_scene_file_is_read_by_its_path(tmp_path: Path) -> None:
 
 def test_missing_keys_have_the_defaults_of_the_design() -> None:
     bare = scene(sections="[recovery]").model_dump()
-    del bare["tile"]
     arrays = {"conversion_ms": None, "wait_ms": None}  # drawn, and measured
     assert bare["array"] == arrays | {
         "bus": "emulated",
@@ -113,9 +112,13 @@ def test_missing_keys_have_the_defaults_of_the_design() -> None:
         "temperature_every": 1,
         "broadcast_channels": 8,  # hardware.md 2: 8 channels want 10 kOhm
     }
-    effects = ("scl_part", "noise_kpa", "correlated_ms", "repeatability", "clip_kpa")
-    assert [bare["emulation"][name] for name in effects] == [1.0, 0.165, 0, 0, 0]
-    assert [bare["emulation"][name] for name in ("gas", "rubber", "hysteresis")] == [True] * 3
+    effects = {
+        "scl_part": 1.0,
+        "noise_kpa": 0.165,
+        **dict.fromkeys(("correlated_ms", "repeatability", "clip_kpa"), 0),
+        **dict.fromkeys(("gas", "rubber", "hysteresis"), True),
+    }
+    assert {name: bare["emulation"][name] for name in effects} == effects
     # The pins of a Raspberry Pi
     lines = {"gpiochip": "/dev/gpiochip0", "scl_line": 3, "sda_line": 2, "reset_line": None}
     assert bare["recovery"] == lines | {"i2c_function": "a0"}
@@ -160,12 +163,15 @@ FAULT = "[[fault]]\nkind='stale'\ntile='T01'\n"
 REFERENCE = "[reference]\nzero_v = 1.65\nn_per_v = 30.0\n"
 
 
-# Strictness and unknown keys are of the base of all sections: a case for each place of a key.
 @pytest.mark.parametrize(
     ("head", "sections", "key"),
     [
         ("Rate_hz = 1", "", "Rate_hz"),
+        ("", "[array]\nscl = 400000", "array.scl"),
         ("", "[servo]\nbaud = 57600", "servo.baud"),
+        ("", "[recovery]\nreset = 17", "recovery.reset"),
+        ("", f"{REFERENCE}offset_n = 1", "reference.offset_n"),
+        ("", "[emulation]\nnoise = 1", "emulation.noise"),
         ("", "[ground]\nkind = 'rolling'\nload_kg = 1", "ground.rolling.load_kg"),
         ("", "[ground]\nkind = 'none'\nload_n = 1", "ground.none.load_n"),
         ("", f"{FAULT}t_s=0\nduration_s=1\nseverity=3", "fault.0.severity"),
@@ -185,7 +191,10 @@ def test_an_unknown_key_is_named_with_its_section(head: str, sections: str, key:
         ("models = 'static'", "", "models"),
         ("models = [1]", "", "models.0"),
         ("calibration = 3", "", "calibration"),
+        ("", "[array]\nwait_ms = true", "array.wait_ms"),
+        ("", "[array]\nconversion_ms = '1.6'", "array.conversion_ms"),
         ("", "[array]\nschedule = 'fast'", "array.schedule"),
+        ("", "[servo]\nid = true", "servo.id"),
         ("", "[servo]\nid = 1.5", "servo.id"),
         ("", "[servo]\nsign = 2", "servo.sign"),
         ("", "[servo]\nprotocol = 3\nid = 1", "servo.protocol"),
@@ -195,6 +204,9 @@ def test_an_unknown_key_is_named_with_its_section(head: str, sections: str, key:
         ("", "[emulation]\nread_during_conversion = 'random'", "read_during_conversion"),
         ("", "[[fault]]\nkind = 'fire'\ntile = 'T01'\nt_s = 0\nduration_s = 1", "fault.0.kind"),
         ("", "[recovery]\nreset_line = true", "recovery.reset_line"),
+        ("", f"{REFERENCE}vref_v = '3.3'", "reference.vref_v"),
+        ("", f"{REFERENCE}channel = true", "reference.channel"),
+        ("", tile("T03").replace('"T03"', "1"), "tile.2.serial"),
         ("", tile("T03", channel='"4"'), "tile.2.channel"),
         ("", tile("T03", channel="true"), "tile.2.channel"),
         ("", tile("T03", mux='"0x70"'), "tile.2.mux"),
@@ -374,17 +386,21 @@ def test_a_foot_of_reference_tiles_alone_is_refused() -> None:
     assert [t.reference for t in scene(tiles=one_bears).tile] == [True, False]
 
 
+def test_a_missing_key_is_named() -> None:
+    assert "key 'tile.0.channel' is missing" in refused(tiles='[[tile]]\nserial = "T01"\nmux = 112')
+    assert "key 'tile' is missing" in refused(tiles="")
+
+
 @pytest.mark.parametrize(
     ("head", "tiles", "sections", "parts"),
     [
-        ("", '[[tile]]\nserial = "T01"\nmux = 112', "", ["key 'tile.0.channel' is missing"]),
-        ("", "", "", ["key 'tile' is missing"]),
         ("tile = []", "", "", ["tile = []"]),
         ("", None, "[ground]\nload_n = 3", ["ground", "kind"]),
-        ("", None, "[ground]\nkind = 'moon'", ["ground", "kind"]),
+        ("", None, "[ground]\nkind = 'moon'", ["ground", "kind", "'plate'"]),
+        ("", None, "[ground]\nkind = 'plates'", ["ground", "kind", "'plate'"]),
     ],
 )
-def test_a_scene_without_a_tile_or_a_ground_without_a_kind_is_refused(
+def test_a_scene_without_tiles_or_with_a_ground_of_no_kind_is_refused(
     head: str, tiles: str | None, sections: str, parts: list[str]
 ) -> None:
     text = refused(head, tiles, sections)

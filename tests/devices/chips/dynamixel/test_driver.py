@@ -128,7 +128,7 @@ def test_requests_of_protocol_1_are_the_golden_ones() -> None:
         *(
             (1, echo + bytes.fromhex(noise), STATUS_1_AT_548, 548)
             for echo in (b"", READ_3_FROM_36)
-            for noise in ("", "FF", "00 FF 01", "FF FF 01 00", "FFFF FE FF")
+            for noise in ("", "FF", "FF FF", "00 FF 01", "FF FF 01 00", "FFFF FE FF")
         ),
     ],
 )
@@ -166,7 +166,12 @@ def test_noise_and_echo_before_an_answer_are_ignored(
             for data in ((), (0, 0, 0))
         ),
         (1, STATUS_1_AT_548[:-1] + b"\x00", ServoPacketError, "damaged"),
-        (1, status_1(0, 1, 2, 3, servo_id=2), ServoPacketError, "servo 2 answered; expected servo"),
+        (
+            1,
+            status_1(0, 1, 2, 3, servo_id=2),
+            ServoPacketError,
+            "servo 2 answered; expected servo 1",
+        ),
         (1, status_1(0, 1, 2), ServoPacketError, "answer of 2 bytes; expected 3 bytes"),
         (1, READ_3_FROM_36, ServoTimeoutError, "8 bytes came"),  # an echo alone
     ],
