@@ -1,4 +1,4 @@
-"""A bus that fails: distinguished from a silent tile, reopened, and named in warnings."""
+"""A bus that fails: told from a silent tile, reopened, in warnings; the bus monitor by itself."""
 
 from __future__ import annotations
 

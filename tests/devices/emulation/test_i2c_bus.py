@@ -1,4 +1,4 @@
-"""The emulated I2C bus, by smbus2 messages alone: its adapter, its muxes and its open drain.
+"""The emulated I2C bus, by smbus2 messages alone, and the emulated TCA9548A by itself.
 
 Expected values come from hardware.md 1 to 4, SCL periods per transaction from its section 4.
 """
@@ -313,10 +313,6 @@ def test_a_data_byte_needs_the_acknowledge_of_one_device() -> None:
 # One emulated TCA9548A
 
 
-def tile() -> EmulatedMpl115a2:
-    return EmulatedMpl115a2(EmulatedPart((0, 0, 0, 0), 1_600_000, lambda _: (0, 0)))
-
-
 def write(mux: EmulatedTca9548a, *values: int) -> None:
     assert mux.on_address(False, 0)
     assert all(mux.receive_byte(value) for value in values)
@@ -326,7 +322,7 @@ def write(mux: EmulatedTca9548a, *values: int) -> None:
 def test_the_last_byte_written_is_the_mask_from_the_stop_on(
     before: int, after: bytes, count: int
 ) -> None:
-    tiles = {channel: tile() for channel in range(7)}  # none on channel 7
+    tiles = {channel: part() for channel in range(7)}  # none on channel 7
     mux = EmulatedTca9548a(0x70, tiles)
 
     def connected(mask: int) -> list[EmulatedMpl115a2]:
@@ -359,7 +355,7 @@ def open_mux(**faults: tuple[int, int]) -> EmulatedTca9548a:
     }
     for timing in timings.values():
         timing.begin_scene_time(0)
-    mux = EmulatedTca9548a(0x70, {0: tile()}, timings.get("brown_out"), timings.get("mux_reset"))
+    mux = EmulatedTca9548a(0x70, {0: part()}, timings.get("brown_out"), timings.get("mux_reset"))
     write(mux, 1)
     mux.on_stop(0)
     return mux
@@ -400,7 +396,7 @@ def test_a_mux_can_be_opened_at_once_after_its_reset() -> None:
 
 
 def test_the_reset_line_clears_a_mask_that_is_not_yet_in_force() -> None:
-    mux = EmulatedTca9548a(0x70, {0: tile()})
+    mux = EmulatedTca9548a(0x70, {0: part()})
     write(mux, 1)
     mux.reset()
     mux.on_stop(0)

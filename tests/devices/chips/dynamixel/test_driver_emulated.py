@@ -1,4 +1,4 @@
-"""The driver on an emulated servo behind a pseudo-terminal."""
+"""The driver and the servo search on an emulated servo behind a pseudo-terminal."""
 
 from __future__ import annotations
 

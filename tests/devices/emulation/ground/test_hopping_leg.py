@@ -1,4 +1,4 @@
-"""A hopping leg obeys mechanics on any ground."""
+"""A hopping leg obeys mechanics on any ground; soft grounds resist, drag and suck."""
 
 from __future__ import annotations
 
