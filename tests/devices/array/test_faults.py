@@ -157,31 +157,34 @@ def test_every_reading_of_a_healthy_foot_is_right_and_none_is_flagged(
 
 
 @cases(KINDS)
-def test_a_fault_leaves_no_wrong_reading_no_missing_number_and_no_trace_after_1_2_s(
+def test_a_foot_is_right_before_a_fault_and_again_1_2_s_after_it(
     schedule: ScheduleName, kind: FaultKind
 ) -> None:
     one = run(schedule, kind)
-    frames, right = one.frames, one.verdict.right
+    assert one.before.sum() > 40
+    assert one.verdict.right[one.before].all()
+    assert (one.frames.tile_flags[one.before] == 0).all()
+    assert one.recovered.sum() > 25
+    if kind != "replaced":
+        assert one.verdict.right[one.recovered].all()
+        assert (one.frames.tile_flags[one.recovered] == 0).all()
+        assert one.rate_hz(one.recovered) >= 0.98 * one.rate_hz(one.before)
+
+
+@cases(KINDS)
+def test_frames_are_numbered_and_dated_through_every_fault(
+    schedule: ScheduleName, kind: FaultKind
+) -> None:
+    frames = run(schedule, kind).frames
     assert (np.diff(frames.seq.astype(np.int64)) == 1).all()
     gaps_s = np.diff(frames.t_mono_ns) * 1e-9
     # Two timeouts of 30 ms, and a frame with an audit.
     assert 0 < gaps_s.min() <= gaps_s.max() < 0.095
-    assert one.before.sum() > 40
-    assert right[one.before].all()
-    assert (frames.tile_flags[one.before] == 0).all()
-    if kind not in ("slow", "stale", "bit_errors", "nack_storm"):
-        assert not one.verdict.wrong.any()
-    assert one.recovered.sum() > 25
-    if kind == "replaced":
-        after = one.within(BEGIN_S + EDGE_S, RUN_S)
-        assert not one.verdict.given[after, BAD].any(), "until it is identified"
-        assert (frames.tile_flags[one.recovered, BAD] == TileFlag.IMPLAUSIBLE).all()
-        assert one.array.replaced_serials == ("T02",)
-        assert "another part" in one.array.get_warnings()["T02"]
-    else:
-        assert right[one.recovered].all()
-        assert (frames.tile_flags[one.recovered] == 0).all()
-        assert one.rate_hz(one.recovered) >= 0.98 * one.rate_hz(one.before)
+
+
+@cases([kind for kind in KINDS if kind not in ("slow", "stale", "bit_errors", "nack_storm")])
+def test_no_reading_during_a_fault_is_wrong(schedule: ScheduleName, kind: FaultKind) -> None:
+    assert not run(schedule, kind).verdict.wrong.any()
 
 
 # A tile
@@ -211,6 +214,16 @@ def test_a_fault_of_one_tile_leaves_the_others_their_readings_and_their_rate(
     assert (one.frames.frame_flags == 0).all()
     if schedule == "pipelined" or kind not in ("slow", "stale"):  # others wait for the slowest
         assert one.mean_rate_hz(BEGIN_S, END_S) >= 0.9 * one.mean_rate_hz(0.0, BEGIN_S)
+
+
+@every_schedule
+def test_a_replaced_tile_stays_null_until_it_is_identified(schedule: ScheduleName) -> None:
+    one = run(schedule, "replaced")
+    rows = one.within(BEGIN_S + EDGE_S, RUN_S)
+    assert not one.verdict.given[rows, BAD].any()
+    assert (one.frames.tile_flags[one.recovered, BAD] == TileFlag.IMPLAUSIBLE).all()
+    assert one.array.replaced_serials == ("T02",)
+    assert "another part" in one.array.get_warnings()["T02"]
 
 
 @every_schedule
@@ -357,11 +370,11 @@ def test_a_fault_of_one_mux_gives_no_wrong_reading_and_leaves_the_tiles_of_the_o
     schedule: ScheduleName, kind: FaultKind, mux: int
 ) -> None:
     one = run(schedule, kind, plugs=EIGHT, mux=mux)
+    is_hit = np.array([address == mux for address, _ in EIGHT])
+    begun = one.within(BEGIN_S + 0.1, END_S - EDGE_S)
     assert not one.verdict.wrong.any()
+    assert one.verdict.right[begun][:, ~is_hit].mean() > 0.99
+    assert (one.frames.frame_flags[begun] & FrameFlag.BUS_FAULT == 0).all()
     assert one.verdict.right[one.recovered].all()
     if kind == "brown_out":
-        is_dark = np.array([address == mux for address, _ in EIGHT])
-        assert not one.verdict.given[one.during][:, is_dark].any()
-        begun = one.within(BEGIN_S + 0.1, END_S - EDGE_S)
-        assert one.verdict.right[begun][:, ~is_dark].mean() > 0.99
-        assert (one.frames.frame_flags[begun] & FrameFlag.BUS_FAULT == 0).all()
+        assert not one.verdict.given[one.during][:, is_hit].any()
