@@ -205,8 +205,16 @@ def choose_scene_schedule(
         SceneError: the schedule does not suit a reference sensor.
     """
     requested = schedule or scene.array.schedule
-    if has_reference:
-        return _choose_with_reference(requested)
+    if has_reference and requested in ("auto", "simultaneous"):
+        return ScheduleChoice(
+            "simultaneous", "the reference force is read while all tiles convert at once"
+        )
+    if has_reference and requested != "sequential":
+        raise SceneError(
+            f"schedule {requested!r} beside a reference sensor: its tiles are sampled in turn",
+            where="array.schedule",
+            expected='"simultaneous" or "sequential": the reference is read with the tiles',
+        )
     if requested == "auto":
         return choose_schedule(
             timing,
@@ -214,20 +222,6 @@ def choose_scene_schedule(
             channels_max=scene.array.broadcast_channels,
         )
     return ScheduleChoice(requested, "as the scene says" if schedule is None else "as requested")
-
-
-def _choose_with_reference(requested: AnySchedule) -> ScheduleChoice:
-    if requested in ("auto", "simultaneous"):
-        return ScheduleChoice(
-            "simultaneous", "the reference force is read while all tiles convert at once"
-        )
-    if requested == "sequential":
-        return ScheduleChoice(requested, "as the scene says")
-    raise SceneError(
-        f"schedule {requested!r} beside a reference sensor: its tiles are sampled in turn",
-        where="array.schedule",
-        expected='"simultaneous" or "sequential", in which the reference is read with the tiles',
-    )
 
 
 def identify_and_measure(bus: I2cBus, scene: Scene, clock: Clock) -> MeasuredTiles:

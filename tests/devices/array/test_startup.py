@@ -163,6 +163,12 @@ def test_tiles_beside_a_reference_force_are_sampled_with_it(
         assert re.search(reason, choice.reason)
 
 
+def test_a_schedule_given_beside_a_reference_force_was_requested() -> None:
+    scene = make_scene(array={"schedule": "simultaneous"})
+    choice = choose_scene_schedule(scene, timing_of(scene), "sequential", has_reference=True)
+    assert (choice.schedule, choice.reason) == ("sequential", "as requested")
+
+
 def test_a_ready_array_has_the_chosen_schedule_and_reads_the_reference_force() -> None:
     scene = make_scene(array={"wait_ms": 1.6})
     ready, *_ = started(scene, schedule="sequential", read_reference_n=lambda: 7.0)
