@@ -5,9 +5,11 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import re
 import stat
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from hypothesis import strategies as st
 
 from devices.errors import FileFormatError, StorageError
 from storage import durable_files
+from storage.clock.log import ClockLog, ClockOffset
 from storage.durable_files import (
     lock_folder,
     make_synced_folder,
@@ -27,8 +30,25 @@ from storage.durable_files import (
     translate_storage_errors,
     write_atomically,
 )
+from storage.journal.journal import Journal
 from storage.permissions import set_umask_and_create_private_folder
+from storage.sessions.folder import Part, Session, SessionsFolder
+from tests.builders.arrays import make_array
 from tests.storage.faulty_disk import IO_ERROR, disk_with_room_for, refusing
+
+STREAM_ID = "a" * 32
+OFFSET = ClockOffset(
+    stream_id=STREAM_ID, t_mono_ns=0, server_minus_node_ns=0, uncertainty_ns=1_000_000
+)
+SESSION = Session(
+    id="20200131T235959Z-0a1b2c",
+    name="first walk",
+    node="bench",
+    state="recording",
+    started_t_ns=10**18,
+    parts=(Part(stream_id=STREAM_ID, seq_first=0),),
+    scene="mud",
+)
 
 
 def files_in(folder: Path) -> dict[str, bytes]:
@@ -118,6 +138,25 @@ def test_a_file_that_cannot_be_made_is_an_error_that_names_it(tmp_path: Path) ->
             write_atomically(path, b"content")
         assert caught.value.where == str(path)
     assert {path.name for path in tmp_path.iterdir()} == {"file", "taken"}
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        pytest.param(lambda folder: Journal(folder, make_array()), id="journal"),
+        pytest.param(lambda folder: ClockLog(folder).append(OFFSET), id="clock log"),
+        pytest.param(
+            lambda folder: SessionsFolder(folder).save_session_json(SESSION), id="session"
+        ),
+    ],
+)
+def test_a_folder_that_cannot_be_made_is_a_storage_error(
+    tmp_path: Path, write: Callable[[Path], object]
+) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(StorageError, match=re.escape(str(tmp_path / "file"))):
+            write(folder)
 
 
 def test_only_a_folder_can_be_synced_as_one(tmp_path: Path) -> None:

@@ -85,3 +85,10 @@ def test_an_empty_interval_is_refused_and_changes_nothing() -> None:
     with pytest.raises(ValueError, match="5 to 4 is empty"):
         stored.add(5, 4)
     assert list(stored) == [(3, 5)]
+
+
+def test_it_is_no_key_of_a_dictionary_and_no_list_is_equal_to_it() -> None:
+    with pytest.raises(TypeError, match="unhashable"):
+        hash(Intervals())
+    assert Intervals([(1, 2)]) != [(1, 2)]
+    assert repr(Intervals([(1, 2), (3, 3)])) == "Intervals([(1, 3)])"

@@ -165,7 +165,12 @@ def test_a_number_with_a_unit_carries_it_as_a_suffix() -> None:
 def test_the_tables_hold_just_the_columns_of_the_contract() -> None:
     assert [column.name for column in MEASURED_COLUMNS] == [f.name for f in fields(FrameBatch)]
     estimates = [f.name for f in fields(Estimates) if f.name not in ("seq", "t_ns")]
-    assert [column.name for column in ESTIMATE_COLUMNS] == estimates
+    made = (
+        "gauge_kpa force_n force_sigma_n grf_n grf_sigma_n grf_lower_bound_n cop_x_m cop_y_m "
+        "cop_sigma_x_m cop_sigma_y_m cop_index_x cop_index_y cop_ground_x_m cop_ground_y_m "
+        "angle_rad contact estimate_flags"
+    )
+    assert [column.name for column in ESTIMATE_COLUMNS] == estimates == made.split()
     truth = "true_force_n true_grf_n true_plate_n true_cop_x_m true_cop_y_m true_angle_rad"
     assert [column.name for column in TRUTH_COLUMNS] == truth.split()
     assert [column.name for column in INDENTER_COLUMNS] == ["pressed_tile", "phase"]

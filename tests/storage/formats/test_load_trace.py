@@ -200,12 +200,6 @@ def test_a_csv_that_is_called_parquet_is_refused(tmp_path: Path) -> None:
         read_load_to_emulate(path)
 
 
-# --- columns --------------------------------------------------------------------------------------
-
-
-# --- rows -----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "time_s",
     [pa.array(["a", "b"]), pa.array([0, 1], pa.timestamp("ms")), pa.array([0, 2**60 + 1])],
@@ -324,7 +318,7 @@ def test_true_forces_go_before_estimates(tmp_path: Path, to: str) -> None:
 
 
 @pytest.mark.parametrize("to", ["parquet", "csv"])
-def test_a_grf_with_its_cop_is_a_load_and_of_one_row_of_tiles_along_it(
+def test_a_grf_with_its_cop_is_a_load_and_one_row_of_tiles_has_no_cop_across_it(
     tmp_path: Path, to: str
 ) -> None:
     names = ("t_ns", "grf_n", "cop_x_m", "cop_y_m")

@@ -135,7 +135,8 @@ def test_damage_costs_the_batches_that_it_hits(tmp_path: Path, what: str) -> Non
     damage(path)
     if "impossible" in what:
         assert "record 1 of its index is damaged" in verify_segment(path).problems
-    journal = begun(path.parent)
+    # Of a folder in which nothing is left the array has to be known.
+    journal = (reopened if kept else begun)(path.parent)
     assert_holds(journal, set(range(kept)))
     lost = members(journal.lost.by_reason.get("corrupt", Intervals()))
     assert lost == set(range(kept, kept + corrupt))
@@ -144,7 +145,8 @@ def test_damage_costs_the_batches_that_it_hits(tmp_path: Path, what: str) -> Non
     if what == "no index":
         assert index_of(path).read_bytes() == index
     if what == "an emptied index":
-        assert path.name in " ".join(journal.problems)
+        (problem,) = journal.problems
+        assert path.name in problem
     if kept:  # it is a stream for Arrow again
         assert pa.ipc.open_stream(path.read_bytes()).read_all().num_rows == kept
 

@@ -27,7 +27,7 @@ from storage.sessions.folder import (
     make_session_id,
 )
 from storage.sessions.metadata import SessionFilter, parse_completeness, parse_iso_or_t_ns
-from tests.storage.faulty_disk import NO_SPACE, failing_if
+from tests.storage.faulty_disk import NO_SPACE, failing_if, refusing
 
 ID = "20200131T235959Z-0a1b2c"
 STREAM_ID = "f" * 32
@@ -234,6 +234,24 @@ def test_a_failed_first_save_leaves_no_folder(
         assert sync == next(calls) == 3  # of the folder's name, the file, and the file's name
     folder.save_session_json(session())
     assert folder.load(ID) == session()
+
+
+def test_a_failed_later_save_keeps_the_session_and_its_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = SessionsFolder(tmp_path)
+    folder.save_session_json(session())
+    frames = folder.get_path(ID) / "frames.parquet"
+    frames.write_bytes(b"frames")
+    with monkeypatch.context() as full:
+        full.setattr(os, "fsync", refusing(*NO_SPACE))
+        with pytest.raises(StorageError, match="No space left"):
+            folder.save_session_json(whole())
+    assert folder.load(ID) == session()
+    folder.save_session_json(whole())
+    assert folder.load(ID) == whole()
+    assert frames.read_bytes() == b"frames"
+    assert {path.name for path in folder.get_path(ID).iterdir()} == {frames.name, "session.json"}
 
 
 def test_a_folder_without_a_whole_file_is_no_session(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
+from devices.frames import NO_SERVO_AGE, NOT_READ
 from storage.parquet_hash import fill_hash_placeholders_and_sync, read_stated_and_actual_hash
 from storage.sessions.reader import SealedFileReader
 from storage.sessions.writer import SealedFileWriter
@@ -33,6 +34,12 @@ def write(path: Path, rows: int = 200, cuts: Sequence[int] = (), **notes: object
     batch, columns = frames(rows, period_ns=1_000_000_000), extra(rows)
     columns["true_grf_n"] = np.where(columns["grf_n"] > 0.0, 1 / 3, np.nan)
     columns["part"] = np.sort(columns["contact"] // 255).astype(np.uint16)
+    columns["phase"] = np.array(["rest", "Ärmel"] * rows, object)[:rows]
+    columns["grf_n"][1::5], columns["grf_n"][2::5] = -1e-40, -0.0
+    batch.temperature_raw[::3] = NOT_READ
+    batch.servo_age_us[::4] = NO_SERVO_AGE  # also beside an angle that is known
+    batch.reference_force_n[::3], batch.reference_force_n[1::3] = np.nan, -0.0
+    batch.reference_force_n[2::3] = 3.25
     with SealedFileWriter(path, make_array(), notes) as writer:
         for begin, end in itertools.pairwise([0, *cuts, rows]):
             piece = {name: values[begin:end] for name, values in columns.items()}

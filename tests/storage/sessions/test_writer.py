@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -376,3 +377,8 @@ def test_a_full_disk_is_an_os_error_and_leaves_nothing_behind(tmp_path: Path, ro
     with pytest.raises(OSError, match=r"[Ff]ile too large|EFBIG"), disk_with_room_for(room):
         write(path, batch)
     assert names_in(tmp_path) == []
+
+
+def test_a_folder_that_is_not_there_is_an_os_error_that_names_it(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match=re.escape(str(tmp_path / "missing"))):
+        write(tmp_path / "missing" / "s.parquet", frames(5))

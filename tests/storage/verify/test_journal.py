@@ -125,6 +125,18 @@ def cut_index(records: int) -> Callable[[Path], object]:
     return cut
 
 
+def remove(find: Callable[[Path], Path]) -> Callable[[Path], object]:
+    return lambda folder: find(folder).unlink()
+
+
+def notes_of(folder: Path) -> Path:
+    return folder / NOTES_FILE
+
+
+def spoil_notes(folder: Path) -> None:
+    notes_of(folder).write_bytes(b"{")
+
+
 def flip_fourth_batch(folder: Path) -> None:
     content = bytearray(segment_of(opened(folder)).read_bytes())
     content[ends(folder)[3] - 9] ^= 1
@@ -152,40 +164,57 @@ def add_other_stream(folder: Path) -> None:
     add_segment(folder, frames(40, 49), array(stream_id="b" * 32))
 
 
-ALL = Intervals([(0, 39)])
+ALL, FOURTH, NONE = Intervals([(0, 39)]), Intervals([(15, 19)]), Intervals()
 
 
 @pytest.mark.parametrize(
-    ("damage", "said", "remarked", "stored"),
+    ("damage", "said", "remarked", "stored", "corrupt"),
     [
-        (cut_index(4), "4 batches behind its last one are in no index", "", None),
-        (cut_index(7), "", "in no index", None),  # the newest may be on its way
-        (lambda folder: index_of(folder).unlink(), "is missing", "", None),
-        (lambda folder: segment_of(folder).unlink(), "segment of this index is missing", "", None),
-        (spoil_a_name, "its columns are not those of a stream of frames", "", ALL),
-        (
+        pytest.param(
+            cut_index(4),
+            "4 batches behind its last one are in no index",
+            "",
+            None,
+            NONE,
+            id="index",
+        ),
+        # The newest may be on its way.
+        pytest.param(cut_index(7), "", "in no index", None, NONE, id="newest record"),
+        pytest.param(remove(index_of), "is missing", "", None, NONE, id="no index"),
+        pytest.param(
+            remove(segment_of), "segment of this index is missing", "", None, NONE, id="no segment"
+        ),
+        pytest.param(
+            spoil_a_name,
+            "its columns are not those of a stream of frames",
+            "",
+            ALL,
+            NONE,
+            id="a name",
+        ),
+        pytest.param(
             flip_fourth_batch,
             "frames 15 to 19 do not agree with their checksum",
             "",
-            ALL - Intervals([(15, 19)]),
+            ALL - FOURTH,
+            FOURTH,
+            id="a bit",
         ),
-        (add_other_stream, "another stream or array", "", None),
-        (take_back, "time runs back before frame 40", "", None),
-        (lambda folder: (folder / NOTES_FILE).write_bytes(b"{"), NOTES_FILE, "", ALL),
-        (
-            lambda folder: (folder / NOTES_FILE).unlink(),
-            "",
-            "nothing says where the stream ended",
-            ALL,
+        pytest.param(add_other_stream, "another stream or array", "", None, NONE, id="stream"),
+        pytest.param(take_back, "time runs back before frame 40", "", None, NONE, id="time"),
+        pytest.param(spoil_notes, NOTES_FILE, "", ALL, NONE, id="notes"),
+        pytest.param(
+            remove(notes_of), "", "nothing says where the stream ended", ALL, NONE, id="no notes"
         ),
     ],
 )
-def test_damage_is_named_and_what_is_on_its_way_remarked(
+def test_damage_is_a_problem_and_an_unfinished_write_a_remark(
     tmp_path: Path,
     damage: Callable[[Path], object],
     said: str,
     remarked: str,
     stored: Intervals | None,
+    corrupt: Intervals,
 ) -> None:
     folder = stream(tmp_path)
     damage(folder)
@@ -194,8 +223,7 @@ def test_damage_is_named_and_what_is_on_its_way_remarked(
     assert bool(report.problems) == bool(said)
     assert remarked in "; ".join(report.remarks)
     assert stored in (None, report.stored)
-    if damage is flip_fourth_batch:
-        assert report.lost.by_reason["corrupt"] == Intervals([(15, 19)])
+    assert report.lost.by_reason.get("corrupt", NONE) == corrupt
 
 
 def test_a_wrong_place_or_end_is_named(tmp_path: Path) -> None:

@@ -184,7 +184,7 @@ def test_of_two_plates_none_is_chosen_for_the_user(tmp_path: Path) -> None:
     assert "there are 2 plates or soles (plate1, plate2): --map says which one" in found.notes
 
 
-def test_what_is_no_c3d_or_was_cut_is_refused(tmp_path: Path) -> None:
+def test_a_foreign_or_cut_c3d_is_refused_by_name(tmp_path: Path) -> None:
     path = written(tmp_path / "gait.c3d")
     cut = path.read_bytes()[:-600]
     for content in (b"", b"junk", b"\x02\x50" + b"\xff" * 600, cut):
@@ -405,7 +405,6 @@ SAMPLES = 200
 ODD_N = 100.0 + 400.0 * np.sin(np.linspace(0.0, np.pi, SAMPLES))
 ODD_X_MM, ODD_Y_MM = np.linspace(-80.0, 120.0, SAMPLES), np.linspace(40.0, -30.0, SAMPLES)
 """Of the load in the plate's own axes, of which y and z are turned in the laboratory's."""
-COLUMNS = {"grf_n": "plate1_fz", "cop_x_m": "plate1_cop_x", "cop_y_m": "plate1_cop_y"}
 
 
 def wrench() -> Floats:

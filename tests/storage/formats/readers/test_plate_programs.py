@@ -300,8 +300,8 @@ def test_units_are_those_of_the_file(tmp_path: Path) -> None:
     check(found, rtol=1e-7, grf_n=[0.0, 90250.0, 100500.0, 80000.0])
     assert found.cop_m is not None
     np.testing.assert_allclose(found.cop_m[1], [13.748e-6, -10.516e-6])
-    columns = {name: f"ground_force_{axis}" for name, axis in
-               (("grf_n", "vy"), ("cop_x_m", "px"), ("cop_y_m", "pz"))}  # fmt: skip
+    axes = {"grf_n": "vy", "cop_x_m": "px", "cop_y_m": "pz"}
+    columns = {name: f"ground_force_{axis}" for name, axis in axes.items()}
     units = {"grf": "N", "cop": "m", "time": "s"}
     found = read(tmp_path, OPENSIM, ReferenceOptions(columns, units), "grf.mot")
     check(found, cop_m=[[0.0, 0.0], [0.1, 0.03], [0.2, 0.02]])

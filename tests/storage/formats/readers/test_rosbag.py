@@ -149,7 +149,7 @@ def test_a_wrench_has_force_and_centre_of_pressure(tmp_path: Path, write: Write)
 
 
 @every_format
-def test_the_only_topic_is_taken_with_its_sign_and_one_of_several_named(
+def test_the_only_topic_is_taken_with_its_sign_and_several_have_to_be_named(
     tmp_path: Path, write: Write
 ) -> None:
     folders = [tmp_path / name for name in ("one", "several", "none")]

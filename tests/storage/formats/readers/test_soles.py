@@ -104,6 +104,9 @@ def test_pressures_of_a_pedar_insole_are_refused_without_their_areas(tmp_path: P
     assert "areas" in caught.value.what
 
 
+# --- Moticon --------------------------------------------------------------------------------------
+
+
 FACTS = (
     "# Start time: 01.01.2026 09:00:00.000\n# Duration: 00:00.200\n"
     "# Sensor insoles: Left SN1, Right SN2\n# Size: 7\n# Notes: a: b\n# Tag: \n"
@@ -113,10 +116,7 @@ SIDE = (
     "{0} center of pressure X[-0.5...+0.5]\t{0} center of pressure Y[-0.5...+0.5]"
 )
 NAMES = "\t".join(("# time", SIDE.format("left"), SIDE.format("right"), "Events label[]"))
-MOTICON_LEFT = ReferenceOptions({"grf_n": "left_fz"})
-LEFT_COP = replace(
-    MOTICON_LEFT, columns={**MOTICON_LEFT.columns, "cop_x_m": "left_cop_x", "cop_y_m": "left_cop_y"}
-)
+LEFT_COP = ReferenceOptions({"grf_n": "left_fz", "cop_x_m": "left_cop_x", "cop_y_m": "left_cop_y"})
 RIGHT_COP = ReferenceOptions(
     {"grf_n": "right_fz", "cop_x_m": "right_cop_x", "cop_y_m": "right_cop_y"}
 )
@@ -134,7 +134,7 @@ def moticon(*lines: str, names: str = NAMES) -> str:
 
 
 def test_each_sole_of_moticon_has_its_force(tmp_path: Path) -> None:
-    found = read(tmp_path, moticon(), MOTICON_LEFT)
+    found = read(tmp_path, moticon(), LEFT)
     np.testing.assert_array_equal(found.grf_n, np.arange(3.0, 20.0))
     np.testing.assert_allclose(found.time_s, np.arange(3, 20) / 100)
     assert "3 of 20 samples have no force: left out" in found.notes
@@ -158,7 +158,7 @@ def test_cop_is_forward_and_to_the_left_of_both_soles(tmp_path: Path) -> None:
     assert right is not None
     np.testing.assert_allclose([left[4], right[7]], [[-0.05, -0.007], [0.0175, -0.01]])
     assert np.isnan(right[5]).all()  # (0, 0): next to no load
-    along = replace(MOTICON_LEFT, sole_m=SOLE_M[:1])
+    along = replace(LEFT, sole_m=SOLE_M[:1])
     along = replace(along, columns={"grf_n": "left_fz", "cop_x_m": "left_cop_x"})
     check(
         read(tmp_path, moticon(), along),
@@ -179,14 +179,12 @@ def test_a_single_sole_is_read_without_mapping_and_without_cop(tmp_path: Path) -
 
 def test_times_in_milliseconds_are_told_by_their_steps(tmp_path: Path) -> None:
     lines = [f"{10 * i}\t" + moticon_line(i).partition("\t")[2] for i in range(20)]
-    np.testing.assert_allclose(
-        read(tmp_path, moticon(*lines), MOTICON_LEFT).time_s, np.arange(3, 20) / 100
-    )
+    np.testing.assert_allclose(read(tmp_path, moticon(*lines), LEFT).time_s, np.arange(3, 20) / 100)
 
 
 def test_cop_in_another_unit_is_not_read(tmp_path: Path) -> None:
     content = moticon(names=NAMES.replace("[-0.5...+0.5]", "[%]"))
-    found = read(tmp_path, content, MOTICON_LEFT)
+    found = read(tmp_path, content, LEFT)
     assert "left: its centre of pressure is in units that are not read" in found.notes
     with pytest.raises(FileFormatError, match="no column 'left_cop_x'"):
         read(tmp_path, content, replace(LEFT_COP, sole_m=SOLE_M))
@@ -203,16 +201,16 @@ def test_cop_in_another_unit_is_not_read(tmp_path: Path) -> None:
         (text().replace("AB1-L::medial", "AB1-L"), LEFT, "sole AB1-L is there twice"),
         (
             moticon(*(moticon_line(10 * i) for i in range(20))),
-            MOTICON_LEFT,
+            LEFT,
             "times go over 1.9 s, where Duration is 0.2 s",
         ),
         (
             moticon(*map(moticon_line, range(9)), moticon_line(9).replace("\t9.00", "\tx")),
-            MOTICON_LEFT,
+            LEFT,
             "is not numeric: 'x'",
         ),
-        (moticon(*map(moticon_line, range(9)), "0.09\t1"), MOTICON_LEFT, "cannot be read"),
-        (FACTS + NAMES + "\n", MOTICON_LEFT, "0 samples"),
+        (moticon(*map(moticon_line, range(9)), "0.09\t1"), LEFT, "cannot be read"),
+        (FACTS + NAMES + "\n", LEFT, "0 samples"),
     ],
 )
 def test_a_damaged_text_is_refused(
@@ -223,18 +221,17 @@ def test_a_damaged_text_is_refused(
 
 
 @pytest.mark.parametrize(
-    ("content", "stated", "forces_n"),
+    ("content", "forces_n", "is_last_cut"),
     [
-        (text(), LEFT, {11 * i + 0.75 for i in range(20)}),
-        (moticon(), MOTICON_LEFT, set(range(3, 20))),
+        # The last number of a line may be cut within, and this force may be the last.
+        pytest.param(text(), {11 * i + 0.75 for i in range(20)}, True, id="novel"),
+        pytest.param(moticon(), set(range(3, 20)), False, id="moticon"),
     ],
-    ids=["novel", "moticon"],
 )
 def test_a_text_cut_off_anywhere_gives_no_other_force(
-    tmp_path: Path, content: str, stated: ReferenceOptions, forces_n: set[float]
+    tmp_path: Path, content: str, forces_n: set[float], is_last_cut: bool
 ) -> None:
     for end in range(0, len(content), 7):
         with suppress(FootTileError):
-            found = read(tmp_path, content[:end], stated).grf_n
-            # The last number of a line of Novel's may be cut within.
-            assert set(found[:-1] if stated is LEFT else found) <= forces_n
+            found = read(tmp_path, content[:end], LEFT).grf_n
+            assert set(found[:-1] if is_last_cut else found) <= forces_n
