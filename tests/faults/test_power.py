@@ -282,7 +282,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
     pid = int(run(code).out)
 
-    until(lambda: has_ended(pid))
+    until(lambda: has_ended(pid), 5.0)  # it would sleep for a minute
 
 
 # --- the product's own protocol, and broken ones --------------------------------------------------

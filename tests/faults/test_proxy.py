@@ -20,6 +20,7 @@ class Echo(socketserver.ThreadingTCPServer):
     """A server that sends back what it hears, in a thread of its own."""
 
     allow_reuse_address = True
+    daemon_threads, block_on_close = True, False
 
     def __init__(self, port: int = 0) -> None:
         self._open: list[socket.socket] = []
@@ -28,8 +29,11 @@ class Echo(socketserver.ThreadingTCPServer):
         self._thread = threading.Thread(target=self.serve_forever, args=(0.02,))
         self._thread.start()
 
+    def process_request(self, request: Any, client_address: Any) -> None:
+        self._open.append(request)  # here: when the server has shut down, all are in the list
+        super().process_request(request, client_address)
+
     def finish_request(self, request: Any, client_address: Any) -> None:
-        self._open.append(request)
         with suppress(OSError):
             while data := request.recv(65536):
                 request.sendall(data)

@@ -78,25 +78,23 @@ def _replaced(content: bytes) -> Damage:
     return replaced
 
 
-DAMAGES: dict[str, Damage] = {
-    "a bit flipped": _flipped,
-    "cut off": _cut,
-    "emptied": _replaced(b""),
+NO_FILE: dict[str, Damage] = {
     "replaced by a folder": _folder,
     "replaced by a link to nowhere": _linked("nowhere"),
     "replaced by a link to /dev/zero": _linked("/dev/zero"),
     "replaced by a link to itself elsewhere": _moved,
     "replaced by a pipe": _pipe,
+}
+"""Damages after which there is no file any more."""
+DAMAGES: dict[str, Damage] = {
+    "a bit flipped": _flipped,
+    "cut off": _cut,
+    "emptied": _replaced(b""),
+    **NO_FILE,
     **{f"replaced by {name}": _replaced(content) for name, content in FOREIGN.items()},
     # Root may read everything.
     **({} if os.geteuid() == 0 else {"forbidden": _forbidden}),
 }
-
-
-NO_FILE = [
-    name for name in DAMAGES if name.endswith(("folder", "nowhere", "zero", "where", "pipe"))
-]
-"""Damages after which there is no file any more."""
 
 
 def damaged_copies(folder: Path, play: Play) -> Iterator[tuple[Path, Path, str, bool]]:

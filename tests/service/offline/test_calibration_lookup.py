@@ -17,8 +17,11 @@ from storage.verify.data_folder import find_verdict, verify_path
 from tests.builders.calibrations import make_calibration, newton_tile
 from tests.hostile.damages import DAMAGES, Damage
 
-SEEDED = Random(1)  # noqa: S311  # no secret
 CALIBRATION = make_calibration(newton_tile("T01"), newton_tile("T02", rmse_n=0.1))
+
+
+def seeded() -> Random:
+    return Random(1)  # noqa: S311  # no secret
 
 
 @pytest.fixture
@@ -50,7 +53,7 @@ def test_a_written_calibration_is_read_and_every_byte_of_it_is_proven(
 def test_verify_proves_it_and_a_folder_of_them(path: Path, tmp_path: Path) -> None:
     write_calibration(tmp_path / "heel.json", CALIBRATION)
     assert [find_verdict(verify_path(each)) for each in (path, tmp_path)] == ["complete"] * 2
-    DAMAGES["a bit flipped"](path, SEEDED)
+    DAMAGES["a bit flipped"](path, seeded())
     assert [find_verdict(verify_path(each)) for each in (path, tmp_path)] == ["damaged"] * 2
     path.write_text(CALIBRATION.to_json())
     assert "it has no hash" in " ".join(verify_path(path).problems)
@@ -129,7 +132,7 @@ def test_a_cached_calibration_that_does_not_prove_itself_is_set_aside_and_made_a
     assert found() == first
     assert pressed == ["emulated-rig-A01"]
     (kept,) = (tmp_path / "cache").iterdir()
-    damage(kept, SEEDED)
+    damage(kept, seeded())
     said.clear()
     assert found() == first
     assert pressed == ["emulated-rig-A01"] * 2

@@ -114,7 +114,7 @@ def test_a_zoom_costs_the_same_wherever_it_is_and_however_long_the_series(
     assert read == [1, 1, 1]
 
 
-def test_a_series_is_read_once_and_again_when_it_has_changed(
+def test_a_series_is_read_again_only_when_it_has_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read: list[Path] = []

@@ -241,6 +241,10 @@ def test_the_notes_say_what_was_used() -> None:
     assert notes["lag_ms"] == 100.0
     tare = notes["tare"]
     assert isinstance(tare, dict)
+    assert set(tare) == {
+        *("baseline_kpa", "baseline_sigma_kpa", "noise_kpa", "temperature_raw_counts"),
+        *("noise_lasting", "noise_lasting_s", "t_ns", "begin_s", "end_s", "frames", "source"),
+    }
     assert (tare["source"], tare["frames"], tare["t_ns"]) == ("lead", 100, 10**18 + 198_000_000)
 
 

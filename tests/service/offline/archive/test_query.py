@@ -189,7 +189,7 @@ def test_sums_of_integers_are_integers_however_great(made: Path) -> None:
     assert row["great"] == 2**64
 
 
-def test_a_question_reads_only_the_views_that_it_names(
+def test_a_question_reads_only_the_views_that_it_selects_from(
     made: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     archive = find_sessions([str(made)])

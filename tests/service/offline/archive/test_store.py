@@ -23,7 +23,7 @@ from tests.service.offline.archives import IDS, STATIC, long_session, made, ran,
 from tests.service.sessions.pieces import calibration
 
 pytestmark = pytest.mark.slow
-FOUND, SESSIONS = f"s3://{BUCKET}/2026", f"s3://{BUCKET}/2026/sessions"
+FOLDER, SESSIONS = f"s3://{BUCKET}/2026", f"s3://{BUCKET}/2026/sessions"
 
 
 def way_to(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -45,14 +45,15 @@ def test_sessions_of_a_store_are_worked_on_and_results_put_back(
     store: Store, archive: Path, tmp_path: Path
 ) -> None:
     out = f"s3://{BUCKET}/estimated"
-    assert made(ran(STATIC, FOUND, out)) == set(IDS[:4])
+    found = ran(STATIC, FOLDER, out)
+    assert {name: each.state for name, each in found.items()} == dict.fromkeys(IDS[:4], "made")
     ran(STATIC, archive, tmp_path / "out")
     for name in IDS[:4]:
         there = store.content(f"estimated/{name}")
         here = {path.name: path.read_bytes() for path in (tmp_path / "out" / name).iterdir()}
         assert there.pop("estimate.made.json") != here.pop("estimate.made.json")  # their places
         assert there == here
-    assert {each.state for each in ran(STATIC, FOUND, out).values()} == {"there"}
+    assert {each.state for each in ran(STATIC, FOLDER, out).values()} == {"there"}
     for place in (f"{out}/{IDS[2]}", f"{out}/{IDS[3]}/frames.parquet"):
         (one,) = ran(VerifyTask(), place, None).values()
         assert one.facts["verdict"] == "complete"
@@ -97,11 +98,11 @@ def test_a_store_that_refuses_and_breaks_off_costs_time_and_nothing_else(
 
     with BadWay(store, trouble) as way:
         way_to(way.endpoint, monkeypatch)
-        assert made(ran(STATIC, FOUND, f"s3://{BUCKET}/badly")) == set(IDS[:4])
+        assert made(ran(STATIC, FOLDER, f"s3://{BUCKET}/badly")) == set(IDS[:4])
         assert way.refused >= 3
         assert way.cut >= 1
     way_to(store.endpoint, monkeypatch)
-    ran(STATIC, FOUND, f"s3://{BUCKET}/well")
+    ran(STATIC, FOLDER, f"s3://{BUCKET}/well")
     assert store.content("badly") == store.content("well")
 
 
@@ -118,11 +119,11 @@ def test_a_session_that_a_store_will_not_give_fails_alone_and_the_next_run_makes
     with BadWay(store, trouble) as way:
         way_to(way.endpoint, monkeypatch)
         closed.add(f"{IDS[1]}/frames.parquet")
-        found = ran(VerifyTask(), FOUND, out)
+        found = ran(VerifyTask(), FOLDER, out)
         assert {name for name, each in found.items() if each.state == "failed"} == {IDS[1]}
         assert "cannot be read" in found[IDS[1]].reason
         closed.clear()
-        found = ran(VerifyTask(), FOUND, out)
+        found = ran(VerifyTask(), FOLDER, out)
         assert {name: each.state for name, each in found.items()} == {
             **dict.fromkeys(IDS[:4], "there"),
             IDS[1]: "made",

@@ -107,7 +107,8 @@ def test_a_tare_that_is_taken_on_the_way_is_in_force_in_the_pieces_after_it(tmp_
     batch = frames(hopping(12_000, loaded_from=200), period_ns=PERIOD_NS)
     source = written(tmp_path / "raw.parquet", batch, tares=[tare.as_dict() for tare in tares])
     whole = in_one_go(source, tmp_path, request())
-    assert in_pieces(source, tmp_path, request(), 1) == whole
+    (folder := tmp_path / "in pieces").mkdir()
+    assert in_pieces(source, folder, request(), 1) == whole
 
 
 @pytest.fixture(scope="module")
