@@ -189,21 +189,23 @@ def read_c3d_force_platforms(path: Path, is_needed: ColumnFilter, values_max: in
     """
     content = read_bytes(path, bytes_max=TEXT_BYTES_MAX)
     try:
-        file = _parse_file(content)
+        return _read_force_platforms(_parse_file(content), values_max)
     except FileFormatError:
         raise
     except (struct.error, IndexError, ValueError, TypeError, OverflowError) as error:
         raise FileFormatError(
             f"its header and its parameters contradict each other: {error}"
         ) from error
-    used = file.parameters.get_numbers_or_empty("FORCE_PLATFORM", "USED")
-    count = min(int(used.sum()), 255)
+
+
+def _read_force_platforms(file: C3dFile, values_max: int) -> ForceTable:
+    count = min(file.parameters.get_count_or_zero("FORCE_PLATFORM", "USED"), 255)
     if count == 0:
         raise FileFormatError(
             "there is no force platform in it", expected="FORCE_PLATFORM:USED of 1"
         )
     if not (np.isfinite(file.rate_hz) and file.rate_hz > 0.0):
-        raise FileFormatError(f"ANALOG:RATE is {file.rate_hz:g}")
+        raise FileFormatError(f"ANALOG:RATE is {file.rate_hz:g}", expected="a rate above 0")
     plates: list[PlateSignals] = []
     notes = [*file.notes]
     refusal: FileFormatError | None = None
@@ -352,13 +354,10 @@ def _parse_floats(content: bytes, order: str, *, is_dec: bool) -> RawNumbers:
 
 
 def _zero_notes(file: C3dFile, plates: list[PlateSignals]) -> list[str]:
-    zero = [
-        int(frame)
-        for frame in np.ravel(file.parameters.get_numbers_or_empty("FORCE_PLATFORM", "ZERO"))
-    ]
-    if len(zero) != 2 or not 1 <= zero[0] <= zero[1]:
+    zero = np.ravel(file.parameters.get_numbers_or_empty("FORCE_PLATFORM", "ZERO"))
+    if len(zero) != 2 or not 1 <= zero[0] <= zero[1] < np.inf:
         return []
-    first, last = zero
+    first, last = map(int, zero)
     window = slice((first - 1) * file.samples_per_frame, last * file.samples_per_frame)
     read = [plate.fz[window] for plate in plates]
     means = ", ".join(f"{fz.mean():.3f}" for fz in read if len(fz))
@@ -429,20 +428,21 @@ def _get_plate_type_and_channels(file: C3dFile, i: int) -> tuple[int, list[int]]
     Raises:
         FileFormatError: the type is not supported, or channels are missing.
     """
-    kinds = np.ravel(file.parameters.get_numbers_or_empty("FORCE_PLATFORM", "TYPE")).astype(int)
-    kind = int(kinds[i]) if i < len(kinds) else 0
+    kinds = np.ravel(file.parameters.get_numbers_or_empty("FORCE_PLATFORM", "TYPE")).tolist()
+    kind = kinds[i] if i < len(kinds) else 0
     count = _CHANNEL_COUNTS.get(kind)
     if count is None:
-        raise FileFormatError(f"it is of type {kind}", expected="force platforms of types 1 to 4")
-    table = file.parameters.get_numbers_or_empty("FORCE_PLATFORM", "CHANNEL")
+        raise FileFormatError(f"it is of type {kind:g}", expected="force platforms of types 1 to 4")
+    table = np.atleast_1d(file.parameters.get_numbers_or_empty("FORCE_PLATFORM", "CHANNEL"))
     table = table.reshape(len(table), table.size // max(len(table), 1))
-    numbers = (table[:count, i : i + 1].astype(int) % 65536).ravel().tolist()
+    stored = table[:count, i : i + 1].ravel()
+    numbers = [int(n) % 65536 if np.isfinite(n) else 0 for n in stored]
     if len(numbers) < count or not all(0 < n <= file.channel_count for n in numbers):
         raise FileFormatError(
             f"it has the channels {', '.join(map(str, numbers)) or 'of nothing'}",
             expected=f"{count} of the {file.channel_count} channels of the C3D file",
         )
-    return kind, [n - 1 for n in numbers]
+    return int(kind), [n - 1 for n in numbers]
 
 
 def _mask_unrecorded_samples(file: C3dFile, at: list[int], channels: Floats) -> Iterator[str]:
@@ -472,10 +472,11 @@ def _calibration_matrix(file: C3dFile, i: int) -> Floats:
     Raises:
         FileFormatError: the matrix is missing, or has another size.
     """
-    stored = file.parameters.get_numbers_or_empty("FORCE_PLATFORM", "CAL_MATRIX").astype(np.float64)
-    stored = stored.reshape((*stored.shape, 1, 1, 1)[:3], order="F")
+    value = file.parameters.get_numbers_or_empty("FORCE_PLATFORM", "CAL_MATRIX")
+    stored = np.atleast_3d(value.astype(np.float64))
     is_by_row = file.parameters.get_keyword_or_empty("FORCE_PLATFORM", "MATRIX_STORE") == "BYROW"
-    if stored.shape[:2] != (6, 6) or i >= stored.shape[2] or not np.isfinite(stored[:, :, i]).all():
+    is_there = stored.ndim == 3 and stored.shape[:2] == (6, 6) and i < stored.shape[2]
+    if not is_there or not np.isfinite(stored[:, :, i]).all():
         raise FileFormatError(
             f"it is of type 4, with a CAL_MATRIX of {' by '.join(map(str, stored.shape))}",
             expected="a matrix of 6 by 6 for each plate",

@@ -138,7 +138,7 @@ def is_loadsol(head: str) -> bool:
     return _find_loadsol_names(head) is not None
 
 
-def parse_loadsol_forces(text: str, is_time_source: ColumnFilter, values_max: int) -> ForceTable:
+def parse_loadsol_forces(text: str, is_needed: ColumnFilter, values_max: int) -> ForceTable:
     """Parse the force of each sole as `left_fz`, `right_fz`, at the times of the needed soles.
 
     Raises:
@@ -192,7 +192,7 @@ def parse_loadsol_forces(text: str, is_time_source: ColumnFilter, values_max: in
         times_s.append(np.asarray(columns[names[stamp]] * scale, dtype=np.float64))
     if len({plate.name for plate in plates}) < len(plates):
         raise FileFormatError("two soles are of one side", expected="one of each")
-    time_s = _needed_times(plates, times_s, is_time_source)
+    time_s = _needed_times(plates, times_s, is_needed)
     return make_table_of_separate_plates(time_s, plates)
 
 

@@ -60,7 +60,9 @@ def _to_numbers(cells: pa.ChunkedArray[Any], name: str) -> Column:
     try:
         return arrow_to_floats(cells.cast(pa.float64()).combine_chunks())
     except pa.ArrowException as error:
-        raise FileFormatError(f"column {name} is not numeric: {error}") from error
+        raise FileFormatError(
+            f"column {name} is not numeric: {error}", expected="numbers"
+        ) from error
 
 
 def read_sealed_session_table(path: Path, optional_names: Collection[str]) -> ForceTable | None:

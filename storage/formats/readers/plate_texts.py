@@ -57,6 +57,8 @@ _BIOWARE_NAMES = re.compile(
 )
 _NEXUS_NAMES = re.compile(r"^\"?Frame\"?(?P<delimiter>[,;\t])\"?Sub ?Frame\"?", re.I | re.M)
 _NEXUS_KIND = re.compile(r"(?P<device>.*?)[ -]*\b(force|moment|cop)", re.IGNORECASE)
+_NEXUS_HEAD_CHARACTERS = 65_536
+"""Most characters of a section's lines above its names: no section copies all text above it."""
 _NEXUS_COMBINED = "combined"
 """Device that Nexus adds: the sum of all plates."""
 _NETFORCE_CHANNELS = 6
@@ -139,13 +141,13 @@ def parse_nexus_force_and_cop(text: str, is_needed: ColumnFilter, values_max: in
     """
     refusal: FileFormatError | None = None
     for found in _NEXUS_NAMES.finditer(text):
-        delimiter = found["delimiter"]
+        delimiter, begin = found["delimiter"], found.start()
         above = [
             split_trimmed_cells_without_empty_end(line, delimiter)
-            for line in text[: found.start()].split("\n")[-4:-1]
+            for line in text[max(0, begin - _NEXUS_HEAD_CHARACTERS) : begin].rsplit("\n", 4)[-4:-1]
         ]
-        line, _, below = text[found.start() :].partition("\n")
-        units, _, rows = below.partition("\n")
+        line, at = _cut_line(text, begin)
+        units, at = _cut_line(text, at)
         columns = _make_device_columns(
             above[-1] if above else [],
             split_trimmed_cells_without_empty_end(line, delimiter),
@@ -162,6 +164,7 @@ def parse_nexus_force_and_cop(text: str, is_needed: ColumnFilter, values_max: in
             for group in groups
             if len(groups) != 2 or columns[group["fz"]].device.lower() != _NEXUS_COMBINED
         ]
+        rows = text[at:]
         end = re.search(rf"^[\"{delimiter} ]*$", rows, re.MULTILINE)
         rows = rows[: end.start()] if end else rows
         needed = {0, 1}
@@ -174,6 +177,12 @@ def parse_nexus_force_and_cop(text: str, is_needed: ColumnFilter, values_max: in
         ]
         return make_table_of_separate_plates(time_s, plates)
     raise refusal or FileFormatError("it has no section")
+
+
+def _cut_line(text: str, begin: int) -> tuple[str, int]:
+    """Return the line that begins at `begin`, and where the next one begins."""
+    end = text.find("\n", begin)
+    return (text[begin:], len(text)) if end < 0 else (text[begin:end], end + 1)
 
 
 def _make_device_columns(

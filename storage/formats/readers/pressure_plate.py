@@ -98,18 +98,23 @@ def _read_arrays(path: Path, bytes_max: int) -> dict[str, Floats]:
     try:
         check_regular_file(path)
         with zipfile.ZipFile(path) as archive:
-            size = sum(member.file_size for member in archive.infolist())
-        if size > bytes_max:
-            raise FileFormatError(
-                f"{size} bytes are too many for memory", expected=f"up to {bytes_max}"
-            )
+            _check_archive_size(archive, bytes_max)
         with np.load(path, allow_pickle=False) as file:
             return {name: np.asarray(file[name], dtype=np.float64) for name in file.files}
-    except (
-        *(OSError, ValueError, EOFError, KeyError, TypeError),
-        *(zipfile.BadZipFile, MemoryError),  # a header that states more than the file has
-    ) as error:
+    except FileFormatError:
+        raise
+    except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile) as error:
         raise FileFormatError(f"no arrays of numpy: {error}") from error
+
+
+def _check_archive_size(archive: zipfile.ZipFile, bytes_max: int) -> None:
+    size = sum(member.file_size for member in archive.infolist())
+    if size > bytes_max:
+        raise FileFormatError(
+            f"{size} bytes are too many for memory",
+            expected=f"up to {bytes_max} bytes",
+            remedy="Cut out the part that is needed",
+        )
 
 
 TEKSCAN_FORM = "facts above ASCII_DATA @@, then frames of ROWS lines with COLS cells"

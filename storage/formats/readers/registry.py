@@ -1,4 +1,4 @@
-"""Registry of all table formats; a new format is a module and a line here."""
+"""Registry of all table formats; a new format is a reader, its form, and a line here."""
 
 from __future__ import annotations
 
@@ -71,7 +71,8 @@ def _read_text(
     path: Path, is_needed: ColumnFilter, values_max: int, options: TextOptions | None = None
 ) -> ForceTable:
     options = options or TextOptions()
-    content = text.read_decoded_text(path, options.encoding)
+    remedy = "" if options.encoding else text.ENCODING_REMEDY
+    content = text.read_decoded_text(path, options.encoding, no_text_remedy=remedy)
     head = content[: text.HEAD_CHARACTERS]
     for one in () if options.has_layout_option else TEXT_FORMATS:
         if one.matches_head(head):
@@ -107,8 +108,9 @@ def _complete_errors(path: Path, form: str) -> Iterator[None]:
         raise FileFormatError(f"cannot be read: {error}", where=str(path), expected=form) from error
     except MemoryError as error:
         raise FileFormatError(
-            "there is not enough memory to read it",
+            ": ".join(filter(None, ("there is not enough memory to read it", str(error)))),
             where=str(path),
+            expected="a file that fits in memory",
             remedy="Lift the limit (ulimit -v), or cut out the part that is needed",
         ) from error
 

@@ -39,7 +39,7 @@ from storage.formats.readers.table import (
 
 FORM = (
     "a text with a line of names above lines of numbers, parted by commas, semicolons or tabs; or "
-    "a file that ends in .parquet, .c3d, .mot, .sto or .npz"
+    "a file that ends in .parquet, .c3d, .mot, .sto, .npz, .bag, .mcap or .db3"
 )
 HEAD_LINES = 200
 """Number of lines in which the line of names is searched."""
@@ -66,8 +66,7 @@ _UNIT_IN_BRACKETS = re.compile(r"[\[(]\s*([^\[\]()\s]+)\s*[\])]$")
 _AMBIGUOUS_COMMA = r"^[+-]?[1-9]\d{0,2},\d{3}$"
 """Pattern of ambiguous cells: decimal comma, or comma between thousands."""
 DECIMAL_REMEDY = "State the mark of decimals: --decimal , or --decimal ."
-
-
+ENCODING_REMEDY = "If it is one, state its encoding: --encoding NAME"
 DECIMAL_PATTERNS = {
     ",": re.compile(r"[+-]?([1-9]\d{0,2}(\.\d{3})+|\d*)(,\d*)?([eE][+-]?\d+)?"),
     ".": re.compile(r"[+-]?([1-9]\d{0,2}(,\d{3})+|\d*)(\.\d*)?([eE][+-]?\d+)?"),
@@ -150,24 +149,34 @@ def parse_text_table(
     if options.units_row is not None:
         units, text = _cut_out_line(text, options.units_row - 1)
         if not units.strip():
-            raise FileFormatError(f"line {options.units_row}, of units, is empty")
+            raise FileFormatError(
+                f"line {options.units_row}, of units, is empty",
+                expected="the line of units",
+                remedy="State another --units-row",
+            )
         skip -= options.units_row <= skip
     text = text[_line_offset(text, skip) :]
     if skip and not text.strip():
-        raise FileFormatError(f"there is no text below {options.skip_rows} lines")
+        raise FileFormatError(
+            f"there is no text below {options.skip_rows} lines",
+            expected="fewer lines above the names",
+            remedy="State another --skip-rows",
+        )
     layout = _detect_layout(text, options)
     if units is not None:
         cells = split_trimmed_cells_without_empty_end(units, layout.delimiter)
         layout = replace(layout, units={**layout.units, **_units_by_name(layout.names, cells)})
     needed = select_needed_names_or_empty(layout.names, is_needed)
-    columns = parse_columns(text, layout, needed, values_max, options.decimal)
+    columns = parse_columns(
+        text, layout, needed, values_max, options.decimal, mixed_marks_remedy=DECIMAL_REMEDY
+    )
     notes = () if layout.is_named else ("no line names its columns: they are numbered from 1 on",)
     return make_table_with_lowercase_standard_names(
         layout.names, columns, units=layout.units, notes=notes, expected_form=FORM
     )
 
 
-def read_decoded_text(path: Path, encoding: str | None = None) -> str:
+def read_decoded_text(path: Path, encoding: str | None = None, *, no_text_remedy: str = "") -> str:
     r"""Read and decode a text in the given or detected encoding; line ends become `\n`.
 
     Raises:
@@ -180,15 +189,14 @@ def read_decoded_text(path: Path, encoding: str | None = None) -> str:
     except UnicodeError as error:
         if encoding is not None:
             raise FileFormatError(
-                f"it is no text in {encoding}", remedy="State another --encoding"
+                f"it is no text in {encoding}",
+                expected=f"a text in {encoding}",
+                remedy="State another --encoding",
             ) from error
         # Names and titles of older programs; numbers are equal in all such encodings.
         text = content.decode("cp1252", errors="replace")
     if "\0" in text[:HEAD_CHARACTERS]:
-        raise FileFormatError(
-            "cannot be read: it is no text",
-            remedy="" if encoding else "If it is one, state its encoding: --encoding NAME",
-        )
+        raise FileFormatError("cannot be read: it is no text", remedy=no_text_remedy)
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
@@ -231,6 +239,8 @@ def parse_columns(
     needed_names: Sequence[str],
     values_max: int,
     decimal_mark: str | None = None,
+    *,
+    mixed_marks_remedy: str = "Save it with decimal points",
 ) -> dict[str, Column]:
     """Return the numbers of the needed columns, without trailing empty lines.
 
@@ -266,7 +276,9 @@ def parse_columns(
         cells = {
             name: _to_decimal_points(column, name, decimal_mark) for name, column in cells.items()
         }
-    has_comma = decimal_mark is None and _has_decimal_comma(list(cells.values()))
+    has_comma = decimal_mark is None and _has_decimal_comma(
+        list(cells.values()), mixed_marks_remedy
+    )
     columns = {
         name: _parse_numbers(column, name, has_comma=has_comma) for name, column in cells.items()
     }
@@ -410,7 +422,7 @@ def _data_lines(text: str, layout: TextLayout) -> str:
     return body + "\n"
 
 
-def _has_decimal_comma(columns: Sequence[pa.Array[Any]]) -> bool:
+def _has_decimal_comma(columns: Sequence[pa.Array[Any]], remedy: str) -> bool:
     """Return whether numbers have a decimal comma.
 
     Raises:
@@ -427,7 +439,7 @@ def _has_decimal_comma(columns: Sequence[pa.Array[Any]]) -> bool:
             raise FileFormatError(
                 f"some numbers have a decimal point, and {first!r} has a comma",
                 expected=expected,
-                remedy=DECIMAL_REMEDY,
+                remedy=remedy,
             )
     if all(
         pc.all(pc.match_substring_regex(cells, _AMBIGUOUS_COMMA)).as_py() is not False
@@ -436,7 +448,7 @@ def _has_decimal_comma(columns: Sequence[pa.Array[Any]]) -> bool:
         raise FileFormatError(
             f"{first!r} may have a decimal comma, or a comma between thousands",
             expected=expected,
-            remedy=DECIMAL_REMEDY,
+            remedy=remedy,
         )
     return True
 
@@ -474,7 +486,8 @@ def _parse_numbers(cells: pa.Array[Any], name: str, *, has_comma: bool) -> Colum
     except pa.ArrowException as error:
         at, text = next((i, c) for i, c in enumerate(cells.to_pylist()) if c and not _is_float(c))
         raise FileFormatError(
-            f"column {name} is not numeric: {text[:40]!r} in row {at + 1} of its numbers"
+            f"column {name} is not numeric: {text[:40]!r} in row {at + 1} of its numbers",
+            expected="numbers",
         ) from error
 
 

@@ -146,6 +146,14 @@ def test_a_spike_of_the_other_sign_is_no_load(tmp_path: Path) -> None:
             {"TYPE": [4], "CAL_MATRIX": np.ones((1, 8, 8))},
             "type 4, with a CAL_MATRIX of 8 by",
         ),
+        (
+            {"TYPE": [4], "CAL_MATRIX": np.ones((1, 1, 6, 6))},
+            "type 4, with a CAL_MATRIX of 6 by 6 by 1 by 1;",
+        ),
+        ({"USED": np.nan}, "no force platform"),
+        ({"TYPE": [np.nan]}, "of type nan"),
+        ({"CHANNEL": np.full((1, 6), np.nan)}, "the channels 0, 0"),
+        ({"CORNERS": np.ones(3), "ORIGIN": np.ones(3), "CHANNEL": np.array(7)}, "the channels 7;"),
     ],
 )
 def test_what_is_no_plate_is_refused(tmp_path: Path, more: dict[str, Any], said: str) -> None:
@@ -172,6 +180,14 @@ def test_a_missing_unit_has_to_be_stated(tmp_path: Path, units: list[str], said:
     found = read(tmp_path / "gait.c3d", stated)
     check(found, atol=0.1, grf_n=factor * LOAD_N)
     check(found, atol=1e-6, cop_m=PLACED_M)
+
+
+@pytest.mark.parametrize("zero", [[np.nan, 10.0], [1.0, np.inf], [3, 1], [1]])
+def test_frames_without_load_that_are_no_frames_are_left_out(
+    tmp_path: Path, zero: list[float]
+) -> None:
+    content = with_units(2, ZERO=np.array(zero))
+    assert not any("ZERO" in note for note in read_c3d(tmp_path, content, channels(2)).notes)
 
 
 def test_of_two_plates_none_is_chosen_for_the_user(tmp_path: Path) -> None:
@@ -397,7 +413,9 @@ def test_too_little_memory_is_the_cause(tmp_path: Path, monkeypatch: pytest.Monk
         raise MemoryError
 
     monkeypatch.setattr(C3dFile, "get_scaled_samples_by_channel", refuse)
-    with pytest.raises(FileFormatError, match=r"not enough memory.*ulimit -v"):
+    with pytest.raises(
+        FileFormatError, match=r"not enough memory to read it; .*fits in memory.*ulimit -v"
+    ):
         read(path)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from devices.errors import FileFormatError, FootTileError, UsageError
+from storage.formats.readers import plate_texts
 from storage.formats.reference import ReferenceOptions
 from tests.storage.formats.readers.reading import check, count_refused, read
 
@@ -364,6 +366,10 @@ def test_what_the_file_does_not_state_is_asked_for(
         (BIOWARE.replace("\t-0.010327", "\t-0.010327\t7"), "cannot be read"),
         (BIOWARE.replace("\tAx\tAy\n\tN", "\n\tN"), "3 names for 5 columns"),
         (BIOWARE.replace("100.5", "1OO.5"), "is not numeric: '1OO.5'"),
+        (
+            BIOWARE.replace("100.5", "100,5"),
+            r"'100,5' has a comma; .*\. Save it with decimal points",
+        ),
         (BIOWARE.replace("(s)\tFx", "(min)\tFx"), "its time is in min"),
         (NEXUS_MARKERS, "no force plate in it"),
         (NEXUS_1.replace("Devices\n500\n", "Devices\n\n"), "the rate of its devices is ''"),
@@ -376,6 +382,26 @@ def test_what_the_file_does_not_state_is_asked_for(
 def test_what_is_no_measurement_is_refused(tmp_path: Path, text: str, says: str) -> None:
     with pytest.raises(FileFormatError, match=says):
         read(tmp_path, text)
+
+
+def test_a_header_without_text_names_no_option_that_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=r"it is no text; expected a header.*numbers$"):
+        read(tmp_path, "\0" + OPENSIM, name="grf.mot")
+
+
+def test_too_little_memory_is_the_cause(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(plate_texts, "parse_columns", refuse)
+    with pytest.raises(FileFormatError, match=r"to read it; expected a file that fits in memory"):
+        read(tmp_path, BIOWARE)
+
+
+def test_many_sections_without_plates_are_skipped(tmp_path: Path) -> None:
+    begin_s = time.monotonic()
+    check(read(tmp_path, NEXUS_MARKERS * 6000 + NEXUS, plate(2)), time_s=STEP / 500.0)
+    assert time.monotonic() - begin_s < 10.0
 
 
 def test_a_part_of_a_recording_and_a_gap_of_frames_are_read_and_said(tmp_path: Path) -> None:

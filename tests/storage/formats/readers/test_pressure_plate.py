@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from devices.errors import FileFormatError, FootTileError
+from storage.formats.readers.registry import read_table
 from storage.formats.reference import ReferenceData, ReferenceOptions, read_reference
 from tests.storage.formats.readers.reading import check, read
 
@@ -95,8 +96,16 @@ def test_an_array_that_says_it_is_endless_is_refused(tmp_path: Path) -> None:
     np.savez(path, **plate(force_n=None))
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("force_n.npy", header.getvalue() + b"\0" * 8)
-    with pytest.raises(FileFormatError, match="numpy"):
+    with pytest.raises(FileFormatError, match=r"not enough memory to read it: .*fits in memory"):
         read_reference(path, ReferenceOptions())
+
+
+def test_arrays_that_are_too_large_are_refused_by_their_size(tmp_path: Path) -> None:
+    np.savez(tmp_path / "plate.npz", **plate())
+    with pytest.raises(
+        FileFormatError, match=r"plate\.npz: \d+ bytes are too many .* 8 bytes.*Cut"
+    ):
+        read_table(tmp_path / "plate.npz", lambda name: True, values_max=1)
 
 
 @pytest.mark.parametrize("keep", [0.3, 0.6, 0.95])

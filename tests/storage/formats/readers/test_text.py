@@ -125,6 +125,7 @@ def test_words_for_no_number_are_nan(tmp_path: Path, cell: str) -> None:
         ("633,21\n628,46\n", "may be two numbers, or one with a decimal comma"),
         ("633,21\n628,46\n", "--decimal"),
         (PLAIN.replace("1e3", "much"), "column Fz is not numeric: 'much' in row 3"),
+        (PLAIN.replace("1e3", "much"), "of its numbers; expected numbers"),
         (PLAIN + "0.03\n", "cannot be read"),
         (PLAIN + "0.03,1,2\n", "cannot be read"),
         ("t;Fz\n0.0;1,5\n", "have a decimal point, and '1,5' has a comma"),
@@ -234,7 +235,9 @@ def test_names_are_read_in_the_stated_encoding(tmp_path: Path) -> None:
         read_reference(path, garbled)
     stated = ReferenceOptions(garbled.columns, {}, "+", text=TextOptions(encoding="cp932"))
     np.testing.assert_array_equal(read_reference(path, stated).grf_n, [1.5, 2.5])
-    with pytest.raises(FileFormatError, match=r"it is no text in utf-8.*another --encoding"):
+    with pytest.raises(
+        FileFormatError, match=r"no text in utf-8; expected a text in utf-8.*another --encoding"
+    ):
         table_of(tmp_path, text, stated=TextOptions(encoding="utf-8"))
     without_mark = "t,F\n0,1\n".encode("utf-32-le")
     with pytest.raises(FileFormatError, match=r"no text.*--encoding NAME"):
@@ -262,9 +265,9 @@ def test_impossible_text_options_are_wrong_usage(stated: dict[str, int | str]) -
 
 def test_rows_that_are_not_there_are_refused(tmp_path: Path) -> None:
     for stated, says in (
-        (TextOptions(skip_rows=9), "there is no text below 9 lines"),
+        (TextOptions(skip_rows=9), "below 9 lines; expected fewer lines .*another --skip-rows"),
         (TextOptions(skip_rows=10**30), "there is no text below"),
-        (TextOptions(units_row=9), "line 9, of units, is empty"),
+        (TextOptions(units_row=9), "line 9, of units, is empty; .*another --units-row"),
     ):
         with pytest.raises(FileFormatError, match=says):
             table_of(tmp_path, PLAIN, stated=stated)
