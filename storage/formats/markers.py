@@ -24,12 +24,17 @@ from storage.sessions.time_axis import NODE_AXIS, TimeAxis
 
 DISTANCE_MAX_NS = 1_000_000_000
 """Largest distance in time between a marker and its frame."""
+_SEARCH_DISTANCE_NS = DISTANCE_MAX_NS + 1_000_000
+"""Search distance with a margin: float64 sums of instants do not wrap, but are off by 2 us."""
 LABEL_SEPARATOR = "; "
 """Separator of the labels of several markers at one frame, in the order of their instants."""
 
 PLACEMENT_COLUMNS = ("seq", "t_mono_ns", "t_ns")
 """Columns by which markers are placed, besides `part`."""
 
+_NO_FRAME = "no frame within a second of it"
+_NO_CLOCK = "no frame's time is known by the server's clock"
+_NOT_IN_SLICE = "its frame is not in this slice"
 _NO_DISTANCE = np.iinfo(np.uint64).max
 
 
@@ -193,19 +198,10 @@ class _NearestFrames:
         )
 
 
-_NO_FRAME = "no frame within a second of it"
-_NO_CLOCK = "no frame's time is known by the server's clock"
-_NOT_IN_SLICE = "its frame is not in this slice"
-
-
 def _distance_ns(a_ns: Array, b_ns: Array) -> Array:
     """Return distances of int64 instants as uint64: an int64 might overflow."""
     a, b = a_ns.astype(np.uint64), b_ns.astype(np.uint64)
     return np.where(a_ns > b_ns, a - b, b - a)
-
-
-_SEARCH_DISTANCE_NS = DISTANCE_MAX_NS + 1_000_000
-"""Search distance with a margin: float64 sums of instants do not wrap, but are off by 2 us."""
 
 
 def place_session_markers(

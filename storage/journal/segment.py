@@ -314,7 +314,7 @@ class RecoveredSegment(NamedTuple):
     damaged: Intervals
     """Numbers of its damaged frames."""
     had_batches: bool
-    """False: it is deleted, and its process was killed just after creating it."""
+    """True if batches were written to it; False: its process was killed just after creating it."""
 
 
 def recover_or_delete_segment(path: Path, schema: pa.Schema) -> RecoveredSegment:

@@ -251,7 +251,7 @@ _MIN_MERGED_FRAMES = 1024
 class BinBuilder:
     """Builder of bins from consecutive frames.
 
-    The bins do not depend on how frames are cut into pieces, unless there are too many.
+    The bins do not depend on how frames are cut into pieces, unless `max_bins` is exceeded.
 
     Args:
         frames_in_bin: frames per bin; 1: the bins are single frames.
@@ -314,7 +314,7 @@ class BinBuilder:
         return concatenate_bins(pieces) if pieces else None
 
     def pop_levels(self) -> list[Bins]:
-        """Return the levels of all bins, the finest first; the builder is empty then."""
+        """Return the levels of all bins, the finest first; the builder is not used after this."""
         pieces = self._get_pieces()
         self._bins, self._pending = [], []
         if not pieces:
@@ -356,7 +356,7 @@ def _frame_at(frames: Mapping[str, Array], row: int) -> tuple[int, int]:
 def choose_frames_in_bin(frame_count: int, min_bins: int) -> int:
     """Return the most frames per bin, 1 or a power of 4, with which there are enough bins."""
     size = 1
-    while frame_count // (size * BINS_PER_COARSER_BIN) >= min_bins:
+    while frame_count // (size * BINS_PER_COARSER_BIN) >= max(min_bins, 1):
         size *= BINS_PER_COARSER_BIN
     return size
 

@@ -80,6 +80,9 @@ def _encode_mat_matrix(
         shape: numbers of rows and columns.
         number_type: numpy type of the numbers.
         chunks: arrays of this type, column after column.
+
+    Raises:
+        RuntimeError: the chunks have another length than the shape; all that follows would be lost.
     """
     kind = np.dtype(number_type)
     of_class, of_data = _NUMBER_TYPES[kind.str[1:]]
@@ -94,8 +97,13 @@ def _encode_mat_matrix(
         )
     )
     yield struct.pack("<II", _MATRIX, len(head) + size + -size % 8) + head
+    written = 0
     for piece in chunks:
-        yield piece.tobytes()
+        data = piece.tobytes()
+        written += len(data)
+        yield data
+    if written != size:
+        raise RuntimeError(f"a variable has {written} bytes of numbers; its head states {size}")
     yield bytes(-size % 8)
 
 
@@ -186,19 +194,28 @@ def _choose_mat_number_type(quantity: Column) -> npt.DTypeLike:
     return np.float32 if kind.bit_width <= 16 else np.float64
 
 
-def _read_text_variables(export: Export, quantity: Column) -> Mapping[str, Array]:
-    """Read a text as two variables by name: the number of its kind in each frame, and its kinds."""
-    pieces = _minimal_export(export, quantity).read_chunks([quantity.name])
-    texts = np.concatenate([piece[quantity.name] for piece in pieces])
-    kinds, codes = np.unique(texts.astype(str), return_inverse=True)
+def _make_text_variables(export: Export, quantity: Column, frames: int) -> dict[str, _Variable]:
+    """Return a text as two variables: the number of its kind in each frame, and its kinds."""
+    found = {kind for texts in _read_texts(export, quantity) for kind in np.unique(texts).tolist()}
+    kinds = np.array(sorted(found), dtype=np.str_)
+
+    def read_numbers() -> Iterator[Array]:
+        for texts in _read_texts(export, quantity):
+            yield (np.searchsorted(kinds, texts) + 1).astype(np.uint16)
+
     return {
-        quantity.name: (codes + 1).astype(np.uint16)[:, None],
-        f"{quantity.name}_kinds": np.array(kinds, dtype=object),
+        quantity.name: _Variable.from_chunks((frames, 1), np.uint16, read_numbers),
+        f"{quantity.name}_kinds": _Variable.from_value(kinds.astype(object)),
     }
 
 
+def _read_texts(export: Export, quantity: Column) -> Iterator[Array]:
+    for piece in _minimal_export(export, quantity).read_chunks([quantity.name]):
+        yield piece[quantity.name].astype(str)
+
+
 def _read_chunks_column_by_column(export: Export, quantity: Column) -> Iterator[Array]:
-    """Read the numbers of a quantity in chunks, column after column."""
+    """Read the numbers of a quantity in chunks, column after column: one pass for each column."""
     for name in _list_selected_columns_or_name(export, quantity):
         for piece in _minimal_export(export, quantity).read_chunks([name]):
             yield _to_number_type(quantity, piece[name])
@@ -324,8 +341,7 @@ def _make_variables(
     variables = {name: _Variable.from_value(value) for name, value in values.items()}
     for column in quantities:
         if pa.types.is_string(column.type):
-            texts = _read_text_variables(export, column)
-            variables |= {name: _Variable.from_value(value) for name, value in texts.items()}
+            variables |= _make_text_variables(export, column, frames)
             continue
         variables[column.name] = _Variable.from_chunks(
             (frames, len(_list_selected_columns_or_name(export, column))),
@@ -336,9 +352,10 @@ def _make_variables(
 
 
 def _read_instants(export: Export) -> dict[str, Array]:
-    """Return the instants of the frames by each requested clock."""
+    """Return the instants of the frames by each requested clock, without their uncertainty."""
     limit = min(FRAMES_MAX, _VALUES_MAX // max(len(export.array_info.tiles), 1))
-    return export.read_all(export.instant_columns, frames_max=limit)
+    names = [name for name in export.instant_columns if name != "t_server_uncertainty_ns"]
+    return export.read_all(names, frames_max=limit)
 
 
 def _encode_meanings(quantities: Sequence[Column]) -> Iterator[bytes]:

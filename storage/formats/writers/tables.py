@@ -24,7 +24,8 @@ from storage.sessions.writer import EXPORT_COLUMN, parquet_options
 
 
 def _encode_arrow(exports: Sequence[Export]) -> Iterator[bytes]:
-    return encode_tables(exports[0].read_tables(), pa.ipc.new_file)
+    (export,) = exports
+    return encode_tables(export.read_tables(), pa.ipc.new_file)
 
 
 ARROW = ExportFormat(
@@ -38,11 +39,13 @@ ARROW = ExportFormat(
 
 
 def _encode_parquet(exports: Sequence[Export]) -> Iterator[bytes]:
+    (export,) = exports
+
     def open_writer(sink: BinaryIO, schema: pa.Schema) -> pq.ParquetWriter:
         options: dict[str, Any] = {**parquet_options(schema), "column_encoding": None}
         return pq.ParquetWriter(sink, schema, **options)
 
-    return encode_tables(exports[0].read_tables(), open_writer)
+    return encode_tables(export.read_tables(), open_writer)
 
 
 PARQUET = ExportFormat(

@@ -32,6 +32,7 @@ from storage.sessions.pyramid import (
     bin_column_types,
     bin_source_columns,
     build_levels,
+    choose_frames_in_bin,
     make_single_frame_bins,
     merge_bins_within_parts,
     select_and_downsample_bins,
@@ -377,3 +378,12 @@ def test_another_file_is_refused_and_none_is_none(tmp_path: Path) -> None:
         OverviewReader(pa.BufferReader(sink.getvalue()), where="here")
     with pytest.raises(FileNotFoundError):
         open_overview(tmp_path / "overview.arrow")
+
+
+@pytest.mark.parametrize(
+    ("frame_count", "min_bins", "size"), [(100, 0, 64), (100, 7, 4), (0, 0, 1)]
+)
+def test_bins_are_as_large_as_their_number_allows(
+    frame_count: int, min_bins: int, size: int
+) -> None:
+    assert choose_frames_in_bin(frame_count, min_bins) == size

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,9 +13,9 @@ from hypothesis import strategies as st
 
 from devices.errors import FileFormatError, LoadTraceError, UsageError
 from storage.formats.load_trace import read_load_to_emulate
-from storage.formats.readers.registry import read_table
+from storage.formats.readers.registry import TABLE_FORMATS, TEXT, read_table
 from storage.formats.readers.table import ForceTable
-from storage.formats.readers.text import TextOptions
+from storage.formats.readers.text import FORM, TextOptions
 from storage.formats.reference import ReferenceOptions, read_reference
 
 PLAIN = "Time,Fz\n0.00,0.5\n0.01,-12.25\n0.02,1e3\n"
@@ -287,6 +288,11 @@ def test_columns_that_no_line_names_are_numbered(tmp_path: Path) -> None:
     assert "no line names its columns: they are numbered from 1 on" in found.notes
     with pytest.raises(FileFormatError, match="or, without times, state --rate-hz"):
         read_reference(path, ReferenceOptions({"grf_n": "column2"}, {"grf": "N"}, "+"))
+
+
+def test_the_expected_form_names_the_endings_of_all_other_formats() -> None:
+    others = {ending for one in TABLE_FORMATS for ending in one.endings if one is not TEXT}
+    assert set(re.findall(r"\.\w+", FORM)) == others
 
 
 def test_text_options_are_for_texts_only(tmp_path: Path) -> None:

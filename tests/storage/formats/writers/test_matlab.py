@@ -16,6 +16,7 @@ from scipy.io import loadmat
 from devices.frames import NO_SERVO_COUNTS, NOT_READ
 from storage.formats.export import make_sealed_export
 from storage.formats.slice import NO_OPTIONS, Slice
+from storage.formats.writers import matlab
 from storage.formats.writers.matlab import MATLAB
 from storage.schema import CONTACT_UNKNOWN
 from storage.sessions import reader as reader_module
@@ -113,6 +114,14 @@ def test_a_matrix_is_given_away_piece_by_piece_and_is_the_same(
         export = make_sealed_export(reader, Slice(None, None, ("force_n",)), options=NO_OPTIONS)
         assert 7 * 4 in {len(chunk) for chunk in MATLAB.encode(export)}
     assert written(sealed) == whole
+
+
+def test_a_matrix_of_another_length_than_its_head_states_is_no_file(
+    sealed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(matlab, "_read_instants", lambda _: {"t_ns": np.zeros(ROWS - 1)})
+    with pytest.raises(RuntimeError, match="its head states"):
+        written(sealed)
 
 
 @pytest.mark.in_turn
