@@ -39,6 +39,7 @@ from storage.wire import encode_frames
 from tests.builders.arrays import PERIOD_NS, UNLOADED_COUNTS, make_array
 from tests.builders.calibrations import make_calibration
 from tests.builders.frames import make_frames
+from tests.builders.hello import make_hello
 from tests.service.recording import Recording
 from tests.service.running import Running
 from tests.waiting import PATIENCE_S, until
@@ -95,22 +96,6 @@ class Spoken:
     def recv(self, timeout: float | None = None) -> str:
         """The next message, without its checksum, which has to be right."""
         return strip_text_crc(self._socket.recv(timeout=timeout))
-
-
-def make_hello(info: ArrayInfo, calibration: Calibration | None = None, **changes: Any) -> Hello:
-    """Return the hello of a node that has no frames yet."""
-    content: dict[str, Any] = {
-        "protocol": PROTOCOL,
-        "array_info": info,
-        "stored": (),
-        "next_seq": 0,
-        "t_mono_ns": 0,
-        "scene": {"name": "test"},
-        "emulated": False,
-        "calibration": calibration,
-        "calibration_problem": None if calibration else "for this test",
-    }
-    return Hello(**(content | changes))
 
 
 class FakeNode:
@@ -177,13 +162,15 @@ class FakeNode:
         if calibration == "by hand":
             calibration = make_calibration(*self.info.serials)
         content: dict[str, Any] = {
+            "array_info": self.info,
+            "calibration": calibration,
             "stored": ((0, self.seq - 1),) if self.seq else (),
             "next_seq": self.seq,
             "t_mono_ns": time.monotonic_ns(),
             "t_ns_first": int(self.sent[0].t_ns[0]) if self.sent else 0,
             "emulated": self.is_emulated,
         }
-        return make_hello(self.info, calibration, **(content | changes))
+        return make_hello(**(content | changes))
 
     def connect(self, **changes: Any) -> list[tuple[int, int | None]]:
         """Connect and say hello, then how the clocks differ; gives what the server lacks."""

@@ -69,8 +69,10 @@ def before_each_sync_of_frames(monkeypatch: pytest.MonkeyPatch, act: Callable[[]
     monkeypatch.setattr(os, "fsync", fsync)
 
 
-def flip_byte(path: Path, at: float = 0.5, bits: int = 1) -> None:
-    """Change a byte of a file: that of this number, or at this part of its length."""
-    content = bytearray(path.read_bytes())
-    content[at if isinstance(at, int) else int(len(content) * at)] ^= bits
-    path.write_bytes(content)
+def flip_bits(path: Path, at: int | None = None, bits: int = 1) -> None:
+    """Flip bits of one byte of a file where it stands, by default of the middle one."""
+    with path.open("r+b") as file:
+        file.seek(path.stat().st_size // 2 if at is None else at)
+        (byte,) = file.read(1)
+        file.seek(-1, os.SEEK_CUR)
+        file.write(bytes([byte ^ bits]))

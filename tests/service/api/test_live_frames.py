@@ -184,6 +184,20 @@ def test_one_of_several_nodes_has_to_be_named(
     assert (code, "bench" in reason, "other" in reason) == (1008, True, True)
 
 
+def test_a_stream_resumed_in_the_middle_of_a_piece_has_the_same_bits(
+    running: Running, tared: FakeNode
+) -> None:
+    with subscribe(running) as whole:
+        tared.send(40, [20.0, 60.0], alive=True)
+        tared.send(160, [30.0, 50.0], alive=True)
+        whole.until(tared.seq - 10)
+    n = len(whole.seqs)
+    for at in (1, 8, 45, n - 15):
+        resumed = resume(tared, whole.seqs[at], whole.seqs[-1])
+        table = resumed.table().slice(0, n - at)
+        assert find_differences(table, whole.table().slice(at)) == {}, at
+
+
 def test_recomputed_frames_have_the_bits_tares_and_calibrations_of_live_ones(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:

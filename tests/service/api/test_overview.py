@@ -19,7 +19,7 @@ from storage.verify.session import verify_session
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.recording import Recording
 from tests.service.running import Running, assert_refused, content_of
-from tests.storage.faulty_disk import flip_byte, refusing
+from tests.storage.faulty_disk import flip_bits, refusing
 from tests.waiting import until
 
 ARROW = "application/vnd.apache.arrow.stream"
@@ -54,6 +54,20 @@ def hopped(shared_tared: FakeNode) -> Recording:
     node.deliver(199, [0.0, 0.0])
     node.finish(session)
     return session
+
+
+def test_no_zoom_hides_a_peak(hopped: Recording) -> None:
+    true = read_frames(hopped, "grf_n", "force_n")
+    for points, frames_in_bin in ((1, 64), (20, 64), (100, 4), (1400, 1), (8000, 1)):
+        overview = get(hopped, points=points)
+        columns = overview["columns"]
+        assert overview["frames_in_bin"] == frames_in_bin, points
+        assert sum(columns["frames"]) == 1400, points
+        assert len(columns["frames"]) >= min(points, 1400)
+        highest_n = max(value for value in columns["grf_n_max"] if value is not None)
+        assert highest_n == pytest.approx(float(np.nanmax(true["grf_n"])), abs=1e-5), points
+        lowest_n = min(columns["force_n_1_min"])
+        assert lowest_n == pytest.approx(float(true["force_n"][:, 1].min()), abs=1e-5), points
 
 
 def test_bins_of_the_full_zoom_are_the_frames(hopped: Recording) -> None:
@@ -125,7 +139,7 @@ def test_a_missing_or_damaged_overview_is_rebuilt(
     path.unlink()
     assert get(hopped, points=20) == before
     assert path.read_bytes() == written
-    flip_byte(path)
+    flip_bits(path)
     assert any("overview.arrow" in text for text in verify_session(hopped.folder).problems)
     assert get(hopped, points=20) == before
     assert path.read_bytes() == written

@@ -30,7 +30,7 @@ from storage.verify.session import verify_session
 from tests.service.api.sealed import Sealed
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import Running, assert_refused
-from tests.storage.faulty_disk import flip_byte
+from tests.storage.faulty_disk import flip_bits
 from tests.waiting import PATIENCE_S
 
 JSON = {"Content-Type": "application/json"}
@@ -249,7 +249,7 @@ def test_a_session_is_verified_and_not_changed(running: Running, tared: FakeNode
     assert (found["problems"], found["complete"]) == ([], True)
     assert found["sha256"] == session.now()["sha256"]
     for name in ("frames.parquet", "markers.parquet", "clock.parquet"):
-        flip_byte(session.folder / name)
+        flip_bits(session.folder / name)
         before = {one.name: one.read_bytes() for one in session.folder.iterdir()}
         found = http.get(url).json()
         assert any(name in problem for problem in found["problems"])
@@ -292,7 +292,7 @@ def test_no_answer_names_the_data_folder(
     folders = [session.folder, running.data / "nodes" / "bench"]
     for path in (path for folder in folders for path in folder.rglob("*") if path.is_file()):
         if path.name != "session.json":
-            flip_byte(path, bits=0xFF)
+            flip_bits(path, bits=0xFF)
     other = session.folder.with_name("20200101T000000Z-00000a")
     other.mkdir()
     (other / "session.json").write_text("{")

@@ -1,4 +1,4 @@
-"""Takes: one session of each node under one name, and all sessions in one file."""
+"""Takes: one session of each node under one name; several sessions in one file or one zip."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.recording import Recording
 from tests.service.running import Running, assert_refused
 from tests.service.takes import Take
-from tests.storage.faulty_disk import failing_if, flip_byte, refusing
+from tests.storage.faulty_disk import failing_if, flip_bits, refusing
 from tests.storage.formats.writers.readers import said_in
 
 
@@ -302,11 +302,11 @@ def test_clients_download_a_take_whole_or_not_at_all(take: Take, tmp_path: Path)
 # --- several sessions in one zip file -------------------------------------------------------------
 
 
-FILES = {"frames.parquet", "session.json"}
+ZIPPED_FILES = {"frames.parquet", "session.json"}
 
 
 @pytest.fixture
-def two(tared: FakeNode) -> list[Recording]:
+def two_sealed(tared: FakeNode) -> list[Recording]:
     sessions = []
     for force_n in (20.0, 60.0):
         session = tared.record(name=f"at {force_n} N")
@@ -316,7 +316,7 @@ def two(tared: FakeNode) -> list[Recording]:
     return sessions
 
 
-def get(running: Running, *ids: str) -> httpx.Response:
+def get_zip(running: Running, *ids: str) -> httpx.Response:
     return running.http.get("/sessions/zip", params={"ids": ",".join(ids)})
 
 
@@ -342,7 +342,7 @@ def test_any_date_of_a_file_is_sent(
 ) -> None:
     folder = tmp_path / "20200101T000000Z-00000a"
     folder.mkdir()
-    for name in FILES:
+    for name in ZIPPED_FILES:
         (folder / name).write_bytes(name.encode())
     sealed = ZippedSession(folder, compute_sha256(folder / "frames.parquet"))
     date_files(monkeypatch, dated_s)
@@ -354,22 +354,24 @@ def test_any_date_of_a_file_is_sent(
     with zipfile.ZipFile(io.BytesIO(content)) as file:
         assert file.testzip() is None
         for entry in file.infolist():
-            assert entry.filename.split("/")[1] in FILES
+            assert entry.filename.split("/")[1] in ZIPPED_FILES
             years = entry.date_time[0]
             assert 1980 <= years <= 2107
             assert (years < 2000) == (dated_s < 946_684_800)
 
 
 def test_a_failure_before_the_first_byte_is_an_error(
-    two: list[Recording], monkeypatch: pytest.MonkeyPatch
+    two_sealed: list[Recording], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(zipfile.ZipFile, "open", refusing(OSError, errno.EIO, "Input/output error"))
-    answer = get(two[0].running, two[0].id)
+    answer = get_zip(two_sealed[0].running, two_sealed[0].id)
     assert_refused(answer, 507, "Input/output error")
 
 
-def test_a_zip_has_the_files_of_its_sessions(two: list[Recording], tmp_path: Path) -> None:
-    answer = get(two[0].running, *(session.id for session in two), two[0].id)
+def test_a_zip_has_the_files_of_its_sessions(two_sealed: list[Recording], tmp_path: Path) -> None:
+    answer = get_zip(
+        two_sealed[0].running, *(session.id for session in two_sealed), two_sealed[0].id
+    )
     assert answer.status_code == 200
     assert answer.headers["content-type"] == "application/zip"
     assert 'filename="foottile-2-sessions.zip"' in answer.headers["content-disposition"]
@@ -377,31 +379,35 @@ def test_a_zip_has_the_files_of_its_sessions(two: list[Recording], tmp_path: Pat
         assert file.testzip() is None
         names = file.namelist()
         assert len(names) == len(set(names))
-        for session in two:
+        for session in two_sealed:
             files = {name.split("/")[1] for name in names if name.startswith(f"{session.id}/")}
-            assert files >= FILES
+            assert files >= ZIPPED_FILES
             for name in files:
                 entry = f"{session.id}/{name}"
                 assert file.read(entry) == (session.folder / name).read_bytes(), entry
                 assert file.getinfo(entry).compress_type == zipfile.ZIP_STORED
         file.extractall(tmp_path)
-    for session in two:
+    for session in two_sealed:
         assert verify_session(tmp_path / session.id).problems == []
 
 
-def test_a_session_without_a_whole_file_is_refused(two: list[Recording], tared: FakeNode) -> None:
-    running = two[0].running
+def test_a_session_without_a_whole_file_is_refused(
+    two_sealed: list[Recording], tared: FakeNode
+) -> None:
+    running = two_sealed[0].running
     recording = tared.record()
-    assert_refused(get(running, two[0].id, recording.id), 409, recording.id, "recording")
-    assert_refused(get(running, "20200101T000000Z-000000"), 404, "20200101T000000Z-000000")
-    assert_refused(get(running, "../trash"), 404)
-    assert_refused(get(running, " , "), 422, "0 sessions")
-    assert_refused(get(running, *(f"a{i}" for i in range(1001))), 422, "1001 sessions")
+    assert_refused(get_zip(running, two_sealed[0].id, recording.id), 409, recording.id, "recording")
+    assert_refused(get_zip(running, "20200101T000000Z-000000"), 404, "20200101T000000Z-000000")
+    assert_refused(get_zip(running, "../trash"), 404)
+    assert_refused(get_zip(running, " , "), 422, "0 sessions")
+    assert_refused(get_zip(running, *(f"a{i}" for i in range(1001))), 422, "1001 sessions")
     assert running.http.get("/sessions/zip").status_code == 422
-    running.http.delete(two[1].url)
-    assert_refused(get(running, two[0].id, two[1].id), 404, two[1].id, "trash")
-    (two[0].folder / "frames.parquet").unlink()
-    assert_refused(get(running, two[0].id), 404, "is missing")
+    running.http.delete(two_sealed[1].url)
+    assert_refused(
+        get_zip(running, two_sealed[0].id, two_sealed[1].id), 404, two_sealed[1].id, "trash"
+    )
+    (two_sealed[0].folder / "frames.parquet").unlink()
+    assert_refused(get_zip(running, two_sealed[0].id), 404, "is missing")
 
 
 def read_until_cut(running: Running, *ids: str) -> bytes:
@@ -417,26 +423,28 @@ def read_until_cut(running: Running, *ids: str) -> bytes:
     pytest.fail("it did not break off")
 
 
-def test_a_zip_of_a_damaged_session_does_not_open(two: list[Recording]) -> None:
-    flip_byte(two[1].folder / "frames.parquet")
+def test_a_zip_of_a_damaged_session_does_not_open(two_sealed: list[Recording]) -> None:
+    flip_bits(two_sealed[1].folder / "frames.parquet")
     with pytest.raises(zipfile.BadZipFile):
-        zipfile.ZipFile(io.BytesIO(read_until_cut(two[0].running, two[0].id, two[1].id)))
+        zipfile.ZipFile(
+            io.BytesIO(read_until_cut(two_sealed[0].running, two_sealed[0].id, two_sealed[1].id))
+        )
 
 
 def test_a_zip_of_a_session_deleted_meanwhile_does_not_open(
-    two: list[Recording], monkeypatch: pytest.MonkeyPatch
+    two_sealed: list[Recording], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    running = two[0].running
+    running = two_sealed[0].running
     put = service.api.routes.downloads.zips._put
 
     def delete_and_put(*arguments: Any) -> Any:
-        if arguments[2].parent.name == two[1].id:
+        if arguments[2].parent.name == two_sealed[1].id:
             with running.client() as http:
-                assert http.delete(two[1].url).status_code == 204
+                assert http.delete(two_sealed[1].url).status_code == 204
         return put(*arguments)
 
     monkeypatch.setattr(service.api.routes.downloads.zips, "_put", delete_and_put)
-    content = read_until_cut(running, two[0].id, two[1].id)
+    content = read_until_cut(running, two_sealed[0].id, two_sealed[1].id)
     assert len(content) > 1000  # the first one had gone out
     with pytest.raises(zipfile.BadZipFile):
         zipfile.ZipFile(io.BytesIO(content))

@@ -20,7 +20,7 @@ from storage.schema import wire_schema
 from storage.wire import encode_frames
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.frames import make_frames
-from tests.service.fake_node import make_hello
+from tests.builders.hello import make_hello
 
 PER_MESSAGE = 5
 OLD, NEW = "a" * 32, "b" * 32
@@ -50,7 +50,7 @@ class Told:
         self.node = ServerNode(self.folder / "node", self.folder / "journal", self.hello())
 
     def hello(self, **changes: Any) -> Hello:
-        facts: dict[str, Any] = {"info": self.info[NEW], "t_mono_ns": 10**12}
+        facts: dict[str, Any] = {"array_info": self.info[NEW], "t_mono_ns": 10**12}
         return make_hello(**(facts | changes))
 
     def earlier(self, **changes: Any) -> EarlierStream:
@@ -260,6 +260,10 @@ def test_a_stream_can_come_until_the_node_does_not_mention_it(told: Told) -> Non
     told.restart()  # a new server has heard nothing
     assert told.node.streams[OLD].obtainable == Intervals([(0, NO_END)])
     told.connect()
+    assert not told.node.streams[OLD].obtainable
+    told.connect(earlier=(told.earlier(stored=((0, 9),), next_seq=10),))
+    assert told.node.streams[OLD].obtainable == Intervals([(0, 9)])
+    told.connect()  # to the same server as before
     assert not told.node.streams[OLD].obtainable
 
 

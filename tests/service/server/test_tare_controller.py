@@ -13,14 +13,16 @@ import pytest
 from devices.errors import StorageError, TareError
 from devices.flags import FrameFlag, TileFlag
 from devices.frames import FrameBatch
+from service.estimation.tare.tare import Tare
 from service.server.node import ServerNode
+from service.sessions.tares import RecordedTare
 from storage.intervals import Intervals
 from storage.schema import wire_schema
 from storage.wire import encode_frames
 from tests.builders.arrays import COUNT_KPA, UNLOADED_KPA, UTC_NS, make_array
 from tests.builders.calibrations import make_calibration
 from tests.builders.frames import make_frames
-from tests.service.fake_node import make_hello
+from tests.builders.hello import make_hello
 from tests.storage.faulty_disk import NO_SPACE, refusing
 
 PERIOD_NS = 10_000_000  # 100 Hz
@@ -116,11 +118,11 @@ class Foot:
         return self.node.estimator.tare_controller.missing_tare_reason
 
     @property
-    def tare(self) -> Any:
+    def tare(self) -> Tare | None:
         return self.node.estimator.live.tare_in_use_unless_lost
 
     @property
-    def tares(self) -> list[Any]:
+    def tares(self) -> list[RecordedTare]:
         return [*self.node.estimator.tare_history.all_tares_with_undone]
 
     @property
@@ -129,6 +131,7 @@ class Foot:
 
     @property
     def offset_counts(self) -> list[float]:
+        assert self.tare is not None
         return list((self.tare.baseline_kpa - UNLOADED_KPA) / COUNT_KPA)
 
 
@@ -215,6 +218,7 @@ def test_without_a_lead_that_could_be_used_the_tare_of_before_stays_and_that_is_
     foot: Foot,
 ) -> None:
     before = foot.tare
+    assert before is not None
     again = {"stream_id": "1" * 32}
     info = foot.hello.array_info.model_copy(update=again)
     foot.hello = foot.hello.model_copy(update={"array_info": info})
@@ -222,6 +226,7 @@ def test_without_a_lead_that_could_be_used_the_tare_of_before_stays_and_that_is_
     foot.seq = 0
     foot.live(1.0, lead=True, silent=0)
     foot.live(1.0)
+    assert foot.tare is not None
     assert foot.tare.t_ns == before.t_ns
     assert "tile T01 has 0 readable frames" in str(foot.problem)
 

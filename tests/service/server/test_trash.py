@@ -20,13 +20,8 @@ from storage.sessions.folder import DELETED_PREFIX, SessionsFolder
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
 from tests.service.running import Running, assert_refused, closed, receive_live
-from tests.storage.faulty_disk import flip_byte, refusing
+from tests.storage.faulty_disk import flip_bits, refusing
 from tests.waiting import until
-
-
-def seal(node: FakeNode) -> Recording:
-    session = node.record_sealed(20)
-    return session
 
 
 def leave_pending(node: FakeNode) -> Recording:
@@ -49,7 +44,7 @@ def list_ids(running: Running, path: str) -> list[str]:
 def test_pages_are_told_of_a_deleted_session_and_it_is_restored_unchanged(
     running: Running, tared: FakeNode
 ) -> None:
-    session = seal(tared)
+    session = tared.record_sealed(20)
     before = session.now()
     with running.socket("/api/v1/live") as live:
         receive_live(live, lambda each: each["type"] == "hello")
@@ -70,10 +65,10 @@ def test_pages_are_told_of_a_deleted_session_and_it_is_restored_unchanged(
 
 
 def test_emptying_the_trash_deletes_and_counts(running: Running, tared: FakeNode) -> None:
-    kept = seal(tared)
+    kept = tared.record_sealed(20)
     size = 0
     for _ in range(2):
-        session = seal(tared)
+        session = tared.record_sealed(20)
         folder = session.folder
         size += sum(path.stat().st_size for path in folder.iterdir())
         running.http.delete(session.url)
@@ -144,7 +139,7 @@ def test_a_pending_session_needs_its_frames_until_the_trash_is_emptied(
 def test_an_interrupted_delete_leaves_a_session_in_one_place(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    session = seal(tared)
+    session = tared.record_sealed(20)
     cut_off = refusing(StorageError, "No space left")
     move = SessionsFolder.move_to
     monkeypatch.setattr(SessionsFolder, "move_to", cut_off)
@@ -168,7 +163,7 @@ def test_an_interrupted_delete_leaves_a_session_in_one_place(
 def test_a_half_deleted_session_is_removed_at_the_next_start(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    session = seal(tared)
+    session = tared.record_sealed(20)
     running.http.delete(session.url)
     monkeypatch.setattr(
         service.server.server, "delete_and_count_bytes", lambda folders: 0
@@ -231,12 +226,16 @@ def test_a_recording_session_is_neither_deleted_nor_abandoned(
 def damage(running: Running, node: FakeNode) -> None:
     """Flip a bit in the middle of the node's journal."""
     [path] = (running.data / "journal" / "bench" / node.stream_id).glob("*.arrows")
-    flip_byte(path, bits=0x10)
+    flip_bits(path, bits=0x10)
 
 
-@pytest.mark.parametrize("is_deleted", [False, True], ids=["sent again", "deleted by the node"])
-def test_damaged_frames_are_requested_again_and_else_lost(
-    running: Running, tared: FakeNode, is_deleted: bool
+@pytest.mark.parametrize(
+    ("is_deleted", "expected"),
+    [(False, (True, 200, {})), (True, ("lossy", 190, {"corrupt": 10}))],
+    ids=["sent again", "deleted by the node"],
+)
+def test_damaged_frames_are_requested_again_and_lost_if_the_node_has_deleted_them(
+    running: Running, tared: FakeNode, *, is_deleted: bool, expected: tuple[Any, ...]
 ) -> None:
     session = tared.record()
     tared.deliver(200)
@@ -253,7 +252,6 @@ def test_damaged_frames_are_requested_again_and_else_lost(
         assert 70 <= first <= last <= 269
         tared.send_again(tared.all_sent().slice_rows(first, last + 1))
     done = session.sealed()
-    expected = ("lossy", 190, {"corrupt": 10}) if is_deleted else (True, 200, {})
     assert (done["complete"], done["frames"], done["lost"]) == expected
 
 
@@ -285,7 +283,7 @@ def test_a_restarted_server_seals_unsealed_sessions(
 def test_half_written_files_of_dead_processes_are_removed_at_the_start(
     running: Running, tared: FakeNode
 ) -> None:
-    session = seal(tared)
+    session = tared.record_sealed(20)
     folder = session.folder
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait(20)

@@ -1,4 +1,7 @@
-"""Wrong options, scenes and files: one line, the right exit code, and no file is changed."""
+"""What no command does: wrong requests, half a file on a full disk, an output over an input.
+
+Each is refused with a reason, the right exit code, and no file changed.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +23,8 @@ GOOD_TRACE = "time_s,fz_n,cop_x_m,cop_y_m\n" + "".join(
 LONE = "there is no session in these places, but files by themselves: a.parquet and 1 more"
 PRESET = "--calibration paper-eq2-shape"
 ESTIMATE = "estimate s.parquet --out e.parquet"
+MANY = "estimate 'lone/*.parquet' --out o"
+UNNAMED = "session and reference are not named, or twice"
 STAND = "simulate --scene standing"
 WEIGH = "calibrate --out cal.json"
 OF_A_PLATE = ("--per-tile", "--shear", "--map grf_n=Fz", "--reference-gain-sigma 0.1")
@@ -46,7 +51,9 @@ REFUSED: tuple[tuple[str | int, ...], ...] = (
     (f"{STAND} --load wrong.csv --out s2.parquet", 1, "wrong.csv", "time_s", "time_ms"),
     (f"{STAND} --load cells.csv --out s2.parquet", 1, "2 cell columns", "4 tiles"),
     (f"{STAND} --load bytes.csv --out s2.parquet", 1, "bytes.csv", "cannot be read", "expected"),
-    *((f"simulate --scene indentation --tiles '{tiles}'", 2) for tiles in ("", "T01,T01", "../x")),
+    ("simulate --scene indentation --tiles ''", 2, "tile.0.serial = ''", "at least 1 item"),
+    ("simulate --scene indentation --tiles T01,T01", 2, "'T01' appears twice"),
+    ("simulate --scene indentation --tiles ../x", 2, "tile.0.serial = '../x'", "pattern"),
     (ESTIMATE, 1, "--calibration"),
     (f"{ESTIMATE} --calibration gone.json", 1, "gone.json", "paper-eq2-shape"),
     (f"{ESTIMATE} --calibration other.json", 1, "T01", "T09", "foottile calibrate"),
@@ -60,29 +67,29 @@ REFUSED: tuple[tuple[str | int, ...], ...] = (
     (f"{ESTIMATE} {PRESET} --scene insole", 2, "T08"),
     ("estimate no.parquet --out e.parquet", 1, "no.parquet"),
     ("estimate gone.parquet --out e.parquet", 1, "gone.parquet"),
-    ("estimate --out o", 2),
+    ("estimate --out o", 2, "no session is named", "--manifest"),
     ("estimate lone nowhere --out o", 2, "nowhere"),
-    ("estimate s.parquet --out o --manifest list.csv", 2),
-    ("estimate --out o --manifest gone.csv", 2),
-    ("estimate 'lone/*.parquet' --out o --jobs 1 --scheduler tcp://127.0.0.1:1", 2),
-    ("estimate 'lone/*.parquet' --out o --scene gone", 2),
-    ("estimate . --out o", 2),
+    ("estimate s.parquet --out o --manifest list.csv", 2, "--manifest and sessions exclude"),
+    ("estimate --out o --manifest gone.csv", 2, "--manifest 'gone.csv' cannot be read"),
+    (f"{MANY} --jobs 1 --scheduler tcp://127.0.0.1:1", 2, "--jobs and --scheduler exclude"),
+    (f"{MANY} --scene gone", 2, "no file 'gone' and no built-in scene"),
+    ("estimate . --out o", 2, LONE.replace("a.parquet", "no.parquet")),
     ("estimate empty --out o", 2, "there is no session in these places"),
     ("estimate lone --out o", 2, LONE),
     (f"{WEIGH} s.parquet", 1, "not an indentation"),
     *((f"{WEIGH} s.parquet {option}", 2, "--reference") for option in OF_A_PLATE),
     (f"{WEIGH} s.parquet s.parquet --reference load.csv", 2, "one session"),
-    (f"{WEIGH} s.parquet --reference load.csv --plot c.png", 2),
+    (f"{WEIGH} s.parquet --reference load.csv --plot c.png", 2, "without --plot"),
     (f"{WEIGH} --live", 2, "--live goes with --tile"),
     (f"{WEIGH} --tile T01", 2, "no recording is named"),
     (f"{WEIGH} x.parquet --tile T01", 2, "go with --live"),
     (f"{WEIGH} --live --tile T01 --weights 200g,much", 2, "'much' is no weight"),
-    ("compare", 2),
-    ("compare s.parquet", 2),
-    ("compare --manifest list.csv", 2),
-    ("compare --manifest list.csv --out o --reference x.csv", 2),
-    ("compare --manifest list.csv --out o --units grf", 2),
-    ("compare --manifest list.csv --out o --decimal ';'", 2),
+    ("compare", 2, UNNAMED),
+    ("compare s.parquet", 2, UNNAMED),
+    ("compare --manifest list.csv", 2, UNNAMED),
+    ("compare --manifest list.csv --out o --reference x.csv", 2, UNNAMED),
+    ("compare --manifest list.csv --out o --units grf", 2, "--units 'grf'; expected NAME=VALUE"),
+    ("compare --manifest list.csv --out o --decimal ';'", 2, "--decimal ';'; expected a comma"),
     ("benchmark --out o --scene nowhere", 2, "nowhere"),
     ("benchmark --out o --scene rolling --scene rolling", 2, "each scene once"),
     ("benchmark --out o --scene rolling --seconds 0", 2, "--seconds 0"),
@@ -93,25 +100,25 @@ REFUSED: tuple[tuple[str | int, ...], ...] = (
     ("benchmark --out o --family broad --scene rolling", 2, "--scene and --family broad"),
     ("benchmark --out o --family broad --full-only", 2, "--full-only and --family broad"),
     ("doctor", 2, "--bus"),
-    ("doctor --bus /dev/i2c-99", 1),
-    ("domes --load-n -1", 2),
-    ("query 'SELECT nope FROM stances' data", 2),
-    ("query 'DELETE FROM stances' data", 2),
-    ("query 'SELECT 1 AS a' nowhere", 2),
-    ("query 'SELECT 1 AS a' data --json --csv", 2),
-    ("query 'SELECT 1 AS a' data --out answer.txt", 2),
-    ("query 'SELECT 1 AS a' data --data data", 2),
+    ("doctor --bus /dev/i2c-99", 1, "/dev/i2c-99", "ENOENT", "dtparam=i2c_arm=on"),
+    ("domes --load-n -1", 2, "--load-n -1.0 is not a load", "above 0"),
+    ("query 'SELECT nope FROM stances' data", 2, 'column "nope" not found'),
+    ("query 'DELETE FROM stances' data", 2, "the question is DELETE; expected one SELECT"),
+    ("query 'SELECT 1 AS a' nowhere", 2, "no session or folder 'nowhere'"),
+    ("query 'SELECT 1 AS a' data --json --csv", 2, "--csv, --json and --out exclude"),
+    ("query 'SELECT 1 AS a' data --out answer.txt", 2, "'answer.txt'", "ends with .parquet"),
+    ("query 'SELECT 1 AS a' data --data data", 2, "--data and places exclude"),
     ("query 'SELECT 1 AS a' empty", 2, "there is no session in these places"),
     ("query 'SELECT 1 AS a' lone", 2, LONE),
     ("export s.parquet --format xlsx --out x", 2, "one of parquet, arrow, csv"),
     ("export s.parquet --format csv --columns nonsense --out x", 2, "no column 'nonsense'"),
     ("export nothere --format csv --out x", 2, "`foottile pull ID"),
-    ("export nosuch://a/b --out o --format csv", 2),
-    ("verify", 2),
+    ("export nosuch://a/b --out o --format csv", 2, "nosuch", "Install the package that opens it"),
+    ("verify", 2, "no session is named", "--manifest"),
     ("verify nothere", 2, "`foottile pull ID"),
-    ("verify 'empty/x*'", 2),
-    ("recover nothere", 2),
-    ("recover lone", 2),
+    ("verify 'empty/x*'", 2, "no session or folder 'empty/x*'"),
+    ("recover nothere", 2, "no data folder 'nothere'", "`journal` and `sessions`"),
+    ("recover lone", 2, "no data folder 'lone'", "`journal` and `sessions`"),
     ("node --scene leg.toml", 2, "no file 'leg.toml' and no built-in scene"),
     ("node --scene .", 2, "scene '.' cannot be read"),
     ("node --scene standing --server nonsense", 2, "no server address"),
@@ -164,19 +171,27 @@ def place(simulate: Simulate, tmp_path: Path) -> Path:
     return tmp_path
 
 
+def read_contents(folder: Path) -> dict[Path, bytes | None]:
+    """Return the bytes of each file by its path; None for a folder."""
+    return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
+
+
 @pytest.mark.parametrize("refused", REFUSED, ids=lambda refused: refused[0])
 def test_a_wrong_command_is_refused_with_its_reason_and_changes_no_file(
     run: Run, place: Path, monkeypatch: pytest.MonkeyPatch, refused: tuple[Any, ...]
 ) -> None:
-    monkeypatch.setenv("XDG_DATA_HOME", str(place.with_name(f"{place.name}-home")))
+    home = place.with_name(f"{place.name}-home")
+    monkeypatch.setenv("XDG_DATA_HOME", str(home))
     typed, code, *says = refused
-    before = sorted(place.rglob("*"))
+    before = read_contents(place)
     outcome = run(*shlex.split(typed))
     outcome.fails(code, *says)
     lines = outcome.err.splitlines()
     assert len(lines) == 1 or lines[0].startswith("Usage: ")
     assert lines[-1].startswith(("foottile: ", "Error: "))
-    assert sorted(place.rglob("*")) == before
+    assert "Traceback" not in outcome.err
+    assert read_contents(place) == before
+    assert not [path for path in home.rglob("*") if path.is_file()]
 
 
 def test_a_full_disk_is_an_error_and_leaves_nothing(

@@ -1,4 +1,4 @@
-"""The main path: rig recording, calibration, session, estimate."""
+"""`simulate`, `calibrate`, `estimate`: what is in a session, and what a second estimate says."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from service.offline.simulation import START_NS
 from storage.schema import ESTIMATE_COLUMNS, MEASURED_COLUMNS, TRUTH_COLUMNS, Column
 from storage.sessions.reader import SealedFileReader
 from tests.service.cli.outcome import Run, Simulate, faulty, scene_text, short_rig, static_only
-from tests.storage.faulty_disk import flip_byte
+from tests.storage.faulty_disk import flip_bits
 
 pytestmark = pytest.mark.slow
 
@@ -247,7 +247,7 @@ def test_a_part_with_damaged_estimates_is_estimated_again(run: Run) -> None:
     group = pq.read_metadata("s.parquet").row_group(0)
     (grf,) = (c for c in map(group.column, range(group.num_columns)) if c.path_in_schema == "grf_n")
     at = grf.data_page_offset + grf.total_compressed_size // 2
-    flip_byte(Path("s.parquet"), at, 0xFF)
+    flip_bits(Path("s.parquet"), at, 0xFF)
     outcome = run(
         "estimate", "s.parquet", "--end-s", 2, "--out", "part.parquet", "--json"
     ).succeeds()
@@ -274,21 +274,3 @@ def test_a_session_is_estimated_with_a_bench_of_its_own_family(
     again = ("estimate", "s.parquet", "--calibration", "emulated-rig", "--out", "e.parquet")
     run(*again).fails(1, "no bench here")
     assert asked == [(family, 5)]
-
-
-def test_files_of_a_plate_are_named_with_the_injected_truth(run: Run, tmp_path: Path) -> None:
-    asked = ("--scene", "standing", "--seconds", "1.5", "--no-estimates", "--force-plate", "fp.csv")
-    done = run("simulate", *asked).succeeds()
-    assert "fp.csv: the force plate; fp.injected.json: what was injected" in done.out
-    assert "instrument" in json.loads((tmp_path / "fp.injected.json").read_text())
-    assert run("simulate", *asked, "--json").printed()["plates"] == ["fp.csv"]
-
-
-def test_domes_names_one_for_a_load_and_marks_estimates(run: Run) -> None:
-    outcome = run("domes", "--load-n", 24)
-    assert outcome.code == 0
-    assert "For 24 N: v60-11 (paper)." in outcome.out
-    assert outcome.out.count("estimate ") >= 5
-    assert run("domes", "--load-n", 50).code == 3
-    printed = json.loads(run("domes", "--load-n", 30, "--json").out)
-    assert (printed["dome"], printed["verdict"]) == ("v60-11", "perhaps")

@@ -26,7 +26,7 @@ from tests.builders.frames import make_frames
 from tests.service.cli.commands.test_any_value import PLACES
 from tests.service.cli.outcome import Run, Simulate
 from tests.service.recording import read_table
-from tests.storage.faulty_disk import flip_byte
+from tests.storage.faulty_disk import flip_bits
 
 ID = "20200101T000000Z-00000a"
 OTHER_ID = "20200101T000000Z-00000b"
@@ -102,7 +102,7 @@ def test_json_of_one_session_is_its_ledger(run: Run, data: Path) -> None:
 def test_damage_is_named_with_exit_code_1(run: Run, data: Path) -> None:
     run("recover", data)
     path = data / "sessions" / ID / "frames.parquet"
-    flip_byte(path, 300)
+    flip_bits(path, 300)
     for target in (path, path.parent, data):
         found = run("verify", target)
         assert found.code == 1
@@ -245,7 +245,7 @@ def test_every_other_file_of_a_data_folder_is_looked_at(run: Run, data: Path) ->
     (node / "hello.json").write_text('{"a": 1}')
     found = run("verify", data)
     assert (found.code, "damaged: nodes/bench/hello.json" in found.out) == (1, True)
-    flip_byte(node / "tares.json", 5)
+    flip_bits(node / "tares.json", 5)
     found = run("verify", data)
     assert (found.code, "damaged: nodes/bench/tares.json" in found.out) == (1, True)
 
@@ -254,7 +254,7 @@ def test_a_damaged_server_id_is_named(run: Run, data: Path) -> None:
     run("recover", data)
     for at in range(41):
         write_server_id(data / SERVER_ID_NAME, "5" * 32)
-        flip_byte(data / SERVER_ID_NAME, at)
+        flip_bits(data / SERVER_ID_NAME, at)
         found = run("verify", data)
         assert (found.code, f"damaged: {SERVER_ID_NAME}" in found.out) == (1, True), at
 

@@ -29,7 +29,7 @@ from storage.wire import encode_frames
 from tests.builders.arrays import COUNT_KPA, PERIOD_NS, UNLOADED_KPA, UTC_NS, make_array
 from tests.builders.calibrations import make_calibration, make_tare
 from tests.builders.frames import make_frames
-from tests.service.fake_node import make_hello
+from tests.builders.hello import make_hello
 
 LOST = "disk_full"
 WAITING = 6
@@ -214,7 +214,7 @@ class World:
     def _hello(self) -> Hello:
         def said(each: Taken) -> dict[str, Any]:
             return {
-                "info" if each is present else "array_info": each.info,
+                "array_info": each.info,
                 "stored": tuple(each.held),
                 "next_seq": each.taken,
                 "lost": {LOST: tuple(each.lost)} if each.lost else {},
