@@ -1,4 +1,4 @@
-"""A real nginx in front of a server: bare, and with the configuration of docs/security.md."""
+"""A real nginx in front of a server, with the configuration of docs/security.md."""
 
 from __future__ import annotations
 

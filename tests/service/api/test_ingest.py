@@ -1,4 +1,4 @@
-"""Connections of nodes: acknowledged frames are on disk, and missing ones are requested."""
+"""Connections of nodes: what is acknowledged and requested, and a bug that costs one node only."""
 
 from __future__ import annotations
 

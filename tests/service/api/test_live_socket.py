@@ -1,4 +1,4 @@
-"""Live websocket for pages: the newest frame at the page's rate."""
+"""What pages show: the newest frame at their rate, and the last seconds of a node over REST."""
 
 from __future__ import annotations
 
@@ -230,26 +230,26 @@ def test_notices_follow_nodes_and_sessions(running: Running, tared: FakeNode) ->
 # --- the last seconds of a node -------------------------------------------------------------------
 
 
-URL = "/nodes/bench/history"
+HISTORY_URL = "/nodes/bench/history"
 
 
-def get(running: Running, **query: Any) -> dict[str, Any]:
-    history: dict[str, Any] = running.http.get(URL, params=query).json()
+def get_history(running: Running, **query: Any) -> dict[str, Any]:
+    history: dict[str, Any] = running.http.get(HISTORY_URL, params=query).json()
     return history
 
 
 def wait_for_frames(running: Running, node: FakeNode) -> None:
     """Wait for all frames but those in the look-ahead."""
-    until(lambda: get(running)["seq"][-1] > node.seq - 12)
+    until(lambda: get_history(running)["seq"][-1] > node.seq - 12)
 
 
 def test_a_history_has_every_peak(running: Running, tared: FakeNode) -> None:
     before = tared.seq
-    assert get(running)["tiles"] is None
+    assert get_history(running)["tiles"] is None
     for force_n in ([10.0, 10.0], [10.0, 90.0], [10.0, 10.0]):
         tared.send(1 if force_n[1] > 10.0 else 200, force_n)
     wait_for_frames(running, tared)
-    history = get(running)
+    history = get_history(running)
     assert (history["node"], history["stream_id"]) == ("bench", tared.stream_id)
     assert history["seq_first"][0] == 0
     assert sum(history["n"]) == history["seq"][-1] + 1
@@ -260,12 +260,12 @@ def test_a_history_has_every_peak(running: Running, tared: FakeNode) -> None:
     assert min(pressed) == pytest.approx(20.0, abs=1.0)
     tared.send(100, [10.0, 90.0])
     wait_for_frames(running, tared)
-    tiles = get(running, tiles="force_n", seconds=60)["tiles"]
+    tiles = get_history(running, tiles="force_n", seconds=60)["tiles"]
     assert sum(tiles["n"]) == tiles["seq"][-1] + 1
     highs = [max(v for v in tile if v is not None) for tile in zip(*tiles["max"], strict=True)]
     assert highs == pytest.approx([10.0, 90.0], abs=1.0)
     assert all(low is None or low < 95.0 for span in tiles["min"] for low in span)
-    kpa = get(running, tiles="gauge_kpa")["tiles"]
+    kpa = get_history(running, tiles="gauge_kpa")["tiles"]
     assert max(value for span in kpa["max"] for value in span if value is not None) > 0.0
 
 
@@ -276,22 +276,22 @@ def test_a_history_ends_where_a_live_message_begins(running: Running, tared: Fak
         message = receive_live(live, lambda message: message["type"] == "frame")
     first = message["seq_first"]
     assert message["seq"] - first + 1 == message["n"]
-    assert get(running, before_seq=first, seconds=60)["seq"][-1] == first - 1
+    assert get_history(running, before_seq=first, seconds=60)["seq"][-1] == first - 1
 
 
 def test_a_new_stream_has_a_new_history(running: Running, tared: FakeNode) -> None:
-    assert get(running)["seq"] != []
+    assert get_history(running)["seq"] != []
     tared.restart()
     tared.connect()
-    history = get(running)
+    history = get_history(running)
     assert (history["stream_id"], history["seq"], history["age_ms"]) == (tared.stream_id, [], None)
     tared.send(20)
-    until(lambda: get(running)["seq"])
+    until(lambda: get_history(running)["seq"])
 
 
 @pytest.mark.parametrize(
     "query", ["seconds=0", "seconds=60.1", "before_seq=-1", "second=5", "tiles=grf_n"]
 )
 def test_a_wrong_query_is_refused(sealed: Sealed, query: str) -> None:
-    answer = sealed.running.http.get(f"{URL}?{query}")
+    answer = sealed.running.http.get(f"{HISTORY_URL}?{query}")
     assert_refused(answer, 422, query.partition("=")[0])

@@ -1,9 +1,8 @@
-"""Recording: a session has exactly its frames, whatever happens to node and server."""
+"""Recording: exactly its frames whatever happens, and repeated requests that are one recording."""
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import httpx
 import numpy as np
@@ -14,7 +13,7 @@ import service.server.recorder
 from devices.frames import FrameBatch
 from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import FakeNode, NodeOf, Play
-from tests.service.running import Running, assert_refused
+from tests.service.running import Running, assert_refused, content_of
 from tests.waiting import PATIENCE_S, until
 
 
@@ -207,24 +206,18 @@ def post(running: Running, path: str = "/sessions", **body: object) -> httpx.Res
     return running.http.post(path, json=(BODY if path == "/sessions" else {}) | body, headers=KEY)
 
 
-def content_of(answer: httpx.Response) -> dict[str, Any]:
-    assert answer.status_code == 201, answer.text
-    content: dict[str, Any] = answer.json()
-    return content
-
-
 def test_a_repeated_start_is_the_same_session(running: Running, tared: FakeNode) -> None:
-    first = content_of(post(running))
+    first = content_of(post(running), 201)
     again = post(running, subject=None, notes="")  # the defaults
-    assert content_of(again)["id"] == first["id"]
+    assert content_of(again, 201)["id"] == first["id"]
     assert again.headers["location"] == f"/api/v1/sessions/{first['id']}"
     tared.deliver(50)
     tared.finish(running.session(first["id"]))
-    assert content_of(post(running))["state"] == "sealed"
+    assert content_of(post(running), 201)["state"] == "sealed"
     tared.leave()
     running.restart()
     # The node is away, so that another session cannot begin.
-    assert content_of(post(running))["id"] == first["id"]
+    assert content_of(post(running), 201)["id"] == first["id"]
     assert [one["id"] for one in running.sessions()] == [first["id"]]
     assert running.http.post("/sessions", json=BODY).status_code == 409
 
@@ -232,21 +225,21 @@ def test_a_repeated_start_is_the_same_session(running: Running, tared: FakeNode)
 def test_simultaneous_starts_are_one_session(running: Running, tared: FakeNode) -> None:
     with ThreadPoolExecutor(8) as pool:
         answers = list(pool.map(lambda _: post(running), range(8)))
-    assert len({content_of(answer)["id"] for answer in answers}) == 1
+    assert len({content_of(answer, 201)["id"] for answer in answers}) == 1
     assert len(running.sessions()) == 1
 
 
 def test_each_key_and_each_request_without_key_is_a_session(
     running: Running, tared: FakeNode
 ) -> None:
-    ids = {content_of(post(running))["id"]}
+    ids = {content_of(post(running), 201)["id"]}
     for headers in ({}, {}, {"Idempotency-Key": "another"}):
-        ids.add(content_of(running.http.post("/sessions", json=BODY, headers=headers))["id"])
+        ids.add(content_of(running.http.post("/sessions", json=BODY, headers=headers), 201)["id"])
     assert len(ids) == 4
 
 
 def test_a_key_of_another_request_is_refused(running: Running, tared: FakeNode) -> None:
-    first = content_of(post(running))
+    first = content_of(post(running), 201)
     for answer in (
         post(running, name="another"),
         post(running, pre_roll_s=1.0),
@@ -266,19 +259,19 @@ def test_a_refused_start_is_tried_again(running: Running, node: FakeNode) -> Non
     node.connect()
     assert_refused(post(running), 409, "sends no frames")
     node.tared()
-    assert content_of(post(running))["state"] == "recording"
+    assert content_of(post(running), 201)["state"] == "recording"
 
 
 def test_a_deleted_session_does_not_begin_again(running: Running, tared: FakeNode) -> None:
-    first = content_of(post(running))
+    first = content_of(post(running), 201)
     tared.finish(running.session(first["id"]))
     running.http.delete(f"/sessions/{first['id']}")
     assert_refused(post(running), 409, "in the trash", "Restore it")
     running.http.post(f"/trash/{first['id']}/restore")
-    assert content_of(post(running))["id"] == first["id"]
+    assert content_of(post(running), 201)["id"] == first["id"]
     running.http.delete(f"/sessions/{first['id']}")
     running.http.delete("/trash")
-    assert content_of(post(running))["id"] != first["id"]
+    assert content_of(post(running), 201)["id"] != first["id"]
 
 
 def test_a_repeated_take_and_its_stops_are_one(
@@ -288,13 +281,13 @@ def test_a_repeated_take_and_its_stops_are_one(
     other.connect()
     other.tared()
     nodes = ["bench", "other", "nobody"]
-    first = content_of(post(running, "/takes", name="both", nodes=nodes))
-    again = content_of(post(running, "/takes", name="both", nodes=nodes))
+    first = content_of(post(running, "/takes", name="both", nodes=nodes), 201)
+    again = content_of(post(running, "/takes", name="both", nodes=nodes), 201)
     ids = [one["id"] for one in first["sessions"]]
     assert (again["id"], again["failed"]) == (first["id"], first["failed"])
     assert [one["id"] for one in again["sessions"]] == ids
     running.restart()
-    after = content_of(post(running, "/takes", name="both", nodes=nodes))
+    after = content_of(post(running, "/takes", name="both", nodes=nodes), 201)
     assert (after["id"], list(after["failed"])) == (first["id"], ["nobody"])
     assert len(running.sessions()) == 2
     assert_refused(post(running, "/takes", name="both"), 422, "used by another request")

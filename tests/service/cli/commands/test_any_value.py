@@ -1,4 +1,4 @@
-"""Every option of every command with values that nobody means: a sentence and a code, no more.
+"""Every command and option is in the table, and says no to absurd values in a sentence.
 
 Commands and options are found, not listed: one that is added without a place here fails a test.
 """
@@ -195,7 +195,7 @@ READ: dict[tuple[str, str], tuple[object, ...]] = {
     ),
     ("node", "ca"): ("--scene", "standing", "--server", "https://127.0.0.1:1", "--ca", "{}"),
     ("sessions", "ca"): ("--server", "https://127.0.0.1:1", "--ca", "{}"),
-    **{
+    **{  # the last --server counts
         (command, "ca"): (*COMMANDS[command], "--server", "https://127.0.0.1:1", "--ca", "{}")
         for command in ("accept-node", "pull", "stream", "invite")
     },

@@ -1,4 +1,4 @@
-"""`foottile benchmark` as a user meets it, with a preset instead of the emulated bench."""
+"""`foottile benchmark`: scenes with a preset for the bench, the broad family with made arrays."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from devices.errors import FootTileError
 from service.estimation.calibration import Calibration
 from service.offline.calibration_lookup import find_calibration
 from studies.benchmark import draws
-from studies.broad import arrays as run
+from studies.broad import arrays as broad_run
 from studies.broad.arrays import ArrayTask
 from studies.broad.results import ArrayResult, RefusedItem
 from tests.service.cli.outcome import Run, scene_text, static_only
@@ -109,7 +109,7 @@ def test_a_missing_matplotlib_is_named_with_the_extra_that_brings_it(
 BROAD = ("benchmark", "--family", "broad", "--draws", 3, "--jobs", 1, "--out", "o")
 
 
-def test_broad_writes_json_tables_and_plot(run: Run, tmp_path: Path, quick: None) -> None:
+def test_broad_writes_json_tables_and_plot(run: Run, tmp_path: Path, made_arrays: None) -> None:
     outcome = run(*BROAD, "--json")
     outcome.fails(0, "2 arrays of about 30 s CPU each")
     content = json.loads((tmp_path / "o" / "broad.json").read_text())
@@ -124,11 +124,13 @@ def test_broad_writes_json_tables_and_plot(run: Run, tmp_path: Path, quick: None
 
 
 @pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run, "run_array", made)
+def made_arrays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(broad_run, "run_array", made)
 
 
-def test_seeds_of_judgement_have_to_be_asked_for(run: Run, tmp_path: Path, quick: None) -> None:
+def test_seeds_of_judgement_have_to_be_asked_for(
+    run: Run, tmp_path: Path, made_arrays: None
+) -> None:
     run(*BROAD, "--seeds", "judgement").fails(0)
     assert "seeds of judgement" in (tmp_path / "o" / "broad.md").read_text()
 
@@ -136,8 +138,6 @@ def test_seeds_of_judgement_have_to_be_asked_for(run: Run, tmp_path: Path, quick
 def test_a_draw_without_a_result_is_named_with_exit_code_3(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from studies.broad import arrays as broad_run
-
     def refused(task: ArrayTask) -> ArrayResult:
         refusal = RefusedItem(what="calibration of T02", why="it drifts")
         return made(task).model_copy(update={"judged": {}, "refusals": (refusal,)})

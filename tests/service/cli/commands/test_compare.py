@@ -218,8 +218,8 @@ def test_the_lag_of_a_ros_bag_is_that_of_the_clocks(
 # --- many sessions --------------------------------------------------------------------------------
 
 
-def plate_of(session: Path, path: Path, *, unit: float = 1.0) -> None:
-    """What a plate would have written of our own estimate, with noise."""
+def write_noisy_plate(session: Path, path: Path, *, unit: float = 1.0) -> None:
+    """Write what a plate would have of our own estimate, with noise."""
     table = pq.read_table(session)
     t_s = (table["t_ns"].to_numpy() - table["t_ns"][0].as_py()) * 1e-9
     grf_n = table["grf_n"].to_numpy().astype(float)
@@ -232,8 +232,8 @@ def plate_of(session: Path, path: Path, *, unit: float = 1.0) -> None:
 def test_each_row_is_compared_and_a_bad_one_fails_alone(
     run: Run, session: Path, tmp_path: Path
 ) -> None:
-    plate_of(session, tmp_path / "newtons.csv")
-    plate_of(session, tmp_path / "kilo.csv", unit=1e-3)
+    write_noisy_plate(session, tmp_path / "newtons.csv")
+    write_noisy_plate(session, tmp_path / "kilo.csv", unit=1e-3)
     kilo = (tmp_path / "kilo.csv").read_text()
     (tmp_path / "kilo.csv").write_text("a,b\n1,2\n" + kilo)
     rows = [

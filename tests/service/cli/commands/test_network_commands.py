@@ -1,4 +1,4 @@
-"""`serve`, `node`, `demo`, `sessions`, `pull`, `export` as a user types them.
+"""`serve`, `demo`, `sessions` and `pull` as a user types them, with settings and tokens.
 
 What serves is a process of its own; what asks it, or is refused, runs in that of the test.
 """

@@ -1,4 +1,4 @@
-"""What a reader of every frame is given when something happens that seldom does."""
+"""What a reader is given when something seldom happens, and what encoded pieces are kept."""
 
 from __future__ import annotations
 
