@@ -122,8 +122,8 @@ async def _run_server(settings: Settings) -> None:
     from storage.permissions import set_umask_and_create_private_folder
 
     stop = create_stop_event()
-    set_umask_and_create_private_folder(settings.data)
     with open_listening_socket(settings.host, settings.port) as listening:
+        set_umask_and_create_private_folder(settings.data)
         server = Server(settings.data, unquantized=settings.no_quantize)
         token = load_or_create_token(settings.token, settings.data)
         logins = Logins(token, is_private=settings.private)

@@ -141,13 +141,7 @@ def test_a_slice_is_the_download_under_a_name_of_its_own(
     assert path.name == f"{sealed.id}_0.25s-0.5s.{to}"
     assert pulled["bytes"] == path.stat().st_size
     query: dict[str, Any] = {"start_s": 0.25, "end_s": 0.5, "columns": ",".join(names)}
-    written, downloaded = path.read_bytes(), sealed.export(format=to, **query).content
-    if to == "mat":  # its first text is scipy's, with the second of its making
-        head_bytes = 116
-        assert written.startswith(b"MATLAB 5.0 MAT-file")
-        assert downloaded.startswith(b"MATLAB 5.0 MAT-file")
-        written, downloaded = written[head_bytes:], downloaded[head_bytes:]
-    assert written == downloaded
+    assert path.read_bytes() == sealed.export(format=to, **query).content
     assert list(tmp_path.rglob("*.tmp")) == []
 
 
