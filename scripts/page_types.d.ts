@@ -426,7 +426,7 @@ type ReportView = {
   matches_current_data: boolean | null;
   missed: Array<string>;
   has_series: boolean;
-  report: any;
+  report: Record<string, any>;
 };
 
 type RouteView = {

@@ -13,10 +13,19 @@ _PLAIN = {"integer": "number"} | {name: name for name in ("number", "string", "b
 
 
 def render_types(openapi: dict[str, Any]) -> str:
-    """Return the types of all messages to pages, and of all bodies of the API, by name."""
+    """Return the types of all messages to pages, and of all bodies of the API, by name.
+
+    Raises:
+        ValueError: a schema has an unknown shape, or one name has two shapes.
+    """
     live = TypeAdapter(PageMessage).json_schema(mode="serialization")
-    schemas = openapi["components"]["schemas"] | live.pop("$defs") | {"PageMessage": live}
-    texts = [f"type {name} = {_render_type(schemas[name])};\n" for name in sorted(schemas)]
+    types: dict[str, str] = {}
+    for schemas in (openapi["components"]["schemas"], live.pop("$defs"), {"PageMessage": live}):
+        for name, schema in schemas.items():
+            text = _render_type(schema)
+            if types.setdefault(name, text) != text:
+                raise ValueError(f"{name} has two shapes:\n{types[name]}\n{text}")
+    texts = [f"type {name} = {types[name]};\n" for name in sorted(types)]
     return "\n".join(["// Written by tests/test_docs.py.\n", *texts])
 
 
@@ -43,4 +52,8 @@ def _render_type(schema: dict[str, Any]) -> str:
             return f"{{\n{''.join(lines)}}}"
         case {"additionalProperties": dict() as item}:
             return f"Record<string, {_render_type(item)}>"
-    return _PLAIN.get(schema.get("type", ""), "any")
+        case {"additionalProperties": True}:
+            return "Record<string, any>"
+        case {"type": str(plain)} if plain in _PLAIN:
+            return _PLAIN[plain]
+    raise ValueError(f"a schema of unknown shape: {schema}")

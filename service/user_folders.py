@@ -97,5 +97,11 @@ def strip_private_folders(text: str) -> str:
     return text
 
 
-PublicText = Annotated[str, AfterValidator(strip_private_folders)]
-"""Message of a server without private paths."""
+def _escape_surrogates(text: str) -> str:
+    return text.encode(errors="backslashreplace").decode()
+
+
+PublicText = Annotated[
+    str, AfterValidator(strip_private_folders), AfterValidator(_escape_surrogates)
+]
+"""Message of a server without private paths; file names that are not UTF-8 are escaped."""

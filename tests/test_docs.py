@@ -213,6 +213,15 @@ def test_the_api_description_and_the_types_of_the_pages_are_those_of_the_server(
         )
 
 
+@pytest.mark.parametrize(
+    ("schema", "said"),
+    [({"type": "object"}, "unknown shape"), ({"type": "string"}, "Heartbeat has two shapes")],
+)
+def test_no_type_of_the_pages_is_a_guess(schema: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        load_script("page_types").render_types({"components": {"schemas": {"Heartbeat": schema}}})
+
+
 def test_every_route_is_documented() -> None:
     for path, operations in openapi()["paths"].items():
         for method in operations:

@@ -21,7 +21,7 @@ from itertools import count
 from websockets.asyncio.client import ClientConnection
 
 from devices.errors import DamagedFramesError, LinkError, StorageError
-from service.protocol.codec import append_crc, encode_message
+from service.protocol.codec import append_crc, encode_link_message
 from service.protocol.link import Hello, NodeStatus, RetentionMessage, StreamSelect, Welcome
 from storage.intervals import NO_END, Intervals, intervals_from_inclusive_pairs, union
 from storage.journal.node.stream import NodeStream
@@ -209,7 +209,7 @@ class FrameSender:
                 continue
             if stream_id != named:
                 named = stream_id
-                await self._link.socket.send(encode_message(StreamSelect(stream_id=stream_id)))
+                await self._link.socket.send(encode_link_message(StreamSelect(stream_id=stream_id)))
             await self._link.socket.send(append_crc(batch.payload))
             self._window.add_sent_bytes(len(batch.payload))
             if self._window.is_ping_due:

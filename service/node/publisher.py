@@ -28,14 +28,13 @@ from service.node.server_connection import (
     parse_server_message,
 )
 from service.node_identity import compute_fingerprint, make_proof
-from service.protocol.codec import SUBPROTOCOL, LinkCloseCode, encode_message
+from service.protocol.codec import SUBPROTOCOL, LinkCloseCode, encode_link_message
 from service.protocol.link import (
     LINK_TIMEOUT_S,
     MESSAGE_BYTES_MAX,
     PROTOCOL,
     Challenge,
     Identify,
-    LinkMessage,
     Proof,
     Welcome,
 )
@@ -146,7 +145,7 @@ class Publisher:
                 f"the server does not speak {SUBPROTOCOL}", where=self._url, expected=SUBPROTOCOL
             )
         node = self._source.get_present_stream().info.node
-        await socket.send(encode_message(Identify(protocol=PROTOCOL, node=node)))
+        await socket.send(encode_link_message(Identify(protocol=PROTOCOL, node=node)))
         challenge = await _receive_message(socket, Challenge)
         # In threads: both read or write the disk.
         secret = await asyncio.to_thread(self._source.get_secret, challenge.server_id)
@@ -155,9 +154,9 @@ class Publisher:
             proof = Proof(proof=make_proof(secret, challenge, node))
         else:
             proof = Proof(secret=secret)
-        await socket.send(encode_message(proof))
+        await socket.send(encode_link_message(proof))
         hello = await asyncio.to_thread(self._source.make_hello)
-        await socket.send(encode_message(hello))
+        await socket.send(encode_link_message(hello))
         welcome = await _receive_message(socket, Welcome)
         return EstablishedLink(
             socket, self._source, challenge.server_id, hello, welcome, self._wake_sender
@@ -175,7 +174,7 @@ _Kind = TypeVar("_Kind", Challenge, Welcome)
 async def _receive_message(socket: ClientConnection, kind: type[_Kind]) -> _Kind:
     """Receive the next message, which has to be of a kind."""
     async with asyncio.timeout(LINK_TIMEOUT_S):
-        answer: LinkMessage = parse_server_message(await socket.recv())
+        answer = parse_server_message(await socket.recv())
     if not isinstance(answer, kind):
         expected = kind.model_fields["type"].default
         raise LinkError(f"the server sent {answer.type!r}", expected=expected)

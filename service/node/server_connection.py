@@ -33,23 +33,25 @@ from service.protocol.codec import (
     SUBPROTOCOL,
     CloseConnection,
     LinkCloseCode,
-    decode_message,
-    encode_message,
+    decode_link_message,
+    encode_link_message,
 )
 from service.protocol.link import (
     INGEST_PATH,
-    LINK_MESSAGES,
     LINK_TIMEOUT_S,
     PROBES_PER_MEASUREMENT,
     PROTOCOL,
+    SERVER_MESSAGES,
     Ack,
+    Challenge,
     ClockProbe,
     ClockSample,
     EarlierStream,
     Hello,
-    LinkMessage,
     LossReport,
     RetentionMessage,
+    ServerMessage,
+    Welcome,
 )
 from storage.journal.node.journal import NodeJournal
 from storage.journal.node.stream import NodeStream
@@ -103,8 +105,10 @@ class ServerConnection:
                     self._forward_retention_request(message)
                 case ClockProbe():
                     self._probes.add_answer(message)
-                case _:
-                    raise LinkError(f"the server sent {message.type!r}, unexpected here")
+                case Challenge() | Welcome():
+                    raise LinkError(
+                        f"the server sent {message.type!r} here", expected="ack, retain or probe"
+                    )
 
     def _forward_retention_request(self, wanted: RetentionMessage) -> None:
         earlier = (stream.array_info.stream_id for stream in self._link.hello.earlier)
@@ -120,22 +124,24 @@ class ServerConnection:
                 if stream_id in reported and lost != reported[stream_id]:
                     reported[stream_id] = lost
                     await self._link.socket.send(
-                        encode_message(LossReport(stream_id=stream_id, lost=lost))
+                        encode_link_message(LossReport(stream_id=stream_id, lost=lost))
                     )
             await self._link.socket.send(
-                encode_message(self._link.callbacks.make_status(self._sender.backlog.frame_count))
+                encode_link_message(
+                    self._link.callbacks.make_status(self._sender.backlog.frame_count)
+                )
             )
             await asyncio.sleep(STATUS_EVERY_S)
 
 
-def parse_server_message(message: str | bytes) -> LinkMessage:
+def parse_server_message(message: str | bytes) -> ServerMessage:
     """Verify and parse a message of a server.
 
     Raises:
         LinkError: it is no valid message of the protocol.
     """
     try:
-        return decode_message(LINK_MESSAGES, message)
+        return decode_link_message(SERVER_MESSAGES, message)
     except CloseConnection as error:
         raise LinkError(
             f"the server sent an invalid message: {error}",
@@ -245,7 +251,7 @@ class ClockOffsetMeter:
             for _ in range(PROBES_PER_MEASUREMENT):
                 number += 1
                 sent_ns = time.monotonic_ns()
-                await self._socket.send(encode_message(ClockProbe(id=number)))
+                await self._socket.send(encode_link_message(ClockProbe(id=number)))
                 answer = await self._wait_for_answer(number)
                 came_ns = time.monotonic_ns()
                 if answer is None or answer.server_t_ns is None:
@@ -259,7 +265,7 @@ class ClockOffsetMeter:
                         uncertainty_ns=half_ns,
                     )
             if best is not None:
-                await self._socket.send(encode_message(best))
+                await self._socket.send(encode_link_message(best))
             await asyncio.sleep(CLOCK_INTERVAL_S)
 
     async def _wait_for_answer(self, number: int) -> ClockProbe | None:

@@ -11,13 +11,15 @@ from __future__ import annotations
 import re
 import zlib
 from enum import IntEnum
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
-from service.protocol.link import LINK_MESSAGES, LinkMessage
-from service.protocol.live import LiveMessage, View
+from service.protocol.link import LinkMessage
 from service.user_folders import strip_private_folders
+
+if TYPE_CHECKING:  # a node needs no shapes of pages
+    from service.protocol.live import LiveMessage
 
 SUBPROTOCOL = "foottile.v1"
 _REASON_BYTES_MAX = 123
@@ -61,38 +63,49 @@ class CloseConnection(Exception):  # noqa: N818  # no error: how a connection en
         self.reason = reason
 
 
-def encode_message(message: LinkMessage | LiveMessage) -> str:
-    """Encode a message as JSON; one of the link with its checksum."""
-    text = message.model_dump_json()
-    return text if isinstance(message, View) else append_text_crc(text)
+def encode_link_message(message: LinkMessage) -> str:
+    """Encode a message of the link as JSON with its checksum."""
+    return append_text_crc(message.model_dump_json())
 
 
-def decode_message(messages: TypeAdapter[_T], text: str | bytes) -> _T:
-    """Verify and decode a message.
+def decode_link_message(messages: TypeAdapter[_T], text: str | bytes) -> _T:
+    """Verify the checksum of a message of the link, and decode it.
 
     Args:
-        messages: `LINK_MESSAGES`, which have a checksum, or messages that have none.
-        text: JSON.
+        messages: `NODE_MESSAGES` or `SERVER_MESSAGES`.
+        text: JSON with its checksum.
 
     Raises:
         CloseConnection: it was damaged on its way, is no such message, or a value is out of bounds.
     """
-    if messages is LINK_MESSAGES:
-        text = strip_text_crc(text)
+    return decode_message(messages, strip_text_crc(text))
+
+
+def encode_message(message: LiveMessage) -> str:
+    """Encode a live message as JSON."""
+    return message.model_dump_json()
+
+
+def decode_message(messages: TypeAdapter[_T], text: str) -> _T:
+    """Decode a message without a checksum.
+
+    Raises:
+        CloseConnection: it is no such message, or a value is out of bounds.
+    """
     try:
         # Strict: true is not 1, and "1" neither.
         return messages.validate_json(text, strict=True)
     except ValidationError as error:
         raise CloseConnection(
-            LinkCloseCode.REFUSED, f"message not understood: {describe_complaint(error)}"
+            LinkCloseCode.REFUSED, f"message not understood: {_describe_complaint(error)}"
         ) from error
 
 
-def describe_complaint(error: ValidationError) -> str:
+def _describe_complaint(error: ValidationError) -> str:
     """Return the place and the reason of the first complaint."""
     complaint = error.errors(include_url=False, include_input=False, include_context=False)[0]
     where = ".".join(str(part)[:60] for part in complaint["loc"])
-    return f"{where}: {complaint['msg']}"
+    return f"{where}: {complaint['msg']}" if where else str(complaint["msg"])
 
 
 def append_text_crc(text: str) -> str:

@@ -91,6 +91,8 @@ PROBES_PER_MEASUREMENT = 8
 _INTERVALS_MAX = 1 << 14
 """Most intervals in a list: a gap every ten seconds for two days."""
 _STREAMS_MAX = 256
+_REQUESTED_STREAMS_MAX = 1 << 14
+"""Most streams of a request, about as many as fit into a message."""
 _REASONS_MAX = 32
 _WARNINGS_MAX = 1000
 UNCERTAINTY_MAX_NS = 60_000_000_000
@@ -221,11 +223,14 @@ class StreamNumbers(StrictModel):
     """Intervals, the most urgent first. An interval without an end includes all future frames."""
 
 
+_RequestedStreams = Annotated[tuple[StreamNumbers, ...], Field(max_length=_REQUESTED_STREAMS_MAX)]
+
+
 class RetentionMessage(StrictModel):
     """Retention request: frames for the node to retain until acknowledged, whatever their age."""
 
     type: Literal["retain"] = "retain"
-    streams: tuple[StreamNumbers, ...]
+    streams: _RequestedStreams
     """Frames of sessions that are not yet sealed, by stream."""
     recording: bool
     """True while a session is being recorded: a new stream belongs to it from its first frame on.
@@ -237,7 +242,7 @@ class Welcome(StrictModel):
 
     type: Literal["welcome"] = "welcome"
     protocol: Count
-    missing: tuple[StreamNumbers, ...]
+    missing: _RequestedStreams
     """Missing frames: of the present stream all that the node stores and the server does not, of
     earlier ones those of sessions. The present stream's last interval has no end."""
     retention: RetentionMessage
@@ -309,19 +314,14 @@ class NodeStatus(StrictModel):
     """Fault counts of this stream, by serial and reason."""
 
 
-LinkMessage = Annotated[
-    Identify
-    | Challenge
-    | Proof
-    | Hello
-    | Welcome
-    | StreamSelect
-    | Ack
-    | RetentionMessage
-    | ClockProbe
-    | ClockSample
-    | NodeStatus
-    | LossReport,
-    Field(discriminator="type"),
-]
-LINK_MESSAGES: TypeAdapter[LinkMessage] = TypeAdapter(LinkMessage)
+NodeMessage = (
+    Identify | Proof | Hello | StreamSelect | ClockProbe | ClockSample | NodeStatus | LossReport
+)
+ServerMessage = Challenge | Welcome | Ack | RetentionMessage | ClockProbe
+LinkMessage = NodeMessage | ServerMessage
+NODE_MESSAGES: TypeAdapter[NodeMessage] = TypeAdapter(
+    Annotated[NodeMessage, Field(discriminator="type")]
+)
+SERVER_MESSAGES: TypeAdapter[ServerMessage] = TypeAdapter(
+    Annotated[ServerMessage, Field(discriminator="type")]
+)

@@ -6,13 +6,12 @@ The live page gets `PageMessage`s. A program that requests every frame (`format=
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from devices.frames import ServoInfo
 from devices.types import StrictModel
-from service.estimation.calibration import Calibration
 from service.estimation.tare.tare import IntervalSource
 from service.protocol.link import StreamId
 from service.user_folders import PublicText
@@ -25,7 +24,7 @@ Policy = Literal["lossless", "drop_oldest", "latest"]
 
 
 class View(BaseModel):
-    """Base of all answers; unknown values are null, never NaN."""
+    """Base of answers and live messages; unknown values are null, never NaN."""
 
     model_config = ConfigDict(
         frozen=True, allow_inf_nan=False, json_schema_serialization_defaults_required=True
@@ -54,17 +53,6 @@ class CalibrationView(View):
     id: str
     name: str
     absolute_scale: Literal["measured", "assumed"]
-
-    @classmethod
-    def from_calibration(
-        cls, calibration: Calibration, calibration_id: str, *, is_scale_assumed: bool
-    ) -> CalibrationView:
-        """Return the view of a calibration."""
-        return cls(
-            id=calibration_id,
-            name=calibration.name,
-            absolute_scale="assumed" if is_scale_assumed else "measured",
-        )
 
 
 class TareView(View):
@@ -176,7 +164,9 @@ class NodeView(NodeCounts):
     storage_problem: PublicText | None = Field(description="Reason why frames cannot be stored.")
     clock: ClockView | None = Field(description="Null: not measured yet.")
     clock_set: bool = Field(description="True if the node's date had been set.")
-    lost: dict[str, int] = Field(description="The same by reason.", examples=[{"evicted": 12}])
+    lost: dict[str, int] = Field(
+        description="Lost frames of this stream, by reason.", examples=[{"evicted": 12}]
+    )
     warnings: list[str] = Field(description="Present faults of its array or disk, as text.")
     compiling: bool = Field(
         description="Models are being compiled, once on this machine: frames have pressures only."
@@ -251,26 +241,31 @@ class SessionView(SessionProgress):
 
 
 class PageQuery(StrictModel):
-    """Query of a page."""
+    """Query of a page. Descriptions say what a refused value should have been."""
 
-    format: Literal["json"] = "json"
-    policy: Literal["latest"] = "latest"
+    format: Literal["json"] = Field(default="json", description="json or arrow")
+    policy: Literal["latest"] = Field(
+        default="latest", description="latest; others need format=arrow"
+    )
     node: str | None = None
     """Node whose frames and progress are sent; None: all."""
-    rate_hz: Annotated[float, Field(ge=1.0, le=60.0)] = 30.0
+    rate_hz: float = Field(default=30.0, ge=1.0, le=60.0, description="1 to 60")
 
 
 class FeedQuery(StrictModel):
-    """Query of a program that requests every frame."""
+    """Query of a program that requests every frame. Descriptions as in `PageQuery`."""
 
     format: Literal["arrow"]
-    policy: Policy = "lossless"
+    policy: Policy = Field(default="lossless", description=", ".join(get_args(Policy)))
     node: str | None = None
     """None: the only one."""
     columns: str = ""
     """Names with commas between; empty: all."""
-    stream_id: StreamId | None = None
-    from_seq: Annotated[int, Field(ge=0, lt=10**15)] | None = None
+    stream_id: StreamId | None = Field(default=None, description="32 hex digits")
+    from_seq: str | None = Field(
+        default=None, pattern=r"^[0-9]{1,15}$", description="a frame's number, from 0"
+    )
+    """A text: as an integer, `1.0` and `1_000` would be accepted."""
 
 
 class PageHello(View):
@@ -376,14 +371,14 @@ class Ping(View):
     """Only message of a client."""
 
     type: Literal["ping"]
-    t_ms: Annotated[float, Field(gt=-1e18, lt=1e18)]
+    t_ms: Annotated[int | float, Field(gt=-(10**18), lt=10**18)]
 
 
 class Pong(View):
     """Answer to `ping`, with its `t_ms`."""
 
     type: Literal["pong"] = "pong"
-    t_ms: float
+    t_ms: int | float
     t_ns: int
 
 

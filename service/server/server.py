@@ -286,17 +286,15 @@ class Server:
 
     def try_make_node_view(self, node: ServerNode) -> NodeView | None:
         """Return a node's present state; None on an error, which is logged."""
-        with self._isolate_errors(f"node {node.name}, as JSON"):
+        with self._isolate_errors(f"node {node.name}, its view"):
             return self.make_node_view(node)
         return None
 
     def notify_node_changed(self, node: ServerNode) -> None:
-        """Send a node's present state to all subscribers."""
-        if (
-            self.broadcaster.subscriber_count
-            and (view := self.try_make_node_view(node)) is not None
-        ):
-            self.broadcaster.queue_droppable_notice(NodeChanged(node=view))
+        """Send a node's present state to all subscribers; an error is logged."""
+        if self.broadcaster.subscriber_count:
+            with self._isolate_errors(f"node {node.name}, its view"):
+                self.broadcaster.queue_droppable_notice(NodeChanged(node=self.make_node_view(node)))
 
     def _update_retention(self, link: NodeLink) -> None:
         """Notify a node if its retention request has changed."""
@@ -342,8 +340,9 @@ class Server:
 
     def _notify_session_changed(self, session: Session) -> None:
         if self.broadcaster.subscriber_count:
-            view = make_session_view(session, self.recorder)
-            self.broadcaster.queue_droppable_notice(SessionChanged(session=view))
+            with self._isolate_errors(f"session {session.id}, its view"):
+                view = make_session_view(session, self.recorder)
+                self.broadcaster.queue_droppable_notice(SessionChanged(session=view))
 
     def _send_heartbeat(self) -> None:
         if not self.broadcaster.subscriber_count:

@@ -22,8 +22,8 @@ from service.node_identity import generate_secret, make_proof
 from service.protocol.codec import append_crc, append_text_crc, strip_text_crc
 from service.protocol.link import (
     INGEST_PATH,
-    LINK_MESSAGES,
     PROTOCOL,
+    SERVER_MESSAGES,
     Challenge,
     ClockSample,
     EarlierStream,
@@ -239,7 +239,7 @@ class FakeNode:
         """The next message of a kind; acknowledgements on the way are noted."""
         end_s = time.monotonic() + timeout_s
         while True:
-            message = LINK_MESSAGES.validate_json(
+            message = SERVER_MESSAGES.validate_json(
                 self.socket.recv(timeout=max(0.0, end_s - time.monotonic()))
             )
             if message.type == "ack":

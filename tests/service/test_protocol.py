@@ -16,15 +16,16 @@ from service.protocol.codec import (
     CloseConnection,
     append_crc,
     append_text_crc,
-    decode_message,
-    encode_message,
+    decode_link_message,
+    encode_link_message,
     format_close_reason,
     strip_binary_crc,
     strip_text_crc,
 )
 from service.protocol.link import (
-    LINK_MESSAGES,
+    NODE_MESSAGES,
     PROTOCOL,
+    SERVER_MESSAGES,
     UNCERTAINTY_MAX_NS,
     Ack,
     Challenge,
@@ -76,7 +77,7 @@ HELLO = Hello(
         ),
     ),
 )
-MESSAGES = (
+FROM_NODE = (
     HELLO,
     Identify(protocol=PROTOCOL, node="leg"),
     Proof(proof="0" * 64, secret="f" * 64),
@@ -85,35 +86,64 @@ MESSAGES = (
     ClockSample(t_mono_ns=5, server_minus_node_ns=-77, uncertainty_ns=9),
     LossReport(stream_id="b" * 32, lost={"node_busy": ((0, 0), (5, 6))}),
     NodeStatus(missed_slots=3, warnings=("T01: does not answer",), counts={"T01": {"stale": 4}}),
+)
+FROM_SERVER = (
     ACK,
     WANTED,
     Challenge(protocol=PROTOCOL, server_id="e" * 32, nonce="0" * 64, is_known=True),
     Welcome(protocol=PROTOCOL, missing=WANTED.streams, retention=WANTED),
     ClockProbe(id=3, server_t_ns=10**18),
 )
+MESSAGES: tuple[tuple[Any, LinkMessage], ...] = (
+    *((NODE_MESSAGES, message) for message in FROM_NODE),
+    *((SERVER_MESSAGES, message) for message in FROM_SERVER),
+)
 
 
-def decode(content: Any) -> LinkMessage:
-    return decode_message(LINK_MESSAGES, append_text_crc(json.dumps(content)))
+def decode(content: Any, messages: Any = NODE_MESSAGES) -> LinkMessage:
+    taken: LinkMessage = decode_link_message(messages, append_text_crc(json.dumps(content)))
+    return taken
 
 
-def assert_taken_as_it_is_or_refused(content: Any) -> None:
+def assert_taken_as_it_is_or_refused(content: Any, messages: Any) -> None:
     try:
-        taken = decode(content)
+        taken = decode(content, messages)
     except CloseConnection:
         return
-    written = encode_message(taken)
-    assert decode_message(LINK_MESSAGES, written) == taken
-    assert encode_message(decode_message(LINK_MESSAGES, written)) == written
+    written = encode_link_message(taken)
+    assert decode_link_message(messages, written) == taken
+    assert encode_link_message(decode_link_message(messages, written)) == written
     json.loads(written, parse_constant=pytest.fail)  # no NaN, which JSON has not
-    assert LINK_MESSAGES.validate_python(taken.model_dump()) == taken
+    assert messages.validate_python(taken.model_dump()) == taken
     written.encode()
 
 
 def test_a_message_is_json_and_comes_back() -> None:
-    assert json.loads(encode_message(ACK))["seq_last"] == 199
-    for message in MESSAGES:
-        assert decode_message(LINK_MESSAGES, encode_message(message)) == message
+    assert json.loads(encode_link_message(ACK))["seq_last"] == 199
+    for messages, message in MESSAGES:
+        assert decode_link_message(messages, encode_link_message(message)) == message
+
+
+@pytest.mark.parametrize(
+    ("messages", "message"),
+    [
+        *((SERVER_MESSAGES, message) for message in FROM_NODE if message.type != "probe"),
+        *((NODE_MESSAGES, message) for message in FROM_SERVER if message.type != "probe"),
+    ],
+    ids=lambda value: getattr(value, "type", ""),
+)
+def test_a_message_of_the_other_side_is_not_understood(messages: Any, message: Any) -> None:
+    with pytest.raises(CloseConnection, match=f"not understood: Input tag '{message.type}'"):
+        decode_link_message(messages, encode_link_message(message))
+
+
+@pytest.mark.parametrize("place", [("missing",), ("retention", "streams")], ids=str)
+def test_a_request_of_too_many_streams_is_not_understood(place: tuple[str, ...]) -> None:
+    content = json.loads(FROM_SERVER[-2].model_dump_json())
+    streams = [{"stream_id": "a" * 32, "numbers": []}] * (1 << 14)
+    decode(with_value(content, place, streams), SERVER_MESSAGES)
+    with pytest.raises(CloseConnection, match="at most 16384"):
+        decode(with_value(content, place, [*streams, streams[0]]), SERVER_MESSAGES)
 
 
 @settings(deadline=None, max_examples=1500)
@@ -121,13 +151,14 @@ def test_a_message_is_json_and_comes_back() -> None:
 def test_what_is_taken_can_be_written_down_and_read_back_as_the_same(data: st.DataObject) -> None:
     """Any one or two values of any message replaced by what JSON, and Python's JSON, can say."""
     at = data.draw(st.integers(0, len(MESSAGES) - 1))
-    content = json.loads(MESSAGES[at].model_dump_json())
+    messages, message = MESSAGES[at]
+    content = json.loads(message.model_dump_json())
     for _ in range(data.draw(st.integers(1, 2))):
         found = list(places(content))
         place = found[data.draw(st.integers(0, len(found) - 1))]
         value = ODD_VALUES[data.draw(st.integers(0, len(ODD_VALUES) - 1))]
         content = with_value(content, place, value)
-    assert_taken_as_it_is_or_refused(content)
+    assert_taken_as_it_is_or_refused(content, messages)
 
 
 @pytest.mark.parametrize(
@@ -202,10 +233,10 @@ def test_a_reason_fits_into_a_close_frame_and_a_line_of_a_log(text: str) -> None
     assert reason.isprintable()
 
 
-@given(at=st.integers(0, len(encode_message(ACK)) - 1), bit=st.integers(0, 7))
+@given(at=st.integers(0, len(encode_link_message(ACK)) - 1), bit=st.integers(0, 7))
 def test_a_flipped_bit_of_a_text_is_noticed_wherever_it_is(at: int, bit: int) -> None:
     """A 1 that became a 9 would have the node forget frames that nobody has."""
-    damaged = bytearray(encode_message(ACK).encode())
+    damaged = bytearray(encode_link_message(ACK).encode())
     damaged[at] ^= 1 << bit
     with pytest.raises(CloseConnection, match="damaged"):
         strip_text_crc(bytes(damaged))

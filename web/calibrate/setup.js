@@ -40,7 +40,7 @@ export class Setup {
     this.form.addEventListener("input", () => this.drawTexts());
     for (const radio of this.form.querySelectorAll("[name=method]")) {
       radio.addEventListener("change", () => {
-        this.method = /** @type {any} */ (radio).value;
+        this.method = /** @type {StartWeighing["method"]} */ (/** @type {HTMLInputElement} */ (radio).value);
         this.useMethod();
       });
     }

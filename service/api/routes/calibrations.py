@@ -21,7 +21,7 @@ from service.api.routes.common import (
 from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
 from service.protocol.live import CalibrationSource, CalibrationView, View
-from service.server.broadcast.views import Page
+from service.server.broadcast.views import Page, make_calibration_view
 from service.server.calibrations import JOB_SESSIONS_MAX, CalibrationJob, CalibrationSummary
 from service.server.node import ServerNode
 from service.server.session_store import check_revision
@@ -151,11 +151,7 @@ class NodeCalibrationView(View):
         live, assigned = estimates.live, estimates.assignment.current
         used = None
         if live.calibration is not None and live.calibration_id and live.ranges is not None:
-            used = CalibrationView.from_calibration(
-                live.calibration,
-                live.calibration_id,
-                is_scale_assumed=live.ranges.is_scale_assumed,
-            )
+            used = make_calibration_view(live.calibration, live.calibration_id, live.ranges)
         return cls(
             node=node.name,
             source=estimates.calibration_source,

@@ -202,8 +202,9 @@ class Broadcaster:
 
     def _get_history(self, node: ServerNode, tile_count: int) -> StreamHistory:
         recent = self._histories.get(node.name)
-        if recent is None or recent.stream_id != node.stream_id:
-            recent = self._histories[node.name] = StreamHistory(node.stream_id, tile_count)
+        key = node.stream_id, tile_count
+        if recent is None or (recent.stream_id, recent.tile_count) != key:
+            recent = self._histories[node.name] = StreamHistory(*key)
         return recent
 
     def newest_frame_age_ms(self, node: ServerNode) -> float | None:

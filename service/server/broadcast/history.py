@@ -148,7 +148,7 @@ class StreamHistory:
     """
 
     def __init__(self, stream_id: str, tile_count: int) -> None:
-        self.stream_id = stream_id
+        self.stream_id, self.tile_count = stream_id, tile_count
         numbers = [(name, np.int64) for name in ForceSpan._fields if not name.startswith("grf_")]
         forces = [(name, float) for name in ForceSpan._fields if name.startswith("grf_")]
         self._as_published: deque[ForceSpan] = deque()

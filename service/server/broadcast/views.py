@@ -10,6 +10,7 @@ import numpy.typing as npt
 from pydantic import Field
 
 from devices.frames import ArrayInfo
+from service.estimation.calibration import Calibration
 from service.estimation.compilation import is_compiling
 from service.estimation.tare.tare import (
     compute_sealed_gas_shift_kpa,
@@ -114,13 +115,28 @@ def make_drift_view(node: ServerNode) -> DriftView:
 
 def make_node_counts(node: ServerNode) -> NodeCounts:
     """Return the present rate and losses of a node."""
-    return NodeCounts(
-        connected=node.is_connected,
-        rate_hz=node.rate_hz if node.is_connected else None,
-        lost_frames=sum(node.present_stream_lost_by_reason.values()),
-        backlog_frames=node.present_stream_backlog_frames,
-        missed_slots=node.present_stream.missed_slots,
-        last_seq=node.last_seq,
+    return NodeCounts(**_list_count_fields(node, node.present_stream_lost_by_reason))
+
+
+def _list_count_fields(node: ServerNode, lost: dict[str, int]) -> dict[str, Any]:
+    return {
+        "connected": node.is_connected,
+        "rate_hz": node.rate_hz if node.is_connected else None,
+        "lost_frames": sum(lost.values()),
+        "backlog_frames": node.present_stream_backlog_frames,
+        "missed_slots": node.present_stream.missed_slots,
+        "last_seq": node.last_seq,
+    }
+
+
+def make_calibration_view(
+    calibration: Calibration, calibration_id: str, ranges: TileRanges
+) -> CalibrationView:
+    """Return a calibration in use."""
+    return CalibrationView(
+        id=calibration_id,
+        name=calibration.name,
+        absolute_scale="assumed" if ranges.is_scale_assumed else "measured",
     )
 
 
@@ -130,10 +146,10 @@ def make_node_view(
     """Return the present state of a node."""
     info, estimates = node.last_info, node.estimator
     live, keeper = estimates.live, estimates.tare_controller
-    calibration = live.calibration
+    calibration, lost = live.calibration, node.present_stream_lost_by_reason
     tare = estimates.tare_history.tare_in_force_unless_lost(info)
     return NodeView(
-        **make_node_counts(node).model_dump(),
+        **_list_count_fields(node, lost),
         node=node.name,
         stream_id=node.stream_id,
         scene=info.scene,
@@ -144,9 +160,7 @@ def make_node_view(
         nominal_rate_hz=info.nominal_rate_hz,
         calibration=None
         if calibration is None or live.calibration_id is None or live.ranges is None
-        else CalibrationView.from_calibration(
-            calibration, live.calibration_id, is_scale_assumed=live.ranges.is_scale_assumed
-        ),
+        else make_calibration_view(calibration, live.calibration_id, live.ranges),
         calibration_source=estimates.calibration_source,
         calibration_problem=estimates.calibration_problem,
         tare=make_tare_view(tare) if tare is not None else None,
@@ -162,7 +176,7 @@ def make_node_view(
             uncertainty_ns=node.clock_offset.uncertainty_ns,
         ),
         clock_set=info.clock_set,
-        lost=node.present_stream_lost_by_reason,
+        lost=lost,
         warnings=[*node.warnings, *node.refused_ahead_frames_warnings],
         compiling=is_compiling(),
         fault_counts=node.fault_counts,

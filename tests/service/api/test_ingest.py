@@ -22,6 +22,7 @@ from websockets.exceptions import ConnectionClosed
 
 import service.api.routes.sockets.ingest
 import service.server.server
+from devices.errors import StorageError
 from devices.frames import FrameBatch
 from service.server.estimates.live_estimator import LiveEstimator
 from service.server.node import ServerNode
@@ -324,6 +325,53 @@ def test_a_bug_in_a_nodes_summary_hides_only_this_node(
         node.deliver(30)
         assert_goes_on(live, other)
     assert count_bugs(caplog) == 1
+
+
+def test_a_problem_that_is_not_utf_8_ends_no_socket(
+    running: Running, other: FakeNode, node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node.connect()
+    server = running.server
+    fail = failing_if(lambda: True, server.check_writable, StorageError, "still")
+    monkeypatch.setattr(server, "check_writable", fail)
+    server.nodes.get("bench").storage_problem = "\udcff"
+    with running.socket(LIVE) as live:
+        hello = json.loads(live.recv(timeout=PATIENCE_S))
+        assert {shown["node"]: shown["storage_problem"] for shown in hello["nodes"]} == {
+            "bench": r"\udcff",
+            "other": None,
+        }
+        running.call(lambda: server.notify_node_changed(server.nodes.get("bench")))
+        receive_live(live, lambda message: message["type"] == "node")
+        assert_goes_on(live, other)
+    assert running.node()["storage_problem"] == r"\udcff"
+    assert "bench" in server.links
+
+
+def test_a_notice_that_cannot_be_encoded_ends_no_socket(
+    running: Running,
+    other: FakeNode,
+    node: FakeNode,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def fail(_: object) -> None:
+        raise ArithmeticError("a bug")
+
+    node.connect()
+    node.deliver(30)
+    session = node.record()
+    with running.socket(LIVE) as live, caplog.at_level(logging.ERROR):
+        receive_live(live, lambda message: message["type"] == "hello")
+        with monkeypatch.context() as patch:
+            patch.setattr(running.server.broadcaster, "queue_droppable_notice", fail)
+            bench = running.server.nodes.get("bench")
+            running.call(lambda: running.server.notify_node_changed(bench))
+            session.stop()
+        assert_goes_on(live, other)
+    assert "bench" in running.server.links
+    for of in ("node bench", f"session {session.id}"):
+        assert f"{of}, its view: this is a bug" in caplog.text
 
 
 def test_the_loop_runs_between_two_messages_of_a_backlog(

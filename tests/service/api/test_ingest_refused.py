@@ -111,7 +111,7 @@ def test_each_step_of_the_handshake_is_needed_once(healthy: FakeNode, odd: FakeN
     assert wait_for_close(odd, healthy) == (4001, "hello was expected, in text")
     odd.connect()
     odd.socket.send(odd.hello().model_dump_json())
-    assert wait_for_close(odd, healthy) == (4001, "hello is not expected here")
+    assert wait_for_close(odd, healthy) == (4001, "hello was sent before")
 
 
 @pytest.mark.parametrize(

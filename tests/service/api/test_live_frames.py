@@ -156,16 +156,15 @@ def test_a_stream_has_the_requested_columns_and_is_an_arrow_stream(
     [
         ("columns=grf_n,colour", "'colour'"),
         ("columns=force_n_2", "'force_n_2'"),
-        ("policy=all", "'drop_oldest'"),
-        ("policy=", "policy: "),
-        ("stream_id=x", "stream_id: "),
+        ("policy=all", "policy='all': expected lossless, drop_oldest, latest"),
+        ("policy=", "policy=''"),
+        ("stream_id=x", "stream_id='x': expected 32 hex digits"),
         ("stream_id=" + "0" * 32, "no stream"),
-        ("from_seq=-1", "from_seq: "),
-        ("from_seq=1e3", "from_seq: "),
-        ("from_seq=" + "9" * 400, "from_seq: "),
+        ("from_seq=-1", "from_seq='-1': expected a frame's number, from 0"),
+        *((f"from_seq={n}", "from_seq=") for n in ("1e3", "9" * 400, "1.0", "1_000", "%2B1", "-0")),
         ("node=nobody", "'nobody'"),
-        ("rate_hz=30", "rate_hz: "),
-        ("colour=red", "colour: "),
+        ("rate_hz=30", "unknown parameter 'rate_hz'; known: format, policy, node, columns, "),
+        ("colour=red", "'colour'"),
     ],
 )
 def test_a_wrong_query_closes_with_a_reason(sealed: Sealed, query: str, word: str) -> None:

@@ -19,12 +19,12 @@ from service.node_identity import compute_fingerprint, make_proof
 from service.protocol.codec import (
     SUBPROTOCOL,
     LinkCloseCode,
-    encode_message,
+    encode_link_message,
     strip_binary_crc,
     strip_text_crc,
 )
 from service.protocol.link import (
-    LINK_MESSAGES,
+    NODE_MESSAGES,
     PROTOCOL,
     Ack,
     Challenge,
@@ -75,23 +75,23 @@ class Script:
     async def serve(self, connection: ServerConnection) -> None:
         self.connection = connection
         assert isinstance(
-            LINK_MESSAGES.validate_json(strip_text_crc(await connection.recv())), Identify
+            NODE_MESSAGES.validate_json(strip_text_crc(await connection.recv())), Identify
         )
         challenge = Challenge(
             protocol=PROTOCOL, server_id="played", nonce="0" * 64, is_known=self.is_known
         )
-        await connection.send(encode_message(challenge))
-        proof = LINK_MESSAGES.validate_json(strip_text_crc(await connection.recv()))
+        await connection.send(encode_link_message(challenge))
+        proof = NODE_MESSAGES.validate_json(strip_text_crc(await connection.recv()))
         assert isinstance(proof, Proof)
         self.proofs.append(proof)
-        hello = LINK_MESSAGES.validate_json(strip_text_crc(await connection.recv()))
+        hello = NODE_MESSAGES.validate_json(strip_text_crc(await connection.recv()))
         assert isinstance(hello, Hello)
         self.hellos.append(hello)
         lacks = self.lacks or (
             StreamNumbers(stream_id=hello.array_info.stream_id, numbers=((0, None),)),
         )
         welcome = Welcome(protocol=PROTOCOL, missing=lacks, retention=self.wanted)
-        await connection.send(encode_message(welcome))
+        await connection.send(encode_link_message(welcome))
         stream_id = hello.array_info.stream_id
         schema = wire_schema(hello.array_info)
         async for message in connection:
@@ -102,9 +102,9 @@ class Script:
                 self.came.append((stream_id, first, last))
                 if self.acknowledges:
                     ack = Ack(stream_id=stream_id, seq_first=first, seq_last=last)
-                    await connection.send(encode_message(ack))
+                    await connection.send(encode_link_message(ack))
                 continue
-            said = LINK_MESSAGES.validate_json(strip_text_crc(message))
+            said = NODE_MESSAGES.validate_json(strip_text_crc(message))
             self.said.append(said)
             if isinstance(said, StreamSelect):
                 stream_id = said.stream_id
@@ -206,10 +206,23 @@ async def test_a_retention_request_comes_with_the_streams_that_the_server_knew(
             await publishing.until(lambda: publishing.wanted)
             assert script.connection is not None
             nothing = RetentionMessage(streams=(), recording=False)
-            await script.connection.send(encode_message(nothing))
+            await script.connection.send(encode_link_message(nothing))
             await publishing.until(lambda: len(publishing.wanted) == 2)
         assert publishing.wanted[0] == ("played", wanted, (node.stream_id,))
         assert publishing.wanted[1] == ("played", nothing, (node.stream_id,))
+
+
+@in_a_loop
+async def test_a_message_of_the_handshake_after_it_ends_the_connection(node: FakeNode) -> None:
+    async with played() as script, Publishing(node, script.url) as publishing:
+        await publishing.until(lambda: script.said)
+        again = Welcome(protocol=PROTOCOL, missing=(), retention=script.wanted)
+        assert script.connection is not None
+        await script.connection.send(encode_link_message(again))
+        await publishing.until(lambda: len(script.hellos) == 2)
+    [said] = [report for report in publishing.reports if "'welcome'" in report]
+    assert "the server sent 'welcome' here" in said
+    assert "ack, retain or probe" in said
 
 
 @in_a_loop

@@ -22,7 +22,7 @@ from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
 from service.estimation.tare.tare import TareSource
 from service.protocol.live import CalibrationView, TileView, View
-from service.server.broadcast.views import make_tile_views
+from service.server.broadcast.views import make_calibration_view, make_tile_views
 from service.server.estimates.live_estimator import TileRanges
 from service.server.server import Server
 from service.user_folders import PublicText
@@ -127,9 +127,7 @@ def _make_view(
         ranges = None
     calibration_view = None
     if calibration is not None and ranges is not None:
-        calibration_view = CalibrationView.from_calibration(
-            calibration, calibration.id, is_scale_assumed=ranges.is_scale_assumed
-        )
+        calibration_view = make_calibration_view(calibration, calibration.id, ranges)
     return ArrayView(
         session_id=session_id,
         node=info.node,

@@ -17,15 +17,15 @@ from service.protocol.codec import (
     SUBPROTOCOL,
     CloseConnection,
     LinkCloseCode,
-    decode_message,
-    encode_message,
+    decode_link_message,
+    encode_link_message,
     format_close_reason,
     strip_binary_crc,
 )
 from service.protocol.link import (
-    LINK_MESSAGES,
     LINK_TIMEOUT_S,
     MESSAGE_BYTES_MAX,
+    NODE_MESSAGES,
     PROTOCOL,
     Ack,
     ClockProbe,
@@ -94,7 +94,7 @@ async def _challenge_node(socket: WebSocket, server: Server, offered: list[str])
         )
     with _close_on_storage_error():
         challenge = server.identities.read_secret_and_make_challenge(who.node, server.id)
-    await send_message(socket, encode_message(challenge))
+    await send_message(socket, encode_link_message(challenge))
     answer = _require_message(Proof, await _receive_message(socket))
     client = socket.client
     return IdentityClaim(who.node, challenge, answer, client.host if client is not None else "")
@@ -114,7 +114,7 @@ def _require_message(kind: type[_Message], message: str | bytes) -> _Message:
     name = kind.model_fields["type"].default
     if isinstance(message, bytes):
         raise CloseConnection(LinkCloseCode.REFUSED, f"{name} was expected, in text")
-    parsed = decode_message(LINK_MESSAGES, message)
+    parsed = decode_link_message(NODE_MESSAGES, message)
     if not isinstance(parsed, kind):
         raise CloseConnection(LinkCloseCode.REFUSED, f"{name} was expected, not {parsed.type}")
     return parsed
@@ -193,7 +193,7 @@ async def _send_welcome(socket: WebSocket, server: Server, link: NodeLink) -> No
     link.retention_request = server.recorder.make_retention_request(node.name)
     lacks = node.needed_and_present_frames_to_request(server.recorder.needed_frames(node.name))
     welcome = Welcome(protocol=PROTOCOL, missing=lacks, retention=link.retention_request)
-    await send_message(socket, encode_message(welcome))
+    await send_message(socket, encode_link_message(welcome))
     log.info("node %s connected, stream %s", node.name, node.stream_id)
     server.notify_node_changed(node)
 
@@ -235,7 +235,7 @@ async def _receive_messages(socket: WebSocket, server: Server, link: NodeLink) -
             if node.estimator.live.tare_in_use_unless_lost is not tare_before:
                 server.notify_node_changed(node)
             continue
-        parsed = decode_message(LINK_MESSAGES, message)
+        parsed = decode_link_message(NODE_MESSAGES, message)
         match parsed:
             case ClockProbe(id=number):
                 await _answer_probe(socket, ClockProbe(id=number, server_t_ns=server_utc_ns()))
@@ -249,8 +249,8 @@ async def _receive_messages(socket: WebSocket, server: Server, link: NodeLink) -
                 server.notify_node_changed(node)
             case LossReport():
                 _find_announced_stream(node, parsed.stream_id).set_node_losses(parsed.lost)
-            case _:
-                raise CloseConnection(LinkCloseCode.REFUSED, f"{parsed.type} is not expected here")
+            case Identify() | Proof() | Hello():
+                raise CloseConnection(LinkCloseCode.REFUSED, f"{parsed.type} was sent before")
 
 
 def _find_announced_stream(node: ServerNode, stream_id: str) -> ServerStream:
@@ -262,7 +262,7 @@ def _find_announced_stream(node: ServerNode, stream_id: str) -> ServerStream:
 async def _answer_probe(socket: WebSocket, probe: ClockProbe) -> None:
     try:
         async with asyncio.timeout(LINK_TIMEOUT_S):
-            await send_message(socket, encode_message(probe))
+            await send_message(socket, encode_link_message(probe))
     except TimeoutError as error:  # else the silence of the node would go unnoticed
         raise CloseConnection(
             LinkCloseCode.SILENT, f"nothing was read for {LINK_TIMEOUT_S:g} s"
@@ -278,11 +278,11 @@ async def _send_updates(socket: WebSocket, server: Server, link: NodeLink) -> No
         wanted = server.recorder.make_retention_request(link.node.name)
         if wanted != link.retention_request:
             link.retention_request = wanted
-            await send_message(socket, encode_message(wanted))
+            await send_message(socket, encode_link_message(wanted))
         for stream_id, numbers in link.pop_acks().items():
             for first, last in numbers:
                 ack = Ack(stream_id=stream_id, seq_first=first, seq_last=last)
-                await send_message(socket, encode_message(ack))
+                await send_message(socket, encode_link_message(ack))
 
 
 async def _receive_message(socket: WebSocket) -> str | bytes:

@@ -19,7 +19,6 @@ from service.protocol.codec import (
     CloseConnection,
     LinkCloseCode,
     decode_message,
-    describe_complaint,
     encode_message,
     format_close_reason,
 )
@@ -71,7 +70,9 @@ class LiveFeedSession:
         except UsageError as error:
             raise CloseConnection(LinkCloseCode.POLICY, error.what) from error
         position = check_stream_and_get_requested_position(
-            self._node, query.stream_id, query.from_seq
+            self._node,
+            query.stream_id,
+            None if query.from_seq is None else int(query.from_seq),
         )
         node, self._memory = self._node, server.live_feeds.get_or_create(self._node.name)
         self._reader = FeedReader(
@@ -225,7 +226,14 @@ def _parse_query(kind: type[_Query], socket: WebSocket) -> _Query:
     try:
         return kind.model_validate(dict(socket.query_params))
     except ValidationError as error:
-        raise CloseConnection(LinkCloseCode.POLICY, describe_complaint(error)) from error
+        complaint = error.errors(include_url=False, include_context=False)[0]
+        name = str(complaint["loc"][0])
+        field = kind.model_fields.get(name)
+        if field is None:
+            what = f"unknown parameter {name[:30]!r}; known: {', '.join(kind.model_fields)}"
+        else:
+            what = f"{name}={complaint['input'][:40]!r}: expected {field.description}"
+        raise CloseConnection(LinkCloseCode.POLICY, what) from error
 
 
 def _make_hello(server: Server, node: str | None) -> PageHello:
@@ -254,7 +262,7 @@ async def _answer_pings(socket: WebSocket) -> None:
             return
         text = message.get("text") or ""
         try:
-            ping = decode_message(PING, text[:_PING_LENGTH_MAX])
+            ping = decode_message(PING, text if len(text) <= _PING_LENGTH_MAX else "")
         except CloseConnection as error:
             raise CloseConnection(
                 LinkCloseCode.POLICY, 'only {"type":"ping","t_ms":NUMBER} is accepted here'

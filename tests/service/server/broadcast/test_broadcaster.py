@@ -18,7 +18,7 @@ from service.protocol.codec import CloseConnection, LinkCloseCode
 from service.protocol.live import SessionDeleted
 from service.server.broadcast.broadcaster import RATES_HZ, Broadcaster, encode_websocket_messages
 from service.server.node import ServerNode
-from tests.builders.arrays import PERIOD_NS
+from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.frames import make_frames
 from tests.waiting import in_a_loop
 
@@ -70,6 +70,13 @@ def publish(hub: Broadcaster, node: ServerNode, first: int, rows: int) -> None:
 async def ticked(hub: Broadcaster, now_s: float = 0.0) -> None:
     for feed, _ in list(hub._groups.values()):
         await feed.send_update(now_s)
+
+
+def test_a_history_begins_anew_with_another_number_of_tiles() -> None:
+    hub, node = Broadcaster(), fake_node()
+    publish(hub, node, 0, 10)
+    cast(Any, node).last_info = make_array(3)
+    assert hub.get_present_stream_history(node).tile_count == 3
 
 
 @in_a_loop
