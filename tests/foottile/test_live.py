@@ -115,7 +115,7 @@ def test_frames_that_are_lost_are_told(running: Running, tared: FakeNode) -> Non
     [
         ({"node": "nobody"}, "no node 'nobody'"),
         ({"columns": ["colour"]}, "no column 'colour'"),
-        ({"policy": "all"}, "'drop_oldest'"),
+        ({"policy": "all"}, "drop_oldest"),
         ({"stream_id": "0" * 32, "from_seq": 1}, "no stream"),
     ],
 )

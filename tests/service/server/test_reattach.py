@@ -50,7 +50,7 @@ class Recorded:
         """The node connects with its one stream, or its copy with another one."""
         seq = self.taken[stream_id]
         self.told.connect(
-            info=self.told.info[stream_id],
+            array_info=self.told.info[stream_id],
             stored=((0, seq - 1),) if seq else (),
             next_seq=seq,
         )
@@ -113,7 +113,7 @@ def test_a_stream_that_did_not_come_back_is_gone_on_from_as_ever(tmp_path: Path)
     told = Told(tmp_path)
     recorded = Recorded(told)
     said = told.earlier(array_info=told.info[NEW], stored=((0, 4),), next_seq=5)
-    told.connect(info=told.info[OLD], earlier=(said,))
+    told.connect(array_info=told.info[OLD], earlier=(said,))
     recorded.follow()
     assert recorded.session.parts == (
         Part(stream_id=NEW, seq_first=0, seq_last=4),

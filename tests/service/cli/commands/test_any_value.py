@@ -164,7 +164,7 @@ PLACES: dict[str, Callable[[Path], object]] = {
 }
 FOLDERS = {"folder", "missing"}
 """What may stand where a folder is asked for."""
-FILES = {"missing", "empty", "junk", "hole", "no Parquet"}
+FILES = {"missing", "nowhere", "empty", "junk", "hole", "no Parquet"}
 """What may be written over."""
 
 
