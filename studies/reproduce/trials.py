@@ -22,13 +22,10 @@ CITED = (
     "Ruppert and Badri-Spröwitz, *FootTile: a Rugged Foot Sensor for Force and Center of Pressure "
     "Sensing in Soft Terrain*, 2020, arXiv 2005.09025"
 )
-CUBIC_R2 = 0.9999
-"""R2 of the cubic, equation 2, fitted to the mean over loadings; single loadings deviate more."""
 REPEATABILITY = 0.03
 """Standard deviation of the normalised output between loadings (III-A)."""
 DOME_RANGE_N = (25.0, 35.0)
 """Range of the 11 mm dome of Vytaflex 60 (III-A); none is stated for other domes."""
-LOADINGS = 4
 MAX_GRF_ERROR_N = 1.0
 """Upper bound of the mean GRF error (III)."""
 MAX_COP_ERROR_M = 0.004

@@ -99,6 +99,7 @@ def test_an_adapter_that_is_lost_at_any_transfer_is_a_fault_of_the_bus(
         with wires.fault("no_answer", "T02"):  # one tile is looked for, too
             array.scan_frame()
         wires.log.clear()
+        # mypy infers no type of a lambda with a default.
         wires.on_transaction = failing(19, lambda count, _, after=after: count > after)  # type: ignore[misc]
         assert_fault_of_the_bus(scanned(array, 10))
         wires.on_transaction = lambda _, __: None

@@ -126,7 +126,7 @@ def write_mcap1(folder: Path, samples: Sequence[Sample]) -> Path:
             raw = types.serialize_ros1(message(types, one, is_first=True), WRENCH)
             at_ns = one.logged_ns or one.t_ns
             writer.add_message(channels[one.topic], at_ns, bytes(raw), at_ns)
-        writer.finish()  # type: ignore[no-untyped-call]
+        writer.finish()  # type: ignore[no-untyped-call]  # mcap's is not annotated
     return path
 
 

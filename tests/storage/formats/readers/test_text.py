@@ -261,7 +261,7 @@ def test_names_are_read_in_the_stated_encoding(tmp_path: Path) -> None:
 )
 def test_impossible_text_options_are_wrong_usage(stated: dict[str, int | str]) -> None:
     with pytest.raises(UsageError, match="--"):
-        TextOptions(**stated)  # type: ignore[arg-type]
+        TextOptions(**stated)  # type: ignore[arg-type]  # mixed types of values
 
 
 def test_rows_that_are_not_there_are_refused(tmp_path: Path) -> None:
