@@ -99,8 +99,8 @@ class FrameSource:
         read_columns: reads the named flat columns, and possibly more, of frames in order, in
             chunks.
         begin_t_ns: `t_ns` of the session's first frame.
-        end_t_ns: latest instant on the time axis; None: `read` yields all frames of the session,
-            also outside of the slice, and can be called once.
+        end_t_ns: latest instant on the time axis; None: `read_columns` yields all frames of the
+            session, also outside of the slice, and can be called once.
         axis: time axis of the session.
     """
 

@@ -326,6 +326,7 @@ def recover_or_delete_segment(path: Path, schema: pa.Schema) -> RecoveredSegment
 
     Raises:
         OSError: it cannot be read or truncated.
+        StorageError: its index, or the bytes that are moved, cannot be written.
     """
     size = path.stat().st_size
     damaged, doubtful = Intervals(), Intervals()

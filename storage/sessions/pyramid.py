@@ -234,9 +234,9 @@ def shift_bins_to_axis(bins: Bins, axis: TimeAxis) -> Bins:
 def build_levels(finest: Bins) -> list[Bins]:
     """Return a level and its coarser ones, until one has at most `MAX_COARSEST_BINS` bins."""
     levels = [finest]
-    while len(levels[-1]["part"]) > MAX_COARSEST_BINS:
+    while count_bins(levels[-1]) > MAX_COARSEST_BINS:
         levels.append(merge_bins_within_parts(levels[-1], BINS_PER_COARSER_BIN))
-        if len(levels[-1]["part"]) == len(levels[-2]["part"]):  # parts of a bin each
+        if count_bins(levels[-1]) == count_bins(levels[-2]):  # parts of a bin each
             levels.pop()
             break
     return levels
@@ -389,5 +389,5 @@ def _copy_rows(bins: Bins, begin: int, end: int) -> Bins:
 
 
 def count_bins(bins: Bins) -> int:
-    """Count bins."""
+    """Return the number of bins."""
     return len(bins["part"])

@@ -173,7 +173,8 @@ def parse_lost_numbers(notes: dict[str, Any]) -> dict[str, Losses]:
         FileFormatError: they cannot be parsed.
     """
     try:
-        return {b: Losses(pairs) for b, pairs in _LOST.validate_python(notes.get("lost")).items()}
+        by_stream = _LOST.validate_python(notes.get("lost"))
+        return {stream_id: Losses(pairs) for stream_id, pairs in by_stream.items()}
     except (ValidationError, ValueError) as error:
         raise FileFormatError(f"the numbers that are lost are not readable: {error}") from error
 
@@ -420,6 +421,6 @@ def _parse_source(metadata: dict[bytes, bytes]) -> dict[str, Any]:
 def _parse_json_object(text: str | bytes) -> dict[str, Any]:
     try:
         source = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return {}
     return source if isinstance(source, dict) else {}

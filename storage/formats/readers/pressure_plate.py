@@ -101,9 +101,9 @@ def _read_arrays(path: Path, bytes_max: int) -> dict[str, Floats]:
             _check_archive_size(archive, bytes_max)
         with np.load(path, allow_pickle=False) as file:
             return {name: np.asarray(file[name], dtype=np.float64) for name in file.files}
-    except FileFormatError:
+    except (FileFormatError, MemoryError):
         raise
-    except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile) as error:
+    except Exception as error:  # damaged bytes lead to any error of zipfile, zlib and numpy
         raise FileFormatError(f"no arrays of numpy: {error}") from error
 
 
@@ -200,7 +200,10 @@ def _parse_frames(body: str, rows: int, columns: int, values_max: int) -> tuple[
         raise FileFormatError("the numbers of its frames do not rise")
     try:
         cells = np.loadtxt(
-            (line.upper().replace("B", "0") for line in lines), delimiter=",", ndmin=2
+            (re.sub(r"\bB\b", "0", line.upper()) for line in lines),
+            delimiter=",",
+            ndmin=2,
+            comments=None,
         )
     except ValueError as error:
         raise FileFormatError(f"a cell is no number: {error}") from error

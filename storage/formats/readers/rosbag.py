@@ -68,7 +68,7 @@ def read_bag_wrenches(path: Path, is_needed: ColumnFilter, values_max: int) -> F
                 check_regular_file(file)  # the libraries would block on a pipe or a device
         bag = _open_mcap(path) if path.suffix.lower() == ".mcap" else _open_rosbag(path)
         return _make_table(bag, is_needed, values_max)
-    except (FootTileError, ModuleNotFoundError):
+    except (FootTileError, ModuleNotFoundError, MemoryError):
         raise
     except Exception as error:  # libraries raise whatever damaged bytes lead to
         kind = type(error).__name__

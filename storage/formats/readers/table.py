@@ -197,7 +197,7 @@ def make_table_of_separate_plates(
             if found in units and units[found] not in SOLE_UNITS:
                 columns[ours], units[ours] = columns[found], units[found]
         (positive if plate.is_positive_under_load else signed_by_load).add("grf_n")
-    else:
+    elif len(plates) > 1:
         names = ", ".join(plate.name for plate in plates)
         all_notes.append(f"there are {len(plates)} plates or soles ({names}): --map says which one")
     columns["time_s"] = time_s

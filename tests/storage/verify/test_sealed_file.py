@@ -18,8 +18,12 @@ from devices.frames import FrameBatch
 from storage.parquet_hash import FOOTER_HASH_KEY, read_stated_and_actual_hash
 from storage.sessions.folder import Ledger, Part, PartLedger
 from storage.sessions.reader import SealedFileReader
-from storage.sessions.writer import SealedFileWriter
-from storage.verify.sealed_file import find_ledger_contradictions, verify_sealed_file
+from storage.sessions.writer import EXPORT_KEY, SealedFileWriter
+from storage.verify.sealed_file import (
+    find_ledger_contradictions,
+    recognise_export_and_check_not_cut_off,
+    verify_sealed_file,
+)
 from tests.builders.arrays import UTC_NS, make_array
 from tests.builders.frames import make_frames
 
@@ -226,3 +230,15 @@ def test_a_ledger_that_contradicts_itself_is_seen() -> None:
     assert len(said(True, True, counted(0, 9, evicted=3))) == 1
     assert len(said(True, True, counted(0, 9))) == 1
     assert said(True, False, counted(5, 4)) == []
+
+
+@pytest.mark.parametrize("source", [b"{", b"[1]", b"\xff", b"[" * 200_000])
+def test_an_export_is_recognised_when_its_source_cannot_be_read(
+    tmp_path: Path, source: bytes
+) -> None:
+    path = tmp_path / "export.parquet"
+    pq.write_table(pa.table({"t_ns": [1]}).replace_schema_metadata({EXPORT_KEY: source}), path)
+    report = recognise_export_and_check_not_cut_off(path)
+    assert report is not None
+    assert report.source == {}
+    assert report.problems == []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +108,26 @@ def test_arrays_that_are_too_large_are_refused_by_their_size(tmp_path: Path) -> 
         read_table(tmp_path / "plate.npz", lambda name: True, values_max=1)
 
 
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+def test_an_archive_with_a_flipped_bit_is_refused_or_has_the_same_numbers(
+    tmp_path: Path, save: Callable[..., None]
+) -> None:
+    path = tmp_path / "plate.npz"
+    save(path, **plate())
+    content, whole = path.read_bytes(), read_reference(path, ReferenceOptions())
+    refused = 0
+    for at in range(len(content)):
+        flipped = content[at] ^ 1 << at % 8
+        path.write_bytes(content[:at] + bytes([flipped]) + content[at + 1 :])
+        try:
+            found = read_reference(path, ReferenceOptions())
+        except FileFormatError:
+            refused += 1
+        else:
+            np.testing.assert_array_equal(found.grf_n, whole.grf_n)
+    assert refused > len(content) / 2
+
+
 @pytest.mark.parametrize("keep", [0.3, 0.6, 0.95])
 def test_an_archive_that_is_cut_off_is_refused(tmp_path: Path, keep: float) -> None:
     path = tmp_path / "plate.npz"
@@ -203,6 +223,9 @@ def test_a_mirrored_sensor_has_no_centre_of_pressure(tmp_path: Path) -> None:
         (text(SECONDS_PER_FRAME="inf"), "SECONDS_PER_FRAME is no time"),
         (text(FRAMES[:3], end=""), "it is cut off: its last frame is 3 of 4"),
         (text((*FRAMES[:3], "B,0\n100,100\n0,x")), "a cell is no number"),
+        (text((*FRAMES[:3], "1B,0\n100,100\n0,1")), "a cell is no number"),
+        (text((*FRAMES[:3], "B,B1\n100,100\n0,1")), "a cell is no number"),
+        (text((*FRAMES[:3], "B,0\n100,100\n0,4#9")), "a cell is no number"),
         (text((*FRAMES[:3], "B,0\n100,100\n0,inf")), "a cell is not finite"),
         (text((*FRAMES[:3], "B,0\n100,100\n0")), "frame 4 has not 3 rows of 2 cells"),
         (text().replace("Frame 2", "Frame 1"), "the numbers of its frames do not rise"),
