@@ -18,9 +18,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 TURN = os.environ.get("FOOTTILE_TURN")
-"""Number of the run of continuous integration; None: all tests are run."""
+"""Number of the run, of which the part in turn follows; None: all tests are run."""
 PARTS = 4
-"""Number of parts of the tests marked `in_turn`; a run plays one part."""
+"""Number of parts of the slow tests; a run plays one part."""
 
 # Failed assertions of builders show their values, as those of tests do.
 pytest.register_assert_rewrite("tests.builders")
@@ -53,13 +53,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def is_of_this_run(item: pytest.Item) -> bool:
-    """Return whether this run plays a test marked `in_turn`. Without a turn it plays all.
+    """Return whether this run plays a slow test. Without a turn it plays all.
 
-    A run plays a quarter of the files, and of files marked `in_turn(each=True)` a quarter of the
-    tests.
+    A run plays a quarter of the tests marked `slow`, and a quarter of the files marked `in_turn`.
     """
-    mark = item.get_closest_marker("in_turn")
-    name = item.name if mark is not None and mark.kwargs.get("each") else item.path.name
+    name = item.path.name if item.get_closest_marker("in_turn") else item.name
     return TURN is None or hashlib.sha256(name.encode()).digest()[0] % PARTS == int(TURN) % PARTS
 
 
@@ -71,7 +69,8 @@ def pytest_report_header() -> str | None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     plays_all = config.getoption("--soak")
     for item in items:
-        if item.get_closest_marker("in_turn") and (plays_all or not is_of_this_run(item)):
+        is_slow = item.get_closest_marker("slow") or item.get_closest_marker("in_turn")
+        if is_slow and (plays_all or not is_of_this_run(item)):
             item.add_marker(pytest.mark.soak)
         if not plays_all and item.get_closest_marker("soak"):
             item.add_marker(pytest.mark.skip(reason="takes long; run with --soak"))

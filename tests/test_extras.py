@@ -54,7 +54,7 @@ def foottile(*words: object, **environment: str) -> subprocess.CompletedProcess[
     )
 
 
-@pytest.mark.in_turn(each=True)
+@pytest.mark.slow
 def test_a_node_that_records_alone_seals_raw_frames_and_estimates_are_added_later(
     tmp_path: Path, without_server: dict[str, str]
 ) -> None:
@@ -88,7 +88,7 @@ def test_a_node_that_records_alone_seals_raw_frames_and_estimates_are_added_late
     assert grf_n[-50:].mean() > 3.0
 
 
-@pytest.mark.in_turn(each=True)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "extra"),
     [

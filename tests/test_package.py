@@ -118,6 +118,7 @@ def names_in(wheel: Path) -> set[str]:
     return {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
 
 
+@pytest.mark.slow
 def test_a_wheel_holds_every_file_of_the_packages_and_the_page_and_no_more(
     wheels: dict[str, Path],
 ) -> None:
@@ -137,7 +138,7 @@ def test_a_wheel_holds_every_file_of_the_packages_and_the_page_and_no_more(
     }
 
 
-@pytest.mark.in_turn(each=True)
+@pytest.mark.slow
 @pytest.mark.parametrize("source", ["checkout", "sdist", "image"])
 def test_a_wheel_alone_runs_its_command(
     source: str, wheels: dict[str, Path], tmp_path: Path
@@ -218,7 +219,7 @@ def container_commands(folder: Path) -> list[list[str]]:
     ]
 
 
-@pytest.mark.in_turn(each=True)
+@pytest.mark.slow
 def test_containers_run_commands_that_there_are(tmp_path: Path) -> None:
     commands = container_commands(tmp_path)
     assert [words[0] for words in commands] == ["serve", "serve", "--help", "node"]
@@ -232,7 +233,7 @@ def test_containers_run_commands_that_there_are(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.in_turn(each=True)
+@pytest.mark.slow
 def test_an_installed_wheel_and_a_checkout_both_find_the_page(
     wheels: dict[str, Path], tmp_path: Path
 ) -> None:

@@ -28,6 +28,7 @@ def rows(said: str) -> list[str]:
     return [line.split()[1] for line in said.splitlines() if line[:3] in ("| 1", "| 2")]
 
 
+@pytest.mark.slow
 def test_each_number_of_nodes_has_its_row_and_no_frame_is_lost(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -36,6 +37,7 @@ def test_each_number_of_nodes_has_its_row_and_no_frame_is_lost(
     assert said.count(" frames 0 are lost") == 2
 
 
+@pytest.mark.slow
 def test_a_long_run_ends_with_whole_sessions_and_a_download(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

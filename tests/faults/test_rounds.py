@@ -78,7 +78,7 @@ def test_a_seed_is_a_story_and_nobody_is_asked_to_fill_a_disk_who_may_not() -> N
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=() if name in IN_EVERY_RUN else pytest.mark.in_turn(each=True))
+        pytest.param(name, marks=() if name in IN_EVERY_RUN else pytest.mark.slow)
         for name in (*STORIES, *STORIES_ALONE)
     ],
 )
@@ -166,7 +166,7 @@ def test_a_server_that_dies_at_each_call_of_stopping_and_sealing_leaves_every_se
 
 
 @pytest.mark.real_time
-@pytest.mark.in_turn(each=True)
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [pytest.param("killed", marks=pytest.mark.soak), "power"])
 def test_a_server_that_dies_at_syncs_of_its_journal_keeps_what_it_has_promised(
     stage: Stage, how: str
@@ -186,7 +186,7 @@ def test_a_server_that_dies_at_syncs_of_its_journal_keeps_what_it_has_promised(
 
 
 @pytest.mark.real_time
-@pytest.mark.in_turn(each=True)
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [pytest.param("killed", marks=pytest.mark.soak), "power"])
 def test_a_node_killed_at_syncs_of_its_journal_loses_no_more_than_it_says(
     stage: Stage, how: str

@@ -89,6 +89,7 @@ def test_the_readme_plots_what_was_pulled_over_seconds(
     assert Path("grf.png").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_every_line_for_the_shell_runs(
     running: Running, left: FakeNode, foottile: Start, tmp_path: Path
 ) -> None:
@@ -102,7 +103,7 @@ def test_every_line_for_the_shell_runs(
         assert not process.err
 
 
-@pytest.mark.in_turn
+@pytest.mark.slow
 def test_the_matlab_example_runs_in_octave(
     running: Running, left: FakeNode, tmp_path: Path
 ) -> None:

@@ -23,7 +23,7 @@ for _path in sorted(Path(__file__).parent.glob("attack_*.py")):
 
 
 @pytest.mark.process
-@pytest.mark.in_turn(each=True)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "attack",
     [

@@ -395,20 +395,30 @@ NodeOf = Callable[..., FakeNode]
 
 
 class Play:
-    """A node that streams in real time until it is told to stop."""
+    """A node that streams until it is told to stop.
+
+    It streams in real time, or goes on from its last frame, so many times faster until then.
+    """
 
     def __init__(
-        self, node: FakeNode, force_n: float | Sequence[float] = 0.0, *, alive: bool = False
+        self,
+        node: FakeNode,
+        force_n: float | Sequence[float] = 0.0,
+        *,
+        alive: bool = False,
+        catch_up: int | None = None,
     ) -> None:
         self.node = node
         self.force_n = force_n
         self.alive = alive
+        self.catch_up = catch_up
         self.problem: BaseException | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="play")
 
     def __enter__(self) -> Play:
-        self.node.next_t_mono_ns = time.monotonic_ns()
+        if self.catch_up is None:
+            self.node.next_t_mono_ns = time.monotonic_ns()
         self._thread.start()
         return self
 
@@ -420,8 +430,11 @@ class Play:
     def _run(self) -> None:
         try:
             # Alive, enough at once that some of them move.
-            while not self._stop.wait(0.05 if self.alive else 0.02):
+            every_s = 0.05 if self.alive else 0.02
+            while not self._stop.wait(every_s):
                 due = (time.monotonic_ns() - self.node.next_t_mono_ns) // PERIOD_NS
+                if self.catch_up is not None:
+                    due = min(due, round(1e9 * self.catch_up * every_s / PERIOD_NS))
                 if due > 0:
                     self.node.send(int(due), self.force_n, alive=self.alive)
         except ConnectionClosed as end:

@@ -146,6 +146,7 @@ def test_a_request_of_too_many_streams_is_not_understood(place: tuple[str, ...])
         decode(with_value(content, place, [*streams, streams[0]]), SERVER_MESSAGES)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=1500)
 @given(data=st.data())
 def test_what_is_taken_can_be_written_down_and_read_back_as_the_same(data: st.DataObject) -> None:

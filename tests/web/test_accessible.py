@@ -13,7 +13,7 @@ from tests.web.pages import DESK, PHONE, OpenPage, complaints, complaints_at, li
 from tests.web.scripted import Scripted
 from tests.web.session_rows import choose, open_menu
 
-pytestmark = [pytest.mark.real_time, pytest.mark.in_turn(each=True)]
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 
 def test_without_a_node(server: Running, open_page: OpenPage) -> None:

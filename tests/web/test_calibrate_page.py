@@ -14,7 +14,7 @@ from tests.waiting import until
 from tests.web.pages import DESK, PHONE, OpenPage, complaints, complaints_at, width_of
 from tests.web.scripted import Scripted
 
-pytestmark = [pytest.mark.real_time, pytest.mark.in_turn(each=True)]
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 FORCES_N = (10, 20, 40, 60, 80)
 """A count of the chip is a newton: what the form offers would be too near each other."""

@@ -17,7 +17,7 @@ from tests.web.pages import DESK, PHONE, OpenPage, complaints, complaints_at
 from tests.web.received import Received
 from tests.web.scripted import Scripted
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 JSON = {"Content-Type": "application/json"}
 

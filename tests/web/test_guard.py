@@ -15,7 +15,7 @@ from tests.waiting import until
 from tests.web.pages import DESK, LIVE, PHONE, TOKEN, OpenPage, complaints, complaints_at, live
 from tests.web.scripted import Scripted
 
-pytestmark = [pytest.mark.real_time, pytest.mark.in_turn(each=True)]
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 Answer = Callable[[Route], object]
 PAGES = ("/", "/nodes", "/calibrate", "/docs", "/sessions", "/sessions/none")

@@ -19,7 +19,7 @@ from tests.web.pages import (
 )
 from tests.web.scripted import Scripted
 
-pytestmark = [pytest.mark.real_time, pytest.mark.in_turn(each=True)]
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 SCREENS = ((1280, 800), PHONE, SMALL_PHONE)
 HIDDEN_BY_WARNING = """() => {

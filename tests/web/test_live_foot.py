@@ -26,7 +26,7 @@ from tests.web.pages import (
 from tests.web.scripted import Scripted
 from tests.web.session_page import settled
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 
 OF_THEIR_FORCE = """async () => {

@@ -15,7 +15,7 @@ from tests.waiting import until
 from tests.web.pages import LIVE, OpenPage, blue_px, live
 from tests.web.scripted import Scripted
 
-pytestmark = [pytest.mark.real_time, pytest.mark.in_turn(each=True)]
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 
 JOINED = """async () => {

@@ -45,6 +45,7 @@ def test_a_warning_links_to_a_section_that_is_there() -> None:
 
 
 @pytest.mark.real_time
+@pytest.mark.slow
 def test_a_warning_says_since_when_and_why_and_stays_open(
     scripted: Scripted, open_page: OpenPage
 ) -> None:

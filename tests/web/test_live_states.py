@@ -18,7 +18,7 @@ from tests.web.pages import LIVE, OpenPage, live
 from tests.web.scripted import Scripted
 from tests.web.session_rows import choose, open_menu, row_of
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 NOTE_WHAT_IS_FROZEN = """() => {
   const place = document.querySelector("#frozen");

@@ -13,7 +13,7 @@ from tests.service.fake_node import FakeNode, Play
 from tests.web.pages import DESK, PHONE, OpenPage, at_sizes, live, width_of
 from tests.web.scripted import Scripted
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 PLACES = """() => Object.fromEntries(
   ["grf-card", "trace-card", "pause", "foot-card", "foot", "bars-card", "bars", "actions", "record"]

@@ -14,7 +14,7 @@ from tests.waiting import until
 from tests.web.pages import DESK, PHONE, OpenPage, blue_px, complaints, complaints_at
 from tests.web.scripted import Scripted
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 
 def card(node: str) -> str:

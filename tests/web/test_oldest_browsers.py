@@ -73,6 +73,7 @@ def test_the_oldest_browsers_are_the_same_everywhere(path: str) -> None:
 
 @SIZES
 @pytest.mark.real_time
+@pytest.mark.slow
 def test_an_old_browser_in_a_network_records_markers_and_looks_back(
     scripted: Scripted, open_page: OpenPage, size: tuple[int, int]
 ) -> None:

@@ -13,7 +13,7 @@ from tests.web.pages import OpenPage, live
 from tests.web.scripted import Scripted
 from tests.web.session_page import settled
 
-pytestmark = [pytest.mark.real_time, pytest.mark.in_turn(each=True)]
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 HOSTILE = "x\x1b[2J\x07\u202ecba\u2066\u200b\ufeff\u00ad\ud800\u2028end"
 SHOWN = r"x\x1b[2J\x07\u202ecba\u2066\u200b\ufeff\xad\ud800\u2028end"

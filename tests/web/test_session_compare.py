@@ -18,7 +18,7 @@ from tests.service.running import Running
 from tests.web.pages import DESK, PHONE, OpenPage, complaints_at
 from tests.web.session_page import grf
 
-pytestmark = [pytest.mark.real_time, pytest.mark.in_turn(each=True)]
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 
 PLATE = "plate <b>1"

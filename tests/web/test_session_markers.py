@@ -13,7 +13,7 @@ from tests.web.pages import OpenPage, complaints
 from tests.web.scripted import Scripted
 from tests.web.session_page import drag_in_plots, left_px, with_marker
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 
 @pytest.fixture

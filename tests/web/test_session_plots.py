@@ -15,7 +15,7 @@ from tests.waiting import until
 from tests.web.pages import OpenPage, box_of
 from tests.web.session_page import grf, recorded_walk, seen, settled, summary, url_of
 
-pytestmark = [pytest.mark.real_time, pytest.mark.in_turn(each=True)]
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from tests.service.recording import Recording
 from tests.service.running import Running
 from tests.web.pages import OpenPage, box_of
 
-pytestmark = [pytest.mark.real_time, pytest.mark.in_turn(each=True)]
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 
 ROLLED, SATURATED, UNREAD, LOST = 700, 50, 50, 300

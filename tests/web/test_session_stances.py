@@ -16,7 +16,7 @@ from tests.waiting import until
 from tests.web.pages import OpenPage, box_of, complaints, width_of
 from tests.web.session_page import settled
 
-pytestmark = [pytest.mark.real_time, pytest.mark.in_turn(each=True)]
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 
 STANCES = 12

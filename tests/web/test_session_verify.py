@@ -8,7 +8,7 @@ from playwright.sync_api import expect
 from tests.web.pages import OpenPage, complaints
 from tests.web.scripted import Scripted
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 
 def test_what_a_check_of_the_files_finds_is_said_in_plain_words(

@@ -20,7 +20,7 @@ from tests.web.login import log_in
 from tests.web.pages import OpenPage, complaints, width_of
 from tests.web.received import Received
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 
 MANY = 1000

@@ -16,7 +16,7 @@ from tests.web.pages import DESK, PHONE, OpenPage, at_sizes, box_of, complaints_
 from tests.web.scripted import Scripted
 from tests.web.session_rows import choose, open_menu, row_of
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 
 def test_recordings_that_run_at_once_are_all_shown_marked_and_stopped_one_by_one(

@@ -16,7 +16,7 @@ from tests.web.scripted import Scripted
 from tests.web.session_page import drag_in_plots, left_px, settled, with_marker
 from tests.web.session_rows import open_menu
 
-pytestmark = [pytest.mark.real_time, pytest.mark.in_turn(each=True)]
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 
 @pytest.fixture

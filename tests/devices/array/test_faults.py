@@ -30,7 +30,7 @@ from tests.builders.scenes import make_scene
 from tests.builders.witness import Verdict, Witness
 from tests.devices.rigs import FOUR, SCHEDULES, TWO_MUXES, Plugs, every_schedule
 
-pytestmark = [pytest.mark.slow, pytest.mark.in_turn(each=True)]
+pytestmark = pytest.mark.slow
 
 BEGIN_S, LENGTH_S, RECOVERED_S, RUN_S = 0.5, 0.4, 1.2, 2.35
 END_S = BEGIN_S + LENGTH_S

@@ -244,6 +244,7 @@ finally:
 """
 
 
+@pytest.mark.slow
 @needs_networks
 @pytest.mark.process
 def test_client_and_node_reach_every_address(tmp_path: Path) -> None:

@@ -65,6 +65,7 @@ def wait_until_away_s(running: Running, begin_s: float) -> float:
     return time.monotonic() - begin_s
 
 
+@pytest.mark.slow
 def test_a_node_out_of_reach_is_away_five_seconds_after_its_last_message(
     running: Running, link: Proxy, far: FakeNode
 ) -> None:
@@ -79,6 +80,7 @@ def test_a_node_out_of_reach_is_away_five_seconds_after_its_last_message(
     assert_refused(refused, 409, "sends no frames")
 
 
+@pytest.mark.slow
 def test_a_node_that_does_not_read_is_away_as_soon(
     running: Running, link: Proxy, far: FakeNode
 ) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -56,15 +56,25 @@ def list_labels(running: Running, session_id: str) -> list[str]:
 
 
 @contextmanager
+def late_node(running: Running, lag_s: float) -> Iterator[FakeNode]:
+    """A tared node whose frames are this old: it can stream faster than real time."""
+    with closing(FakeNode(running)) as node:
+        node.next_t_mono_ns = time.monotonic_ns() - round(1e9 * lag_s)
+        node.connect()
+        node.tared()
+        yield node
+
+
+@contextmanager
 def person(
-    node: FakeNode, put_on_n: Callable[[float], float] = float
+    running: Running, lag_s: float, put_on_n: Callable[[float], float] = float
 ) -> Iterator[Callable[[str], dict[str, Any]]]:
     """Put on each requested weight, or another force; yield a wait for a state."""
-    with Play(node, alive=True) as play:
+    with late_node(running, lag_s) as node, Play(node, alive=True, catch_up=15) as play:
 
         def wait_for(state: str) -> dict[str, Any]:
             end_s = time.monotonic() + 120.0
-            while (found := get(node.running))["state"] != state:
+            while (found := get(running))["state"] != state:
                 assert time.monotonic() < end_s, found
                 if found["prompt"].startswith("Put "):
                     tile = next(one for one in found["tiles"] if one["serial"] == found["tile"])
@@ -73,17 +83,15 @@ def person(
                     play.force_n = put_on_n(weight.force_n)
                 elif found["step"] == "empty":
                     play.force_n = 0.0
-                time.sleep(0.05)
+                time.sleep(0.01)
             return found
 
         yield wait_for
 
 
 @pytest.mark.slow
-def test_tiles_are_calibrated_in_turn_and_the_node_uses_the_result(
-    running: Running, tared: FakeNode
-) -> None:
-    with person(tared) as wait_for:
+def test_tiles_are_calibrated_in_turn_and_the_node_uses_the_result(running: Running) -> None:
+    with person(running, 90.0) as wait_for:
         began = start(running, tiles=["T02", "T01"], within_percent=0.5, name="left leg")
         assert began["prompt"] == "Take everything off T02"
         done = wait_for("done")
@@ -153,8 +161,8 @@ def test_a_node_has_one_calibration_and_only_its_client_ends_it(
         assert running.http.request(method, url).status_code == 404
 
 
-def test_a_repeated_weight_loses_its_markers(running: Running, tared: FakeNode) -> None:
-    with Play(tared, alive=True) as play:
+def test_a_repeated_weight_loses_its_markers(running: Running) -> None:
+    with late_node(running, 20.0) as node, Play(node, alive=True, catch_up=5) as play:
         id_ = start(running)["session_id"]
         until(lambda: get(running)["step"] == "put on")
         play.force_n = 20.0
@@ -200,8 +208,8 @@ def test_a_calibration_fails_with_its_node_or_its_recording(
 
 
 @pytest.mark.slow
-def test_a_refused_fit_has_its_reason(running: Running, tared: FakeNode) -> None:
-    with person(tared, lambda force_n: min(force_n, 40.0)) as wait_for:
+def test_a_refused_fit_has_its_reason(running: Running) -> None:
+    with person(running, 45.0, lambda force_n: min(force_n, 40.0)) as wait_for:
         id_ = start(running)["session_id"]
         found = wait_for("failed")
     assert "expected a pressure that rises with the weight" in found["problem"]

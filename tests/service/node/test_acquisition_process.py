@@ -47,6 +47,7 @@ def process(running: Running, foottile: Start, tmp_path: Path) -> Process:
     return started
 
 
+@pytest.mark.slow
 def test_acquisition_that_is_held_up_is_said_everywhere_and_goes_on_in_the_same_stream(
     running: Running, process: Process
 ) -> None:
@@ -70,6 +71,7 @@ def test_acquisition_that_is_held_up_is_said_everywhere_and_goes_on_in_the_same_
     assert after["missed_slots"] > before["missed_slots"], "what was missed is counted"
 
 
+@pytest.mark.slow
 def test_acquisition_that_is_killed_ends_the_node_with_the_reason(
     running: Running, process: Process
 ) -> None:
@@ -191,6 +193,7 @@ def test_emulated_tiles_are_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> N
     assert failed.error is NOT_YET[0]
 
 
+@pytest.mark.slow
 def test_a_node_waits_for_its_bus_says_so_once_and_stops_when_told(
     foottile: Start, tmp_path: Path
 ) -> None:

@@ -65,6 +65,7 @@ def test_an_emulated_node_streams_tares_and_ends_without_loss(
     np.testing.assert_array_equal(seqs, np.arange(node["last_seq"] + 1))
 
 
+@pytest.mark.slow
 def test_a_servo_that_is_silent_from_the_start_is_said_and_the_tiles_stream(
     running: Running, foottile: Start, scene: Path
 ) -> None:
@@ -88,6 +89,7 @@ def test_a_servo_that_is_silent_from_the_start_is_said_and_the_tiles_stream(
     assert all((b.servo_counts == NO_SERVO_COUNTS).all() for b in batches)
 
 
+@pytest.mark.slow
 def test_a_tile_that_does_not_answer_is_named(
     running: Running, foottile: Start, scene: Path
 ) -> None:
@@ -99,6 +101,7 @@ def test_a_tile_that_does_not_answer_is_named(
     assert not any("Traceback" in line for line in process.err)
 
 
+@pytest.mark.slow
 def test_acquisition_ends_when_its_node_is_killed(
     running: Running, foottile: Start, scene: Path
 ) -> None:
@@ -112,6 +115,7 @@ def test_acquisition_ends_when_its_node_is_killed(
     until(lambda: not running.node("demo")["connected"])
 
 
+@pytest.mark.slow
 def test_a_node_without_a_server_keeps_its_frames(
     running: Running, foottile: Start, scene: Path, tmp_path: Path
 ) -> None:
@@ -174,6 +178,7 @@ def test_a_killed_node_has_lost_nothing_and_its_session_goes_on(
     assert again.ended(12.0) == 0, again.err
 
 
+@pytest.mark.slow
 def test_a_node_whose_own_files_are_damaged_starts_says_so_and_loses_no_more_than_it_says(
     running: Running, leg: Callable[..., Any], tmp_path: Path
 ) -> None:
@@ -217,6 +222,7 @@ def test_a_node_whose_own_files_are_damaged_starts_says_so_and_loses_no_more_tha
     assert again.ended(12.0) == 0, again.err
 
 
+@pytest.mark.slow
 def test_frames_of_a_session_wait_on_the_nodes_disk_until_both_are_back(
     running: Running, leg: Callable[..., Any], tmp_path: Path
 ) -> None:
@@ -239,6 +245,7 @@ def test_frames_of_a_session_wait_on_the_nodes_disk_until_both_are_back(
     assert again.ended(20.0) == 0, again.err
 
 
+@pytest.mark.slow
 def test_a_node_alone_leaves_a_complete_session_that_proves_itself(
     leg: Callable[..., Any], foottile: Start, tmp_path: Path
 ) -> None:
@@ -258,6 +265,7 @@ def test_a_node_alone_leaves_a_complete_session_that_proves_itself(
     assert (session["complete"], len(session["parts"])) == (True, 2)
 
 
+@pytest.mark.slow
 def test_a_part_that_is_swapped_begins_a_new_stream_and_loses_nothing_of_the_old_one(
     running: Running, foottile: Start, scene: Path
 ) -> None:
@@ -286,6 +294,7 @@ def test_a_part_that_is_swapped_begins_a_new_stream_and_loses_nothing_of_the_old
     assert (again.tile_flags[20:, 1] & TileFlag.UNUSABLE == 0).mean() > 0.99
 
 
+@pytest.mark.slow
 def test_a_tile_that_dies_is_named_on_the_terminal_and_by_the_server_and_so_is_its_return(
     running: Running, foottile: Start, scene: Path
 ) -> None:

@@ -19,6 +19,7 @@ from service.offline.simulation import EmulatedRun, SimulationOptions
 from service.rig.emulated_foot import EmulatedFoot
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None)
 @given(
     protocol=st.sampled_from([1, 2]),

@@ -162,6 +162,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("sliced")
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(
     parts=st.lists(boots, min_size=1, max_size=3),

@@ -9,7 +9,7 @@ from studies.benchmark.draws import DrawTask, list_model_sets, run_draw
 from studies.benchmark.run import BenchmarkOptions, run_benchmark, run_draws
 
 
-@pytest.mark.in_turn(each=True)
+@pytest.mark.slow
 @pytest.mark.process
 def test_draws_in_processes_of_their_own_give_the_same() -> None:
     scene = load_scene("rolling").model_copy(
@@ -31,7 +31,7 @@ def test_a_draw_that_cannot_be_made_is_a_failure_and_no_end() -> None:
     assert "nowhere.json" in result.failures[0].why
 
 
-@pytest.mark.in_turn(each=True)
+@pytest.mark.slow
 def test_a_foot_with_a_bare_tile_is_measured_and_timed() -> None:
     scene = load_scene("mud").model_copy(
         update={"calibration": "paper-eq2-shape", "models": ("unwrap", "static")}

@@ -38,7 +38,6 @@ def test_every_condition_differs_from_the_clean_one_in_one_thing_only() -> None:
     assert len(cases) == 13
 
 
-@pytest.mark.in_turn(each=True)
 @pytest.mark.slow
 def test_an_array_is_judged_in_both_modes_and_its_tiles_are_told() -> None:
     scene = broad("poppy").model_copy(update={"models": ("unwrap", "static")})

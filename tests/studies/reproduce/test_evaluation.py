@@ -23,7 +23,7 @@ from studies.reproduce.result import (
 )
 from studies.reproduce.trials import POPPY, ROLLING, ExperimentSetup
 
-pytestmark = [pytest.mark.slow, pytest.mark.in_turn(each=True)]
+pytestmark = pytest.mark.slow
 
 
 def recorded(

@@ -54,7 +54,6 @@ def test_every_dome_is_pressed_past_its_expected_end_and_within_the_mill_s_range
     assert max(loads_n) < 50.0
 
 
-@pytest.mark.in_turn(each=True)
 @pytest.mark.slow
 def test_a_dome_that_is_pressed_is_found_to_saturate_where_it_does() -> None:
     found = evaluate_dome(

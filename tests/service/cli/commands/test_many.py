@@ -85,6 +85,7 @@ def test_a_damaged_session_among_many_gives_exit_code_1(run: Run, data: Path) ->
     assert "pull a damaged session again" in done.out.lower()
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_an_interrupted_and_then_killed_client_goes_on_and_leaves_the_same_files(
     run: Run, made: Path, tmp_path: Path

@@ -143,6 +143,7 @@ def test_a_second_server_on_the_same_port_or_folder_is_refused(
     done.fails(1, "another foottile server uses this data folder")
 
 
+@pytest.mark.slow
 def test_a_demo_prints_one_link_that_logs_a_browser_in_and_commands_need_no_token(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -202,6 +203,7 @@ def test_settings_come_from_option_environment_and_file_in_that_order(
     done.fails(2, "prot")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])  # noqa: S104  # of this test
 def test_a_token_is_made_kept_and_asked_for_and_commands_of_its_user_find_it(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, host: str

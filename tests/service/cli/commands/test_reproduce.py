@@ -15,7 +15,7 @@ from tests.service.cli.outcome import Run
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.in_turn(each=True)
+@pytest.mark.slow
 def test_a_quick_look_goes_from_the_mill_to_the_figures_through_node_and_server(
     run: Run, tmp_path: Path
 ) -> None:
@@ -62,7 +62,7 @@ class Lab:
         raise FootTileError(f"node {trial.name} has ended by itself, with code 1")
 
 
-@pytest.mark.in_turn(each=True)
+@pytest.mark.slow
 def test_a_trial_that_fails_twice_fails_alone_with_exit_code_3(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

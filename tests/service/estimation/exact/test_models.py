@@ -144,6 +144,7 @@ def test_ambient_is_within_a_micropascal(seed: int) -> None:
     assert digits.apart(found[:, None], expected) < GOAL
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("look_ms", [0, 10, 100])
 @pytest.mark.parametrize("kind", ["still", "moving", "uneven", "few", "crowded"])
 @pytest.mark.parametrize("lasts", [0.0, 0.6])

@@ -81,6 +81,7 @@ def in_pieces(source: Path, folder: Path, asked: EstimateRequest, piece_frames: 
     return out.read_bytes() + (folder / "stances.parquet").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [
@@ -116,6 +117,7 @@ def static(raw: Path, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return in_one_go(raw, tmp_path_factory.mktemp("whole"), request(models=("static",)))
 
 
+@pytest.mark.slow
 @settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(lost=st.lists(st.tuples(st.integers(0, 6), st.sampled_from(["json", "npz", "parquet"]))))
 def test_a_kill_at_any_time_costs_the_piece_that_was_not_finished(

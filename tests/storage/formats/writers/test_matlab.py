@@ -124,7 +124,7 @@ def test_a_matrix_of_another_length_than_its_head_states_is_no_file(
         written(sealed)
 
 
-@pytest.mark.in_turn
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("octave-cli") is None, reason="Octave is not installed")
 def test_octave_reads_it(sealed: Path, tmp_path: Path) -> None:
     path = tmp_path / "session.mat"

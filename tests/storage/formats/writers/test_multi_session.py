@@ -300,7 +300,7 @@ def test_sessions_are_structs_with_the_same_fields() -> None:
     np.testing.assert_array_equal(left["force_n"], walk()["force_n"].astype(np.float32))
 
 
-@pytest.mark.in_turn
+@pytest.mark.slow
 def test_octave_reads_an_array_of_structs(tmp_path: Path) -> None:
     octave = shutil.which("octave-cli") or shutil.which("octave")
     if octave is None:

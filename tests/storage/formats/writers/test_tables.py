@@ -239,7 +239,7 @@ def _values(cell: ElementTree.Element) -> list[Any]:
     return [value] * times
 
 
-@pytest.mark.in_turn
+@pytest.mark.slow
 @pytest.mark.process
 @pytest.mark.soak
 @pytest.mark.skipif(OFFICE is None, reason="LibreOffice is not installed: libreoffice-calc-nogui")
