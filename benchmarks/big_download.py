@@ -18,7 +18,7 @@ from pathlib import Path
 import httpx
 from many_sessions import sealed
 
-from storage.checksummed_json import write_checksummed_json
+from storage.documents import write_checksummed_json
 from storage.parquet_hash import compute_sha256
 from storage.sessions.folder import FRAMES_NAME
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from service.api.routes.recordings.sessions import list_sessions
 from service.server.server import TICK_S, Server
-from storage.checksummed_json import write_checksummed_json
+from storage.documents import write_checksummed_json
 from storage.sessions.folder import Ledger, Part, PartLedger, Session
 
 ROUNDS = 7

@@ -14,7 +14,7 @@ from urllib.parse import quote
 
 import foottile
 from devices.errors import DamagedFileError, UsageError
-from storage.checksummed_json import read_checksummed_json, write_checksummed_json
+from storage.documents import read_checksummed_json, write_checksummed_json
 from storage.durable_files import (
     LOCK_NAME,
     make_synced_folder,

@@ -7,15 +7,16 @@ user may read them.
 from __future__ import annotations
 
 import errno
-import json
 import os
-import re
 import stat
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Annotated
 
-from devices.errors import DamagedFileError, StorageError, is_utf8_encodable
-from storage.checksummed_json import read_checksummed_json, write_checksummed_json
+from pydantic import BaseModel, ConfigDict, Field
+
+from devices.errors import StorageError, is_utf8_encodable
+from storage.documents import read_document, write_document
 from storage.durable_files import (
     LOCK_NAME,
     make_synced_folder,
@@ -24,7 +25,7 @@ from storage.durable_files import (
 )
 
 _OUR_NAMES = {
-    *(LOCK_NAME, ".writable", "journal", "nodes", "server_id", "sessions", "token", "trash"),
+    *(LOCK_NAME, ".writable", "journal", "nodes", "server.json", "sessions", "token", "trash"),
     "demo",  # a data folder of its own, within the user's
     "servers",  # foottile.local_server keeps it beside a node's journal
 }
@@ -79,30 +80,27 @@ def _has_only_our_files(folder: Path) -> bool:
 
 
 SECRETS_NAME = "secrets.json"
-_SECRET = re.compile(r"[0-9a-f]{64}")
 _OWNER_ONLY = 0o600
 """File permissions, also in a folder that its owner has opened to a group."""
+
+
+class _Secrets(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    secrets: dict[str, Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]]
 
 
 def read_secrets_or_empty(path: Path) -> dict[str, str]:
     """Return the secrets by name, 64 hex digits each; empty if there is no file.
 
     Raises:
-        DamagedFileError: its content has changed since it was written.
+        FileFormatError: it is damaged, or holds no secrets.
         StorageError: it cannot be read now.
     """
     try:
-        content = json.loads(read_checksummed_json(path))
+        return read_document(path, _Secrets).secrets
     except FileNotFoundError:
         return {}
-    found = content.get("secrets") if isinstance(content, dict) else None
-    if not isinstance(found, dict) or not all(
-        isinstance(secret, str) and _SECRET.fullmatch(secret) for secret in found.values()
-    ):
-        raise DamagedFileError(
-            "it holds no secrets", where=str(path), expected="64 hex digits by name"
-        )
-    return found
 
 
 def write_secrets(path: Path, secrets: Mapping[str, str]) -> None:
@@ -113,5 +111,4 @@ def write_secrets(path: Path, secrets: Mapping[str, str]) -> None:
     """
     with translate_storage_errors(path.parent):
         make_synced_folder(path.parent)
-    text = json.dumps({"secrets": dict(secrets)}).encode()
-    write_checksummed_json(path, text, mode=_OWNER_ONLY)
+    write_document(path, _Secrets(secrets=dict(secrets)), mode=_OWNER_ONLY)

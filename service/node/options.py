@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from devices.errors import DamagedFileError, StorageError
+from devices.errors import FileFormatError, StorageError
 from service.estimation.calibration import Calibration
 from service.node_identity import generate_secret
 from service.rig.emulated_foot import RigOptions
@@ -80,7 +80,7 @@ class ServerSecrets:
     def _read(self) -> dict[str, str]:
         try:
             return read_secrets_or_empty(self._path)
-        except DamagedFileError as error:
+        except FileFormatError as error:
             self._report_once(
                 f"{try_set_aside_and_describe(self._path, error)}; servers that know this node "
                 "refuse it until a person accepts it"

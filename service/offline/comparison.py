@@ -42,7 +42,7 @@ from service.offline.compare.plausibility import (
 from service.offline.compare.plot import plot_comparison
 from service.offline.compare.report import FIGURES_WITH_LOWER_LIMIT, format_comparison_report
 from service.offline.compare.signals import ForceSignal
-from storage.checksummed_json import write_checksummed_json
+from storage.documents import write_checksummed_json
 from storage.durable_files import write_atomically
 from storage.formats.markers import place_session_markers
 from storage.formats.readers.parquet import is_sealed_session_file

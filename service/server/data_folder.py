@@ -14,7 +14,10 @@ from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-from devices.errors import DamagedFileError, FolderGoneError
+from pydantic import BaseModel, ConfigDict, Field
+
+from devices.errors import FileFormatError, FolderGoneError
+from storage.documents import read_document, write_document
 from storage.durable_files import (
     is_locked_folder_in_place,
     lock_folder,
@@ -24,10 +27,20 @@ from storage.durable_files import (
     try_set_aside_and_describe,
     write_atomically,
 )
-from storage.server_id import SERVER_ID_NAME, read_existing_server_id, write_server_id
 from storage.sessions.folder import Session
 
 log = logging.getLogger("foottile.server")
+
+SERVER_NAME = "server.json"
+
+
+class ServerIdentity(BaseModel):
+    """Random name of a server's data folder, `server.json`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    server_id: str = Field(pattern=r"^[0-9a-f]{32}$")
+
 
 _PROBE_NAME = ".writable"
 _PROBE_BYTES = 64 << 10
@@ -135,8 +148,8 @@ class DataFolder:
 
     def _read_id_at_path(self) -> str | None:
         """Read the id of the folder at the path; None if it has none."""
-        with suppress(DamagedFileError, FileNotFoundError):
-            return read_existing_server_id(self.path / SERVER_ID_NAME)
+        with suppress(FileFormatError, FileNotFoundError):
+            return read_document(self.path / SERVER_NAME, ServerIdentity).server_id
         return None
 
     def _acquire_lock(self) -> ExitStack:
@@ -156,12 +169,12 @@ class DataFolder:
         Raises:
             StorageError: it cannot be read now; no new id is made for that.
         """
-        path = self.path / SERVER_ID_NAME
+        path = self.path / SERVER_NAME
         try:
-            return read_existing_server_id(path)
+            return read_document(path, ServerIdentity).server_id
         except FileNotFoundError:
             return None
-        except DamagedFileError as error:
+        except FileFormatError as error:
             self.problems.append(
                 f"{try_set_aside_and_describe(path, error)}; nodes treat this server as a new one"
             )
@@ -169,7 +182,7 @@ class DataFolder:
             return None
 
     def _write_id(self, server_id: str) -> str:
-        write_server_id(self.path / SERVER_ID_NAME, server_id)
+        write_document(self.path / SERVER_NAME, ServerIdentity(server_id=server_id))
         return server_id
 
 

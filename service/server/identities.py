@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from devices.errors import ChangedError, DamagedFileError, StateError, StorageError
+from devices.errors import ChangedError, FileFormatError, StateError, StorageError
 from service.node_identity import compute_fingerprint, generate_secret, is_proof_valid
 from service.protocol.codec import CloseConnection, LinkCloseCode
 from service.protocol.link import PROTOCOL, Challenge, Proof
@@ -87,7 +87,7 @@ class NodeIdentities:
         path = self._path(node)
         try:
             return read_secrets_or_empty(path).get(node)
-        except DamagedFileError as error:
+        except FileFormatError as error:
             # The true node sends it again. Otherwise a flipped bit would lock it out.
             self.problems.append(
                 f"node {node}: {try_set_aside_and_describe(path, error)}; "

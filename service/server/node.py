@@ -26,8 +26,8 @@ from service.server.estimates.node_estimator import EstimatedBatch, NodeEstimato
 from service.server.streams import ServerStream
 from service.server_clock import server_utc_ns
 from service.sessions.tares import RecordedTare
-from storage.checksummed_json import write_checksummed_json
 from storage.clock.log import ClockOffset
+from storage.documents import write_document
 from storage.durable_files import make_synced_folder, translate_storage_errors
 from storage.intervals import NO_END, NODE_RESTARTED, Intervals, to_open_pairs
 from storage.journal.journal import RING_DURATION_NS, Journal
@@ -389,7 +389,7 @@ class ServerNode:
         hello = self.hello
         with translate_storage_errors(self._folder):
             make_synced_folder(self._folder)
-        write_checksummed_json(self._folder / HELLO_NAME, hello.model_dump_json().encode())
+        write_document(self._folder / HELLO_NAME, hello)
         if hello is self.hello:  # a newer hello may have come meanwhile
             self.is_dirty = False
 

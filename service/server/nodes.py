@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import re
 from collections.abc import Iterator
 from pathlib import Path
-
-from pydantic import ValidationError
 
 from devices.errors import (
     DamagedFileError,
@@ -21,7 +18,7 @@ from devices.errors import (
 )
 from service.protocol.link import PROTOCOL, Hello
 from service.server.node import BOOT_ID_PATTERN, HELLO_NAME, ServerNode
-from storage.checksummed_json import read_checksummed_json
+from storage.documents import read_document
 from storage.durable_files import translate_storage_errors, try_set_aside_and_describe
 
 log = logging.getLogger("foottile.nodes")
@@ -60,10 +57,7 @@ class NodeRegistry:
                     f"node {folder.name}: {try_set_aside_and_describe(folder / HELLO_NAME, error)}"
                 )
                 continue
-            except FileFormatError as error:
-                self._add_problem(f"node {folder.name}: {error}")
-                continue
-            except StorageError as error:
+            except (FileFormatError, StorageError) as error:
                 self._add_problem(f"node {folder.name} is left out until it connects: {error}")
                 continue
             try:
@@ -140,32 +134,18 @@ def _read_hello(path: Path) -> Hello:
     Raises:
         FileNotFoundError: there is none.
         DamagedFileError: it is damaged, or of another node.
-        FileFormatError: it is of another protocol version.
+        FileFormatError: it is of another version.
         StorageError: it cannot be read now.
     """
-    text = read_checksummed_json(path)
-    again = "the node is unknown until it connects"
-    try:
-        content = json.loads(text)
-        protocol = content["protocol"]
-        hello = Hello.model_validate_json(text) if protocol == PROTOCOL else None
-        if hello is not None:
-            _check_hello(hello)
-    except (ValueError, KeyError, TypeError, RecursionError, LinkError) as error:
-        what = str(error)
-        if isinstance(error, ValidationError):
-            first = error.errors()[0]
-            field = ".".join(map(str, first["loc"]))
-            what = f"written by another version, or edited ({field}: {first['msg']})"
-        raise DamagedFileError(
-            f"not this node's last hello: {' '.join(what.split())[:200]}",
-            where=str(path),
-            remedy=again.capitalize(),
-        ) from error
-    if hello is None:
+    hello = read_document(path, Hello)
+    if hello.protocol != PROTOCOL:
         raise FileFormatError(
-            f"written by another version, of protocol {protocol!r}: {again}", where=str(path)
+            f"written by another version, of protocol {hello.protocol}", where=str(path)
         )
+    try:
+        _check_hello(hello)
+    except LinkError as error:
+        raise DamagedFileError(f"not this node's last hello: {error}", where=str(path)) from error
     if hello.array_info.node != path.parent.name:
         raise DamagedFileError(f"it is of node {hello.array_info.node!r}", where=str(path))
     return hello

@@ -9,7 +9,7 @@ from pathlib import Path
 from devices.errors import CalibrationError, DamagedFileError
 from devices.input_files import decode_text
 from service.estimation.calibration import EDITED_REMEDY, Calibration
-from storage.checksummed_json import (
+from storage.documents import (
     CHECKSUM_KEY,
     append_json_checksum,
     verify_and_strip_json_checksum,

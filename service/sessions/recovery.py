@@ -37,8 +37,8 @@ from service.sessions.parts import (
 )
 from service.sessions.sealing import rebuild_damaged_session_json, seal_session
 from service.sessions.tares import TareHistory
-from storage.checksummed_json import read_checksummed_json
 from storage.clock.log import ClockLog
+from storage.documents import read_checksummed_json
 from storage.durable_files import ASIDE_SUFFIX, remove_dead_process_temporaries, set_aside_damaged
 from storage.intervals import CORRUPT, NO_END, Intervals, Losses
 from storage.journal.journal import Journal

@@ -18,8 +18,8 @@ from service.sessions.frames import SessionFrames
 from service.sessions.inputs import SessionInputs
 from service.sessions.overview import OverviewWriter
 from service.sessions.stances import StancesWriter
-from storage.checksummed_json import read_checksummed_json
 from storage.clock.table import CLOCK_NAME, read_clock_file, write_clock_file
+from storage.documents import read_checksummed_json
 from storage.durable_files import set_aside_damaged
 from storage.parquet_hash import compute_sha256
 from storage.sessions.folder import FRAMES_NAME, Ledger, Session, SessionsFolder

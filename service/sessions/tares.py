@@ -23,7 +23,7 @@ from typing import Any
 from devices.errors import DamagedFileError, StorageError, UnknownError
 from devices.frames import ArrayInfo
 from service.estimation.tare.tare import Tare
-from storage.checksummed_json import verify_and_strip_json_checksum, write_checksummed_json
+from storage.documents import verify_and_strip_json_checksum, write_checksummed_json
 from storage.durable_files import (
     ASIDE_SUFFIX,
     make_synced_folder,

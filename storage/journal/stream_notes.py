@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
-from devices.errors import DamagedFileError, FileFormatError
+from devices.errors import DamagedFileError
 from devices.frames import ArrayInfo
-from storage.checksummed_json import read_checksummed_json, write_checksummed_json
+from storage.documents import read_document, write_document
 from storage.durable_files import try_set_aside_and_describe
 from storage.intervals import LossPairs
 
@@ -63,7 +63,7 @@ class StreamNotes(BaseModel):
         Raises:
             StorageError: the disk is full or not writable.
         """
-        write_checksummed_json(folder / NOTES_FILE, self.model_dump_json(indent=1).encode())
+        write_document(folder / NOTES_FILE, self)
 
     @classmethod
     def load(cls, folder: Path) -> StreamNotes | None:
@@ -74,21 +74,11 @@ class StreamNotes(BaseModel):
             FileFormatError: another version wrote it.
             StorageError: it cannot be read now.
         """
-        path = folder / NOTES_FILE
         try:
-            text = read_checksummed_json(path)
+            # An unknown field is not dropped silently: it may bound the losses.
+            return read_document(folder / NOTES_FILE, cls)
         except FileNotFoundError:
             return None
-        try:
-            return cls.model_validate_json(text)
-        except ValidationError as error:
-            what = f"not a stream's notes: {' '.join(str(error).split())[:300]}"
-            # An unknown field is not dropped silently: it may bound the losses.
-            raise FileFormatError(
-                f"{what}; another version wrote it, and it is left as it is",
-                where=str(path),
-                remedy="Update foottile",
-            ) from error
 
     @classmethod
     def load_or_set_aside(cls, folder: Path, problems: list[str]) -> StreamNotes | None:

@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from devices.errors import DamagedFileError, StorageError, UnknownError
-from storage.checksummed_json import read_checksummed_json
+from storage.documents import read_checksummed_json
 from storage.durable_files import open_regular_file
 from storage.parquet_hash import read_hashed_table, write_hashed_table
 from storage.schema import Column

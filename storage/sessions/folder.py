@@ -16,11 +16,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from devices.errors import FileFormatError, FootTileError, StorageError, UnknownError
-from storage.checksummed_json import read_checksummed_json, write_checksummed_json
 from storage.clock.log import ClockOffset
+from storage.documents import read_document, write_document
 from storage.durable_files import (
     ASIDE_SUFFIX,
     make_synced_folder,
@@ -229,11 +229,10 @@ class SessionsFolder:
         """
         folder = self.get_path(session.id)
         is_new = not folder.exists()
-        text = session.model_dump_json(indent=1).encode()
         try:
             with translate_storage_errors(folder):
                 make_synced_folder(folder)
-            write_checksummed_json(folder / "session.json", text)
+            write_document(folder / "session.json", session)
         except StorageError:
             if is_new:  # a full disk still accepts an empty folder, and perhaps a file's name
                 shutil.rmtree(folder, ignore_errors=True)
@@ -249,11 +248,9 @@ class SessionsFolder:
         """
         path = self.get_path(session_id) / "session.json"
         try:
-            session = Session.model_validate_json(read_checksummed_json(path))
+            session = read_document(path, Session)
         except FileNotFoundError as error:
             raise UnknownError(f"no session {session_id!r}") from error
-        except ValidationError as error:
-            raise FileFormatError(f"not a session: {error}", where=str(path)) from error
         if session.id != session_id:
             raise self._make_stray_error(path.parent, session.id)
         return session
@@ -278,11 +275,11 @@ class SessionsFolder:
             if is_named or ASIDE_SUFFIX in path.name or not path.is_dir():
                 continue
             try:
-                session = Session.model_validate_json(read_checksummed_json(path / "session.json"))
+                session = read_document(path / "session.json", Session)
             except FileNotFoundError:
                 if (path / FRAMES_NAME).is_file():
                     found.append(StraySession(path.name, self._make_stray_error(path, None), True))
-            except (FootTileError, ValidationError):
+            except FootTileError:
                 found.append(StraySession(path.name, self._make_stray_error(path, None), True))
             else:
                 is_copy = (self._folder / session.id).is_dir()

@@ -15,8 +15,8 @@ import pyarrow as pa
 from pydantic import TypeAdapter, ValidationError
 
 from devices.errors import DamagedFileError, FileFormatError, StorageError, UsageError
-from storage.checksummed_json import read_checksummed_json, verify_and_strip_json_checksum
 from storage.clock.table import CLOCK_NAME, ClockTable, StreamClockFacts, read_clock_file
+from storage.documents import read_checksummed_json, verify_and_strip_json_checksum
 from storage.durable_files import read_small_file
 from storage.parquet_hash import read_hashed_table, write_hashed_table
 from storage.sessions.folder import Completeness, Ledger, Marker, Part, Session

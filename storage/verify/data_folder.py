@@ -2,8 +2,8 @@
 
 Nothing is written, no lock is taken; a server or node may run meanwhile.
 
-Every JSON file of ours has its own hash (`storage.checksummed_json`), `server_id` a CRC-32. A name
-with `.damaged-N` was set aside and is not verified.
+Every JSON file of ours has a checksum (`storage.documents`). A name with `.damaged-N` was set aside
+and is not verified.
 """
 
 from __future__ import annotations
@@ -18,11 +18,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from devices.errors import DamagedFileError, FileFormatError, FootTileError, StorageError
-from storage.checksummed_json import read_checksummed_json
+from storage.documents import read_checksummed_json
 from storage.durable_files import ASIDE_SUFFIX
 from storage.journal.segment import INDEX_SUFFIX, SUFFIX
 from storage.journal.stream_notes import NOTES_FILE
-from storage.server_id import SERVER_ID_NAME, read_existing_server_id
 from storage.sessions.folder import FRAMES_NAME, SESSION_ID, Ledger, SessionsFolder
 from storage.sessions.metadata import SESSION_NAME
 from storage.verify.journal import SegmentReport, StreamReport, verify_journal, verify_segment
@@ -149,14 +148,14 @@ def verify_data_folder(path: Path) -> DataFolderReport:
                 )
                 session.problems.append(f"{place}/{stray.name}: {stray.error.what}")
                 report.sessions.append(session)
-    _verify_json_and_server_id(data, proven, report)
+    _verify_documents(data, proven, report)
     return report
 
 
-def _verify_json_and_server_id(
+def _verify_documents(
     data_folder: Path, verified_folders: set[Path], report: DataFolderReport
 ) -> None:
-    """Verify `server_id` and every JSON file of a data folder, except in folders done elsewhere.
+    """Verify every document of a data folder, except in folders done elsewhere.
 
     Token, locks and other files have no checksum.
 
@@ -178,8 +177,6 @@ def _verify_json_and_server_id(
             path = here / name
             if ASIDE_SUFFIX in name:
                 report.set_aside.append(os.path.relpath(path, data_folder))
-            elif path == data_folder / SERVER_ID_NAME:
-                _verify_with(read_existing_server_id, path, name, report)
             elif name.endswith(".json") and not name.startswith(".") and not is_verified:
                 relative = os.path.relpath(path, data_folder)
                 _verify_with(read_checksummed_json, path, relative, report)

@@ -15,7 +15,7 @@ import storage
 from devices.errors import FootTileError
 from devices.types import StrictModel
 from service.offline.accuracy import CoverageCount
-from storage.checksummed_json import read_checksummed_json, write_checksummed_json
+from storage.documents import read_checksummed_json, write_checksummed_json
 
 Seeds = Literal["development", "judgement"]
 FIRST_SEEDS: dict[Seeds, int] = {"development": 1_000_000, "judgement": 2_000_000}

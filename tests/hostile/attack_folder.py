@@ -10,8 +10,8 @@ from typing import Any
 
 from devices.errors import FootTileError
 from service.server.broadcast.views import make_session_view
+from service.server.data_folder import SERVER_NAME
 from service.server.server import Server
-from storage.server_id import SERVER_ID_NAME
 from tests.hostile.attack import Outcome, Play, attack
 from tests.hostile.damages import DAMAGES, damaged_copies
 from tests.hostile.data_folders import NODES, copied, data_folder, digest, sha
@@ -81,7 +81,7 @@ def _may_change(path: Path, whole: Served) -> set[str]:
             return set()
 
 
-_SAID = ("hello.json", "tares.json", "stream.json", "session.json", SERVER_ID_NAME)
+_SAID = ("hello.json", "tares.json", "stream.json", "session.json", SERVER_NAME)
 
 
 @attack("every file of a server's data folder, damaged in every way", tries=40, soak_tries=4_000)
@@ -99,7 +99,6 @@ def folder_of_a_server(play: Play) -> Outcome:
         outcome.failed(f"undamaged: {problems}")
     slowest_s = 0.0
     for copy, path, what, is_same in damaged_copies(data, play):
-        is_whole = is_same or _is_same_id(copy / path, data / path)
         found = _in_time(copy)
         if not isinstance(found, tuple):
             outcome.failed(f"{what}: {found}")
@@ -109,7 +108,7 @@ def folder_of_a_server(play: Play) -> Outcome:
         changed = {key for key in {*whole, *now} if whole.get(key) != now.get(key)}
         if wrong := changed - _may_change(path, whole):
             outcome.failed(f"{what}: {sorted(wrong)}")
-        elif path.name in _SAID and not is_whole and path.name not in f"{said} {_views(now)}":
+        elif path.name in _SAID and not is_same and path.name not in f"{said} {_views(now)}":
             outcome.failed(f"{what}: nothing is said of it: {said}")
         elif said:
             outcome.saw("said by name, all else served as before")
@@ -119,17 +118,6 @@ def folder_of_a_server(play: Play) -> Outcome:
     if "forbidden" not in DAMAGES:
         outcome.figures["no permission"] = "not tried: root may read everything"
     return outcome
-
-
-def _is_same_id(now: Path, before: Path) -> bool:
-    """Return whether a server's id has another space at its end only, or lacks its CRC-32.
-
-    Cut behind its 32 digits it is the same id, as a version without a CRC-32 wrote it.
-    """
-    if now.name != SERVER_ID_NAME or now.is_symlink() or not now.is_file():
-        return False
-    whole = before.read_bytes().strip()
-    return now.read_bytes().strip() in (whole, whole[:32])
 
 
 def _in_time(copy: Path) -> tuple[Served, list[str], float] | str:

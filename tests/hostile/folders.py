@@ -13,14 +13,14 @@ from devices.errors import FootTileError
 from devices.frames import ArrayInfo
 from service.offline.calibration_lookup import read_calibration
 from service.protocol.link import PROTOCOL, Hello
+from service.server.data_folder import SERVER_NAME, ServerIdentity
 from service.sessions.calibration_file import write_calibration
 from service.sessions.recovery import recover_locked_folder
 from service.sessions.tares import TareHistory
-from storage.checksummed_json import write_checksummed_json
 from storage.clock.log import ClockLog, ClockOffset
+from storage.documents import write_document
 from storage.journal.node.retention_requests import RetentionRequest, RetentionRequests
 from storage.permissions import SECRETS_NAME, write_secrets
-from storage.server_id import SERVER_ID_NAME, write_server_id
 from storage.sessions.folder import FRAMES_NAME, Marker, Part, SessionsFolder
 from storage.sessions.metadata import MARKERS_NAME, load_clock_table, read_existing_markers
 from storage.sessions.reader import SealedFileReader
@@ -55,9 +55,9 @@ def make_server(data: Path) -> None:
         calibration=make_calibration("T01", "T02"),
         calibration_problem=None,
     )
-    write_checksummed_json(node / "hello.json", hello.model_dump_json().encode())
+    write_document(node / "hello.json", hello)
     write_secrets(node / SECRETS_NAME, {"bench": SECRET})
-    write_server_id(data / SERVER_ID_NAME, SERVER_ID)
+    write_document(data / SERVER_NAME, ServerIdentity(server_id=SERVER_ID))
     (data / "token").write_text("a token that nobody has\n")
     folder = _journal(data, info)
     log = ClockLog(folder)

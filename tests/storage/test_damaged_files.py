@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.errors import DamagedFileError, FileFormatError
-from storage.checksummed_json import (
+from storage.documents import (
     append_json_checksum,
     read_checksummed_json,
     verify_and_strip_json_checksum,

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.errors import DamagedFileError
-from storage.checksummed_json import write_checksummed_json
+from devices.errors import FileFormatError
+from storage.documents import write_checksummed_json
 from storage.durable_files import make_synced_folder, write_atomically
 from storage.permissions import (
     SECRETS_NAME,
@@ -51,10 +51,10 @@ def test_a_folder_that_is_made_is_its_users(tmp_path: Path) -> None:
     "found",
     [
         (),
-        ("server_id", "journal"),
+        ("server.json", "journal"),
         (".lock",),
-        (".lock", ".writable", "journal", "nodes", "server_id", "sessions", "token", "trash"),
-        (".lock", "server_id.damaged-1", ".server_id.4711.815.0123abcd.tmp"),
+        (".lock", ".writable", "journal", "nodes", "server.json", "sessions", "token", "trash"),
+        (".lock", "server.json.damaged-1", ".server.json.4711.815.0123abcd.tmp"),
     ],
     ids=str,
 )
@@ -77,7 +77,7 @@ def test_a_users_folder_stays_open_and_our_files_in_it_are_closed(
         set_umask_and_create_private_folder(tmp_path)
         assert mode_of(tmp_path) == 0o755
         assert written(tmp_path) == (0o700, 0o600)
-        for ours in (".lock", "server_id"):  # what a start leaves is there at the second one
+        for ours in (".lock", "server.json"):  # what a start leaves is there at the second one
             (tmp_path / ours).touch()
 
 
@@ -111,5 +111,5 @@ def test_secrets_are_read_back_and_only_by_their_owner(secrets: dict[str, str]) 
 def test_another_file_is_no_file_of_secrets(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / SECRETS_NAME
     write_checksummed_json(path, content)
-    with pytest.raises(DamagedFileError, match=f"{SECRETS_NAME}: it holds no secrets"):
+    with pytest.raises(FileFormatError, match=f"{SECRETS_NAME}: written by another version"):
         read_secrets_or_empty(path)

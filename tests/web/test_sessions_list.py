@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
-from storage.checksummed_json import write_checksummed_json
+from storage.documents import write_checksummed_json
 from storage.sessions.folder import SessionsFolder
 from tests.service.fake_node import FakeNode
 from tests.service.patient import be_patient

@@ -33,7 +33,7 @@ from service.offline.archive.locations import (
     read_bytes,
     upload,
 )
-from storage.checksummed_json import append_json_checksum, verify_and_strip_json_checksum
+from storage.documents import append_json_checksum, verify_and_strip_json_checksum
 from storage.durable_files import (
     make_synced_folder,
     make_temporary_path,

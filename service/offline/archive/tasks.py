@@ -22,8 +22,8 @@ from service.offline.archive.local_copies import (
 )
 from service.offline.estimate.preparation import CHUNK_FRAMES, EstimateRequest
 from service.offline.export import ExportOptions, export_session
-from storage.checksummed_json import append_json_checksum
 from storage.clock.table import CLOCK_NAME
+from storage.documents import append_json_checksum
 from storage.formats.slice import Slice
 from storage.formats.writers.registry import get_format
 from storage.parquet_hash import compute_sha256

@@ -36,7 +36,7 @@ from service.offline.estimate.preparation import (
 from service.offline.estimate_summary import EstimateSummarizer, EstimateSummary
 from service.sessions.pipeline import EstimateOptions, EstimateStream, make_estimate_metadata
 from service.sessions.stances import StancesWriter
-from storage.checksummed_json import append_json_checksum, verify_and_strip_json_checksum
+from storage.documents import append_json_checksum, verify_and_strip_json_checksum
 from storage.durable_files import open_for_atomic_write, read_small_file, write_atomically
 from storage.formats.slice import Slice
 from storage.parquet_hash import compute_sha256

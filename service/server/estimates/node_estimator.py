@@ -8,15 +8,16 @@ one.
 
 from __future__ import annotations
 
-import json
 import logging
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from devices.errors import CalibrationError, DamagedFileError, StorageError
+from pydantic import BaseModel, ConfigDict
+
+from devices.errors import FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
 from service.protocol.link import Hello
@@ -24,7 +25,7 @@ from service.server.estimates.live_estimator import EstimateEpoch, LiveEstimator
 from service.server.estimates.tare_controller import TareController
 from service.sessions.pipeline import Columns
 from service.sessions.tares import TareHistory
-from storage.checksummed_json import read_checksummed_json, write_checksummed_json
+from storage.documents import read_document, write_document
 from storage.durable_files import (
     ASIDE_SUFFIX,
     make_synced_folder,
@@ -45,6 +46,14 @@ class AssignedCalibration:
     t_ns: int
 
 
+class _Assignment(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    t_ns: int
+    calibration: Calibration | None
+    """None: the assignment was removed."""
+
+
 class CalibrationAssignment:
     """Assignment for one node.
 
@@ -59,11 +68,13 @@ class CalibrationAssignment:
         self.problem: str | None = None
         """Reason why the assignment is unknown; None: it is known, or there is none."""
         try:
-            self.current = _read_assignment(path)
+            found = read_document(path, _Assignment)
+            if found.calibration is not None:
+                self.current = AssignedCalibration(found.calibration, found.t_ns)
         except FileNotFoundError:
             if any(path.parent.glob(path.name + ASIDE_SUFFIX + "*")):
                 self.problem = f"the calibration that was assigned is lost: {_LOST}"
-        except DamagedFileError as error:
+        except FileFormatError as error:
             aside = try_set_aside_and_describe(path, error)
             self.problem = f"the calibration that was assigned is lost ({aside}): {_LOST}"
         except StorageError as error:
@@ -75,7 +86,7 @@ class CalibrationAssignment:
         Raises:
             StorageError: it cannot be stored; the assignment is unchanged.
         """
-        self._store({"id": calibration.id, **calibration.model_dump(mode="json")}, t_ns)
+        self._store(_Assignment(t_ns=t_ns, calibration=calibration))
         self.current, self.problem = AssignedCalibration(calibration, t_ns), None
 
     def remove_assignment(self, t_ns: int) -> None:
@@ -84,35 +95,13 @@ class CalibrationAssignment:
         Raises:
             StorageError: that cannot be stored; the assignment is unchanged.
         """
-        self._store(None, t_ns)
+        self._store(_Assignment(t_ns=t_ns, calibration=None))
         self.current, self.problem = None, None
 
-    def _store(self, calibration: dict[str, Any] | None, t_ns: int) -> None:
+    def _store(self, assignment: _Assignment) -> None:
         with translate_storage_errors(self._path):
             make_synced_folder(self._path.parent)
-        content = {"t_ns": t_ns, "calibration": calibration}
-        write_checksummed_json(self._path, json.dumps(content).encode())
-
-
-def _read_assignment(path: Path) -> AssignedCalibration | None:
-    """Read the last assignment; None: it was removed.
-
-    Raises:
-        FileNotFoundError: there never was one.
-        DamagedFileError: the file is damaged.
-        StorageError: it cannot be read now.
-    """
-    text = read_checksummed_json(path)
-    try:
-        document = json.loads(text)
-        if document["calibration"] is None:
-            return None
-        content = json.dumps(document["calibration"])
-        calibration = Calibration.from_json_verifying_id(content, where=str(path))
-        return AssignedCalibration(calibration, int(document["t_ns"]))
-    except (CalibrationError, ValueError, KeyError, TypeError, RecursionError) as error:
-        what = " ".join(str(error).split())[:200]
-        raise DamagedFileError(f"no assigned calibration: {what}", where=str(path)) from error
+        write_document(self._path, assignment)
 
 
 log = logging.getLogger("foottile.nodes")

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
-from devices.errors import DamagedFileError, StorageError
-from storage.checksummed_json import read_checksummed_json, write_checksummed_json
+from devices.errors import FileFormatError, StorageError
+from storage.documents import read_document, write_document
 from storage.durable_files import ASIDE_SUFFIX, try_set_aside_and_describe
 from storage.intervals import NO_END, Intervals, OpenPairs, intervals_from_inclusive_pairs, union
 
@@ -87,13 +87,11 @@ class RetentionRequests:
         """
         path = self._path
         try:
-            return _File.model_validate_json(read_checksummed_json(path)).servers
+            return read_document(path, _File).servers
         except FileNotFoundError:
             pass
-        except (DamagedFileError, ValidationError) as error:
-            what = f"retention requests cannot be read: {error}"
-            damage = DamagedFileError(what, where=str(path))
-            self.problems.append(try_set_aside_and_describe(path, damage))
+        except FileFormatError as error:
+            self.problems.append(f"retention requests: {try_set_aside_and_describe(path, error)}")
         return {}
 
     def node_session_or_server_numbers_of(self, stream_id: str) -> Intervals:
@@ -150,4 +148,4 @@ class RetentionRequests:
         if not self._is_read:
             self._servers = {**self._load(), **self._servers}
             self._is_read = True
-        write_checksummed_json(self._path, _File(servers=self._servers).model_dump_json().encode())
+        write_document(self._path, _File(servers=self._servers))

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from storage.checksummed_json import write_checksummed_json
+from storage.documents import write_checksummed_json
 from tests.service.fake_node import FakeNode
 from tests.service.patient import patient_server
 from tests.service.plates import LAG_S, ZERO_N, compare, hopped, write_plate

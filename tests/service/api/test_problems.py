@@ -135,7 +135,7 @@ def test_a_bug_and_a_full_disk_are_problems(
     node.connect()
     node.deliver(10)
     with monkeypatch.context() as patch:
-        patch.setattr("storage.checksummed_json.write_atomically", full)
+        patch.setattr("storage.documents.write_atomically", full)
         answer = running.http.post("/sessions", json={"node": "bench", "name": "trial"})
         assert_problem(answer, 507, "/api/v1/sessions")
     assert running.sessions() == []

@@ -21,6 +21,7 @@ from devices.errors import FootTileError
 from service.api.address import load_or_create_token
 from service.estimation import LIVE_LAG_MS, OFFLINE_LAG_MS
 from service.protocol.codec import format_close_reason
+from service.server.data_folder import SERVER_NAME
 from service.user_folders import register_private_folder, strip_private_folders
 from storage.durable_files import set_aside_damaged
 from storage.intervals import NO_END, Intervals
@@ -344,7 +345,7 @@ def test_a_used_data_folder_is_closed_to_others(running: Running, tared: FakeNod
     assert running.http.delete(session.url).status_code == 204
     assert running.http.get("/ready").status_code == 200
     running.stop()
-    set_aside_damaged(running.data / "server_id")
+    set_aside_damaged(running.data / SERVER_NAME)
     running.start()
     running.data.chmod(0o755)
     set_umask_and_create_private_folder(running.data)

@@ -14,7 +14,7 @@ import pytest
 
 from devices.flags import EstimateFlag
 from service.sessions.tares import TareHistory
-from storage.checksummed_json import read_checksummed_json, write_checksummed_json
+from storage.documents import read_checksummed_json, write_checksummed_json
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running, receive_live
 from tests.waiting import PATIENCE_S
@@ -147,7 +147,7 @@ def test_a_node_with_a_damaged_hello_is_unknown_until_it_connects(
     path = running.data / "nodes" / "bench" / "hello.json"
     match damage:
         case "flip":
-            flip(path, b'"x_m":0.0', b'"x_m":1.0')
+            flip(path, b'"x_m": 0.0', b'"x_m": 1.0')
         case "folder":
             path.unlink()
             path.mkdir()
@@ -194,7 +194,7 @@ def test_a_problem_of_any_file_name_is_printable(running: Running, tared: FakeNo
     running.start()
     text = list_problems(running)
     assert text.count("it is not a file") == len(odd_names)
-    assert text.count("not this node's last hello") == len(odd_names)
+    assert text.count("written by another version") == len(odd_names)
     assert text.isprintable()
     with running.socket("/api/v1/live") as live:
         assert json.loads(live.recv(timeout=PATIENCE_S))["problems"]

@@ -22,7 +22,7 @@ from service.server.server import Server
 from service.sessions.calibration_file import write_calibration
 from service.sessions.tares import TareHistory
 from storage import durable_files
-from storage.checksummed_json import write_checksummed_json
+from storage.documents import write_checksummed_json
 from storage.journal import journal as journal_module
 from storage.journal.node.in_flight import IN_FLIGHT_FILE, InFlightWriter
 from storage.journal.node.journal import NodeJournal

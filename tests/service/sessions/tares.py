@@ -14,7 +14,7 @@ import numpy as np
 from devices.frames import ArrayInfo
 from service.estimation.tare.tare import Tare, TareSource
 from service.sessions.tares import RecordedTare, TareHistory
-from storage.checksummed_json import write_checksummed_json
+from storage.documents import write_checksummed_json
 from tests.builders.arrays import make_array, make_tile
 from tests.builders.calibrations import make_tare
 

@@ -10,8 +10,8 @@ import pytest
 from devices.errors import StateError
 from service.server.session_store import SessionStore, Trash
 from service.sessions.recovery import recover_locked_folder
-from storage.checksummed_json import append_json_checksum, verify_and_strip_json_checksum
 from storage.clock.log import ClockLog, ClockOffset
+from storage.documents import append_json_checksum, verify_and_strip_json_checksum
 from storage.sessions.folder import Session, SessionsFolder
 from storage.verify.data_folder import find_verdict, verify_path
 from tests.builders.calibrations import make_calibration

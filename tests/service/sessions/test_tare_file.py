@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from devices.frames import ArrayInfo
 from service.estimation.tare.tare import Tare, TareSource
 from service.sessions.tares import TareHistory
-from storage.checksummed_json import write_checksummed_json
+from storage.documents import write_checksummed_json
 from tests.builders.calibrations import make_tare
 from tests.hostile.damages import DAMAGES, NO_FILE
 from tests.service.sessions.tares import INFO, array

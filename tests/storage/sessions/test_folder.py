@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError, StorageError, UnknownError, UsageError
-from storage.checksummed_json import append_json_checksum, verify_and_strip_json_checksum
 from storage.clock.log import ClockOffset
+from storage.documents import append_json_checksum, verify_and_strip_json_checksum
 from storage.sessions.folder import (
     Completeness,
     Ledger,
@@ -212,7 +212,7 @@ def test_what_is_no_session_is_refused_by_path(tmp_path: Path, old: bytes, new: 
     path.write_bytes(
         append_json_checksum(verify_and_strip_json_checksum(content, where="").replace(old, new, 1))
     )
-    with pytest.raises(FileFormatError, match="not a session") as caught:
+    with pytest.raises(FileFormatError, match="by another version") as caught:
         folder.load(ID)
     assert caught.value.where == str(path)
 

@@ -15,12 +15,12 @@ from devices.errors import FileFormatError
 from devices.frames import ArrayInfo, FrameBatch
 from service.sessions.inputs import SessionInputs
 from service.sessions.sealing import seal_session
-from storage.checksummed_json import (
+from storage.clock.log import ClockOffset
+from storage.documents import (
     append_json_checksum,
     verify_and_strip_json_checksum,
     write_checksummed_json,
 )
-from storage.clock.log import ClockOffset
 from storage.intervals import Losses
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes

@@ -14,7 +14,7 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 import pytest
 
-from storage.checksummed_json import read_checksummed_json
+from storage.documents import read_checksummed_json
 from tests.service.cli.outcome import Run, scene_text
 from tests.storage.formats.readers.test_rosbag import Sample, write_bag1
 

@@ -14,10 +14,10 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-from storage.checksummed_json import write_checksummed_json
+from service.server.data_folder import SERVER_NAME, ServerIdentity
+from storage.documents import write_checksummed_json, write_document
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
-from storage.server_id import SERVER_ID_NAME, write_server_id
 from storage.sessions.folder import Part, Session, SessionsFolder
 from storage.sessions.reader import SealedFileReader
 from storage.sessions.writer import SealedFileWriter
@@ -250,21 +250,12 @@ def test_every_other_file_of_a_data_folder_is_looked_at(run: Run, data: Path) ->
     assert (found.code, "damaged: nodes/bench/tares.json" in found.out) == (1, True)
 
 
-def test_a_damaged_server_id_is_named(run: Run, data: Path) -> None:
-    run("recover", data)
-    for at in range(41):
-        write_server_id(data / SERVER_ID_NAME, "5" * 32)
-        flip_bits(data / SERVER_ID_NAME, at)
-        found = run("verify", data)
-        assert (found.code, f"damaged: {SERVER_ID_NAME}" in found.out) == (1, True), at
-
-
 @pytest.mark.parametrize("kind", ["folder", "nowhere", "loop", "pipe", "empty"])
 def test_verify_names_a_file_that_was_replaced(run: Run, data: Path, kind: str) -> None:
     run("recover", data)
     (data / "nodes" / "bench").mkdir(parents=True)
     write_checksummed_json(data / "nodes" / "bench" / "hello.json", b'{"a": 1}')
-    write_server_id(data / SERVER_ID_NAME, "5" * 32)
+    write_document(data / SERVER_NAME, ServerIdentity(server_id="5" * 32))
     paths = [path for path in data.rglob("*") if path.is_file() and path.name != ".lock"]
     assert len(paths) == 10
     for path in paths:

@@ -22,7 +22,7 @@ from service.offline.estimate.session import (
     join_chunks,
     needs_chunks,
 )
-from storage.checksummed_json import append_json_checksum
+from storage.documents import append_json_checksum
 from storage.formats.slice import Slice
 from storage.parquet_hash import compute_sha256
 from storage.sessions.writer import SealedFileWriter

@@ -11,7 +11,7 @@ import pytest
 
 from devices.errors import StorageError
 from devices.flags import TileFlag
-from storage.checksummed_json import read_checksummed_json, write_checksummed_json
+from storage.documents import read_checksummed_json, write_checksummed_json
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
 from storage.journal.node import in_flight, retention
@@ -176,7 +176,7 @@ def test_a_stream_with_notes_of_a_later_version_is_left_out(start: Start, tmp_pa
     before = path.read_bytes()
     again = start()
     assert again.streams == []
-    assert "another version wrote it" in again.problems[0]
+    assert "by another version" in again.problems[0]
     assert "Update foottile" in again.problems[0]
     again.end_streams_and_close()
     assert [each.name for each in path.parent.glob("stream.json*")] == ["stream.json"]

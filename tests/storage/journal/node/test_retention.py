@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from devices.errors import StorageError
-from storage.checksummed_json import append_json_checksum
+from storage.documents import append_json_checksum
 from storage.intervals import NO_END, Intervals
 from storage.journal.node import journal as node_journal
 from storage.journal.node import retention

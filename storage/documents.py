@@ -1,7 +1,8 @@
-"""JSON files with a checksum: the last key is a SHA-256 of all text before it.
+"""Documents: JSON files of a typed class, replaced whole, with a SHA-256 of their text as last key.
 
 Every JSON file of ours that can change a number, or what a node must retain, is written and read
-here. A file without a checksum is damaged.
+here. A file without a checksum is damaged. One with the right checksum whose content is not of the
+class is of another version, and is not damaged.
 """
 
 from __future__ import annotations
@@ -9,8 +10,11 @@ from __future__ import annotations
 import hashlib
 import re
 from pathlib import Path
+from typing import TypeVar
 
-from devices.errors import DamagedFileError
+from pydantic import BaseModel, ValidationError
+
+from devices.errors import DamagedFileError, FileFormatError
 from storage.durable_files import read_small_file, write_atomically
 
 CHECKSUM_KEY = "check"
@@ -19,6 +23,44 @@ _BEFORE, _AFTER = b',\n "check": "', b'"\n}'
 _END = re.compile(re.escape(_BEFORE) + rb"([0-9a-f]{64})" + re.escape(_AFTER) + rb"\Z")
 _TAIL_BYTES = 2 * (len(_BEFORE) + 64 + len(_AFTER))
 """Length of the end in which a damaged checksum is recognised."""
+
+DocumentT = TypeVar("DocumentT", bound=BaseModel)
+
+
+def write_document(path: Path, document: BaseModel, *, mode: int = 0o666) -> None:
+    """Write a document atomically; an existing one is replaced.
+
+    Args:
+        path: the file.
+        document: its content.
+        mode: permissions before the umask.
+
+    Raises:
+        StorageError: the disk is full or not writable; raises as `open_for_atomic_write`.
+    """
+    write_checksummed_json(path, document.model_dump_json(indent=1).encode(), mode=mode)
+
+
+def read_document(path: Path, kind: type[DocumentT]) -> DocumentT:
+    """Read a document and verify its checksum.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        DamagedFileError: its checksum is wrong or missing, or it is no file.
+        FileFormatError: its content is not of this class.
+        StorageError: it cannot be read now.
+    """
+    text = read_checksummed_json(path)
+    try:
+        return kind.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(map(str, first["loc"])) or "content"
+        raise FileFormatError(
+            f"written by another version, or edited ({field}: {first['msg']})",
+            where=str(path),
+            remedy="Update foottile",
+        ) from error
 
 
 def write_checksummed_json(path: Path, text: bytes, *, mode: int = 0o666) -> None:
