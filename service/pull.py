@@ -29,7 +29,7 @@ from storage.formats.slice import NO_OPTIONS, FormatOptions, Slice
 from storage.formats.writers.format import ExportFormat
 from storage.parquet_hash import compute_sha256, parse_hashed_table
 from storage.sessions.folder import FRAMES_NAME
-from storage.sessions.metadata import SESSION_NAME
+from storage.sessions.metadata import SESSION_NAME, write_sha256_sums
 from storage.verify.sealed_file import RECOGNISED_FORMATS as PROVEN
 from storage.verify.sealed_file import recognise_export_and_check_not_cut_off
 
@@ -110,6 +110,7 @@ def pull_session(server: foottile.Server, session_id: str, out_folder: Path) -> 
         write_checksummed_json(folder / f"{name}.json", json.dumps(content, indent=1).encode())
     for name in ("markers", "clock"):
         _pull_table(server, f"/sessions/{session_id}/{name}", folder / f"{name}.parquet")
+    write_sha256_sums(folder, session["sha256"])
     return {**session, "path": str(path), "resumed_bytes": resumed}
 
 

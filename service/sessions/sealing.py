@@ -28,6 +28,7 @@ from storage.sessions.metadata import (
     SESSION_NAME,
     read_existing_markers,
     write_markers,
+    write_sha256_sums,
 )
 from storage.sessions.writer import SealedFileWriter
 from storage.verify.sealed_file import SealedFileReport, verify_sealed_file
@@ -80,6 +81,7 @@ def seal_session(inputs: SessionInputs, folder: Path, ledger: Ledger) -> Session
     write_markers(session, folder)
     write_clock_file(folder / CLOCK_NAME, session.clock, inputs.stream_facts)
     sha256 = compute_sha256(path)
+    write_sha256_sums(folder, sha256)
     stances.try_write_or_delete_file(folder, sha256)
     overview.try_write_file(folder, sha256)
     problems = session.problem, frames.problem, stances.problem, overview.problem

@@ -17,9 +17,9 @@ from pydantic import TypeAdapter, ValidationError
 from devices.errors import DamagedFileError, FileFormatError, StorageError, UsageError
 from storage.clock.table import CLOCK_NAME, ClockTable, StreamClockFacts, read_clock_file
 from storage.documents import read_checksummed_json, verify_and_strip_json_checksum
-from storage.durable_files import read_small_file
-from storage.parquet_hash import read_hashed_table, write_hashed_table
-from storage.sessions.folder import Completeness, Ledger, Marker, Part, Session
+from storage.durable_files import read_small_file, translate_storage_errors, write_atomically
+from storage.parquet_hash import compute_sha256, read_hashed_table, write_hashed_table
+from storage.sessions.folder import FRAMES_NAME, Completeness, Ledger, Marker, Part, Session
 
 if TYPE_CHECKING:
     from storage.sessions.reader import SealedFileReader
@@ -146,6 +146,36 @@ def read_existing_markers(path: Path) -> tuple[Marker, ...]:
             where=str(path),
             expected="columns id, label, t_ns without empty values",
         ) from error
+
+
+SUMS_NAME = "SHA256SUMS"
+
+
+def format_sha256_sums(folder: Path, frames_sha256: str) -> bytes:
+    """Return the content of `SHA256SUMS`, which `sha256sum -c` checks: files that never change.
+
+    Args:
+        folder: folder of the session, with the clock's file if there is one.
+        frames_sha256: hash of the file of frames.
+
+    Raises:
+        OSError: the clock's file cannot be read.
+    """
+    sums = {FRAMES_NAME: frames_sha256}
+    if (folder / CLOCK_NAME).is_file():
+        sums[CLOCK_NAME] = compute_sha256(folder / CLOCK_NAME)
+    return "".join(f"{sha256}  {name}\n" for name, sha256 in sums.items()).encode()
+
+
+def write_sha256_sums(folder: Path, frames_sha256: str) -> None:
+    """Write `SHA256SUMS` into the session's folder; an existing one is replaced.
+
+    Raises:
+        StorageError: the disk is full or not writable, or the clock's file cannot be read.
+    """
+    with translate_storage_errors(folder):
+        content = format_sha256_sums(folder, frames_sha256)
+    write_atomically(folder / SUMS_NAME, content)
 
 
 def load_clock_table(reader: SealedFileReader) -> ClockTable:

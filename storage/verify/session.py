@@ -6,6 +6,7 @@ a check that finds problems, the check is repeated.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +21,9 @@ from storage.sessions.ledger import compute_ledger, mark_damaged_and_abandoned_l
 from storage.sessions.metadata import (
     MARKERS_NAME,
     SESSION_NAME,
+    SUMS_NAME,
     StoredMetadata,
+    format_sha256_sums,
     parse_session_metadata,
     read_bytes_or_none,
     read_existing_markers,
@@ -187,9 +190,19 @@ def _check_sealed(report: SessionReport, folder: Path, metadata: StoredMetadata)
     session = metadata.session
     _check_events(report, folder / MARKERS_NAME, session.markers if session is not None else None)
     _check_clock(report, folder / CLOCK_NAME, session)
+    _check_sums(problems, folder, str(content.get("sha256")))
     stances, overview = folder / STANCES_NAME, folder / OVERVIEW_NAME
     _check_derived_file(report, stances, lambda path: read_stances(path).frames_sha256)
     _check_derived_file(report, overview, _read_overview_frames_sha256)
+
+
+def _check_sums(problems: list[str], folder: Path, frames_sha256: str) -> None:
+    """Compare `SHA256SUMS`, if there is one, with files that have no problem themselves."""
+    path = folder / SUMS_NAME
+    if problems or not os.path.lexists(path):
+        return
+    if read_bytes_or_none(path) != format_sha256_sums(folder, frames_sha256):
+        problems.append(f"{SUMS_NAME} has other hashes than the files")
 
 
 def _compare_metadata(

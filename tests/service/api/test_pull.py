@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -42,8 +43,9 @@ def test_a_pulled_session_has_the_file_and_verified_sidecars(
     folder = tmp_path / sealed.id
     assert {path.name for path in folder.iterdir()} == {
         *("frames.parquet", "session.json", "markers.json", "markers.parquet", "ledger.json"),
-        "clock.parquet",
+        *("clock.parquet", "SHA256SUMS"),
     }
+    subprocess.run(["sha256sum", "--check", "--strict", "SHA256SUMS"], cwd=folder, check=True)
     written_ns = Path(pulled["path"]).stat().st_mtime_ns
     assert pull_session(server, sealed.id, tmp_path)["path"] == pulled["path"]
     assert Path(pulled["path"]).stat().st_mtime_ns == written_ns

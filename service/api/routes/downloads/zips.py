@@ -25,7 +25,7 @@ from service.api.routes.downloads.exports import iterate_chunks
 from storage.clock.table import CLOCK_NAME
 from storage.formats.writers.format import DrainedBuffer
 from storage.sessions.folder import FRAMES_NAME, Session
-from storage.sessions.metadata import MARKERS_NAME, SESSION_NAME
+from storage.sessions.metadata import MARKERS_NAME, SESSION_NAME, SUMS_NAME
 from storage.sessions.stances import STANCES_NAME
 
 _CHUNK_BYTES = 1 << 20
@@ -34,8 +34,8 @@ _ZIP_DATES_S = (315_619_200, 4_354_732_800)
 
 Files of 1970, from a machine without a clock, get the nearest date.
 """
-_SIDECARS = (MARKERS_NAME, CLOCK_NAME, STANCES_NAME)
-"""Sidecars of a session. Each has its own checksum; without estimates there are no stances."""
+_SIDECARS = (MARKERS_NAME, CLOCK_NAME, STANCES_NAME, SUMS_NAME)
+"""Files beside the frames. Each can be verified; without estimates there are no stances."""
 
 
 @dataclass(frozen=True)

@@ -257,7 +257,7 @@ def test_verify_names_a_file_that_was_replaced(run: Run, data: Path, kind: str) 
     write_checksummed_json(data / "nodes" / "bench" / "hello.json", b'{"a": 1}')
     write_document(data / SERVER_NAME, ServerIdentity(server_id="5" * 32))
     paths = [path for path in data.rglob("*") if path.is_file() and path.name != ".lock"]
-    assert len(paths) == 10
+    assert len(paths) == 11
     for path in paths:
         aside = path.rename(data.parent / "aside")
         PLACES[kind](path)
