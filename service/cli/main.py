@@ -68,8 +68,13 @@ SUMMARIES = {
 }
 """Summary of each command, the first sentence of its function, in the order of `--help`."""
 
-_MODULES = {"accept-node": "invite", "pull": "sessions", "export": "sessions"}
-"""Modules with more than one command."""
+_MODULES = {
+    **dict.fromkeys(("pull", "export"), "sessions"),
+    **dict.fromkeys(("demo", "invite", "accept-node"), "serve"),
+    **dict.fromkeys(("benchmark", "reproduce"), "studies"),
+    "recover": "verify",
+}
+"""Modules of commands that do not have their own name."""
 
 
 def get_command_function(name: str) -> Callable[..., None]:

@@ -1,28 +1,54 @@
-"""`foottile serve`: server."""
+"""`foottile serve`, `demo`, `invite` and `accept-node`: servers, and who may use them."""
 
 from __future__ import annotations
 
+import asyncio
+import os
 import shlex
 import sys
+from collections.abc import AsyncIterator, Callable
+from contextlib import ExitStack, asynccontextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
+from urllib.parse import quote
 
 import typer
 
-from devices.errors import require_extra
-from service.cli.options import create_stop_event, echo, remark
+from devices.errors import FootTileError, StateError, require_extra
+from service.cli.commands.node import find_scene_calibration
+from service.cli.commands.sessions import SERVER, ServerOption
+from service.cli.options import (
+    SECONDS_MAX,
+    CaOption,
+    FootOptions,
+    JsonOption,
+    add_foot_options,
+    check_emulated,
+    create_stop_event,
+    echo,
+    load_adapted_scene,
+    print_json,
+    remark,
+    resolve_data_folder,
+)
 from service.cli.tickets import (
     AdvertiseOption,
+    TokenFolderOption,
     get_host,
     is_reachable,
+    print_ticket,
+    read_data_token,
     remark_unreachable,
     show_qr_code,
 )
 
 if TYPE_CHECKING:
+    import socket
+
     from service.api.logins import Logins
     from service.api.settings import Settings
+    from service.server.server import Server
 
 
 def _make_limit(text: str) -> Any:
@@ -177,3 +203,211 @@ def print_addresses(
         remark(f"its token is {place}; `foottile invite` prints a login link")
     token_text = token if sys.stderr.isatty() else where
     remark(f"a node: FOOTTILE_TOKEN={token_text} foottile node --scene FILE --server {urls[0]}")
+
+
+NODE = "demo"
+_SEAL_TIMEOUT_S = 20.0
+_STOP_TIMEOUT_S = 8.0
+
+
+@require_extra("server", "`foottile demo`")
+@add_foot_options
+def demo_command(
+    options: FootOptions,
+    scene: Annotated[str, typer.Option(help="Built-in scene, or a scene file.")] = "rolling",
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port; 0: any.")] = 8000,
+    advertise: AdvertiseOption = None,
+    data: Annotated[
+        Path | None, typer.Option(help="Folder for sessions; default: the user's demo folder.")
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(min=0.0, max=SECONDS_MAX, help="Run time; default: until Ctrl-C."),
+    ] = None,
+) -> None:
+    """Run a server and an emulated node, and print a link to the live page.
+
+    The scene never ends; a recorded load repeats. Ctrl-C stops and seals running recordings, and
+    ends both.
+    """
+    import uvloop
+
+    from service.api.connection_limits import raise_open_files_limit
+    from service.rig.emulated_foot import RigOptions
+
+    raise_open_files_limit()
+    the_scene = load_adapted_scene(scene, bus=None, servo=None)
+    check_emulated(the_scene)
+    # Fills the cache for the node.
+    find_scene_calibration(RigOptions(the_scene, NODE, options.make_foot(the_scene)))
+    arguments = [f"--scene={scene}", *options.to_arguments()]
+    folder = resolve_data_folder(data)
+    if data is None:
+        folder /= "demo"
+    arguments.append(f"--journal={folder / 'node'}")
+    uvloop.run(_run_demo(host, port, advertise, folder, seconds, arguments))
+
+
+async def _run_demo(
+    host: str,
+    port: int,
+    advertise: str | None,
+    data: Path,
+    seconds: float | None,
+    node_arguments: list[str],
+) -> None:
+    from foottile.environment import read_token
+    from service.api.address import (
+        list_urls,
+        load_or_create_token,
+        open_listening_socket,
+        publish_token,
+    )
+    from service.api.logins import Logins
+    from storage.permissions import set_umask_and_create_private_folder
+
+    stop = create_stop_event()
+    set_umask_and_create_private_folder(data)
+    with open_listening_socket(host, port) as listening, ExitStack() as stack:
+        given_token = read_token()
+        token = load_or_create_token(given_token, data)
+        stack.enter_context(publish_token(listening, token))
+        logins = Logins(token)
+        find_urls = partial(list_urls, listening, host, advertise)
+        urls = find_urls()
+        # First: the node finds and measures its tiles while the server starts.
+        node = await _start_node(urls[-1], token, node_arguments)
+        try:
+            async with _serve_demo(listening, data, logins, find_urls) as server:
+                print_addresses(urls, data, logins, is_stored=not given_token, is_demo=True)
+                remark_unreachable(urls, host)
+                remark(f"list recordings: foottile sessions --server {urls[-1]}")
+                ended = asyncio.create_task(node.wait())
+                stopped = asyncio.create_task(stop.wait())
+                done, _ = await asyncio.wait(
+                    {ended, stopped}, timeout=seconds, return_when=asyncio.FIRST_COMPLETED
+                )
+                stopped.cancel()
+                if ended in done:
+                    raise FootTileError(
+                        f"the node ended with code {node.returncode}",
+                        remedy="See its output above",
+                    )
+                await _stop_recording(server)
+                await _stop_node(node)  # before its server, else it would try to reconnect
+                if not stop.is_set():
+                    remark(f"ended after {seconds:g} s; data in {data}")
+        finally:
+            await _stop_node(node)
+
+
+@asynccontextmanager
+async def _serve_demo(
+    listening: socket.socket, data: Path, logins: Logins, find_urls: Callable[[], list[str]]
+) -> AsyncIterator[Server]:
+    """Run a server while the block runs."""
+    from devices.realtime import freeze_garbage_collector
+    from service.api.address import list_own_names
+    from service.api.app import make_app
+    from service.api.runner import serve_app
+    from service.server.server import Server
+
+    server = Server(data)
+    hosts = (*list_own_names(), get_host(find_urls()[0]))
+    app = make_app(server, hosts=hosts, logins=logins, find_urls=find_urls)
+    async with serve_app(app, listening):
+        freeze_garbage_collector()
+        yield server
+
+
+async def _start_node(url: str, token: str, arguments: list[str]) -> asyncio.subprocess.Process:
+    code = "from service.cli.main import main; main()"
+    environment = {**os.environ, "FOOTTILE_TOKEN": token}
+    return await asyncio.create_subprocess_exec(
+        *(sys.executable, "-c", code, "node", f"--server={url}", f"--name={NODE}"),
+        "--end-with-parent",
+        *arguments,
+        env=environment,
+        stdin=asyncio.subprocess.DEVNULL,
+        start_new_session=True,  # Ctrl-C reaches this process, which stops the recording first
+    )
+
+
+async def _stop_recording(server: Server) -> None:
+    for session in server.recorder.list_recording(NODE):
+        server.recorder.stop_session(session.id)
+        sealed = await server.sealer.wait_until_sealed_or_timeout(session.id, _SEAL_TIMEOUT_S)
+        remark(f"session {sealed.id} ({sealed.name}) is {sealed.state}")
+
+
+async def _stop_node(node: asyncio.subprocess.Process) -> None:
+    """Stop the node, if it still runs."""
+    if node.returncode is not None:
+        return
+    with suppress(ProcessLookupError):
+        node.terminate()
+    try:
+        await asyncio.wait_for(node.wait(), _STOP_TIMEOUT_S)
+    except TimeoutError:
+        with suppress(ProcessLookupError):
+            node.kill()
+        await node.wait()
+
+
+@require_extra("server", "`foottile invite`")
+def invite_command(
+    read_only: Annotated[
+        bool, typer.Option("--read-only", help="May look; may not tare or record.")
+    ] = False,
+    server: ServerOption = None,
+    ca: CaOption = None,
+    data: TokenFolderOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Create a one-time login link, and on a terminal its QR code.
+
+    The first browser that opens it within five minutes is logged in for twelve hours. Run it on the
+    server's computer. The token comes from the folder of --data, else from FOOTTILE_TOKEN, else
+    from a server of this user.
+    """
+    import foottile
+
+    with foottile.connect(server or SERVER, read_data_token(data), ca=ca) as source:
+        ticket = source.create_invite(role="viewer" if read_only else "operator")
+    if as_json:
+        print_json(ticket)
+    else:
+        print_ticket(ticket["urls"], viewer=read_only)
+
+
+@require_extra("server", "`foottile accept-node`")
+def accept_node_command(
+    node: Annotated[str, typer.Argument(help="Name of the node.")],
+    fingerprint: Annotated[
+        str | None,
+        typer.Option(help="Fingerprint of the machine; default: the last one that connected."),
+    ] = None,
+    server: ServerOption = None,
+    ca: CaOption = None,
+    data: TokenFolderOption = None,
+) -> None:
+    """Accept another machine under the name of a node.
+
+    A server rejects a machine without the node's secret, for example after a change of its storage.
+    The accepted machine becomes the node; the previous one is disconnected and rejected. Compare
+    the fingerprint with the machine's output first. Run this on the server's computer.
+    """
+    import foottile
+
+    path = f"/nodes/{quote(node, safe='')}"
+    with foottile.connect(server or SERVER, read_data_token(data), ca=ca) as source:
+        replacement = source.http.get(path)["replacement"]
+        if replacement is None:
+            raise StateError(
+                f"no other machine asks to connect as {node!r}",
+                remedy="Start the machine; it retries every few seconds",
+            )
+        accepted = fingerprint or replacement["fingerprint"]
+        source.http.send("POST", f"{path}/accept-replacement", {"fingerprint": accepted})
+    echo(f"{node} is now the machine {accepted}")

@@ -30,7 +30,7 @@ from tests.service.networks import needs_networks, run_in_network
 def test_an_address_needs_no_heavy_import() -> None:
     # `foottile demo` starts its node with it, which looks for tiles while the server is prepared.
     code = (
-        "import sys, service.api.address, service.cli.commands.demo\n"
+        "import sys, service.api.address, service.cli.commands.serve\n"
         "print([name for name in ('fastapi', 'uvicorn', 'numba') if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
