@@ -1,4 +1,4 @@
-"""`foottile serve`, `demo`, `invite` and `accept-node`: servers, and who may use them."""
+"""Commands of a server: `foottile serve`, `demo`, and `invite` and `accept-node` for access."""
 
 from __future__ import annotations
 
