@@ -23,7 +23,7 @@ from devices.scene.emulation_sections import PartFamily
 from service.estimation.dead_weights import STANDARD_GRAVITY_M_S2
 from service.estimation.fitting.rig.indentation import Indentation
 from service.estimation.fitting.weights_fit import fit_curve_to_dead_weights
-from service.estimation.models.static import StaticCurves
+from service.estimation.models.static import StaticParams, compute_forces
 from service.offline.calibration_lookup import make_rig_scene
 
 FIVE_G = (200.0, 500.0, 1000.0, 1500.0, 2000.0)
@@ -114,7 +114,7 @@ def measure(
             gauge = kpa[now & (since >= at_s) & (since < at_s + 0.5), i].mean() - tare_kpa
             if gauge > tile.range_kpa[1]:
                 continue  # an estimate says that it is a lower bound
-            found = StaticCurves([tile]).compute_forces(np.array([[gauge]]))
+            found = compute_forces(StaticParams.from_calibrations([tile]), np.array([[gauge]]))
             true_n = test_n[test, i]
             half_n = 1.96 * float(found.fit_sigma_n[0, 0])
             error_n = float(found.force_n[0, 0]) - true_n

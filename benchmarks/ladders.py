@@ -19,7 +19,7 @@ from pathlib import Path
 from devices.emulation.ground.load_trace import CopTransform
 from devices.scene.scene_file import Scene, load_scene
 from service.estimation.calibration import PRESETS
-from service.estimation.pipeline.model_set import MODEL_NAMES
+from service.estimation.pipeline.params import MODEL_NAMES
 from service.offline.calibration_lookup import find_calibration
 from service.rig.emulated_foot import EmulatedFoot
 from storage.formats.load_trace import read_load_to_emulate

@@ -49,7 +49,7 @@ class StaticKernel:
             _column([t.coefficients[k] * t.f_scale_n for t in entries]) for k in (1, 2, 3)
         )
         self.u0 = -self.offset * self.per_kpa
-        self.slope_at_zero = _column(plan.model_set.static_curves.slope_at_zero_n_per_kpa)
+        self.slope_at_zero = _column(plan.curves["slope_at_zero_n_per_kpa"])
         self.misfit = _column([t.relative_misfit for t in entries])
         self.loop_n = _column([t.loop_misfit_n for t in entries])
         # The matrix is symmetric: six terms instead of nine.
@@ -62,7 +62,7 @@ class StaticKernel:
         self.low_kpa = (
             _column([t.range_kpa[0] for t in entries]) - SIGNIFICANCE_SIGMAS * self.still_kpa
         )
-        self.plan = plan
+        self.plan, self.bearing, self.foot = plan, plan.bearing, plan.params.foot
         self.f = [np.empty((n, rows)) for _ in range(9)]
         self.flag = [np.empty((n, rows), dtype=np.bool_) for _ in range(4)]
         self.row = [np.empty(rows) for _ in range(12)]
@@ -152,7 +152,7 @@ class StaticKernel:
         np.copyto(divisor, grf)
         np.copyto(divisor, np.nan, where=grf == 0.0)
         for axis, (at, at_sigma) in enumerate(((x, sx), (y, sy), (z, sz))):
-            arm = self.plan.tile_positions_m[:, axis, None]
+            arm = self.bearing["position_m"][:, axis, None]
             np.multiply(force, arm, out=u)
             np.add.reduce(u, axis=0, out=at)
             np.divide(at, divisor, out=at)
@@ -163,9 +163,9 @@ class StaticKernel:
             np.sqrt(at_sigma, out=at_sigma)
             np.abs(divisor, out=nothing)
             np.divide(at_sigma, nothing, out=at_sigma)
-        if self.plan.grid is not None:
+        if self.foot["has_grid"]:
             np.add.reduce(gauge, axis=0, out=nothing)
-            for weights in self.plan.grid:
+            for weights in self.bearing["grid_index"].T:
                 np.multiply(gauge, weights[:, None], out=u)
                 np.add.reduce(u, axis=0, out=index)
                 index /= nothing
@@ -179,15 +179,14 @@ class StaticKernel:
             np.bitwise_or(status, np.uint16(bit), out=status, where=also)
         np.greater(frames.t_ns, self.plan.tare.t_ns + TARE_OLD_NS, out=also)
         np.bitwise_or(status, np.uint16(128), out=status, where=also)
-        np.greater_equal(grf, self.plan.contact.on_n, out=good)
+        np.greater_equal(grf, self.foot["contact_on_n"], out=good)
         np.multiply(grf_sigma, SIGNIFICANCE_SIGMAS, out=nothing)
         np.greater_equal(grf, nothing, out=also)
         good &= also
         for at_sigma in (sx, sy):
-            np.less_equal(at_sigma, self.plan.cop_sigma_max_m, out=also)
+            np.less_equal(at_sigma, self.foot["cop_sigma_max_m"], out=also)
             good &= also
-        normals, offsets_m = self.plan.hull
-        for (nx, ny), offset_m in zip(normals, offsets_m, strict=True):
+        for nx, ny, offset_m in self.plan.params.hull:
             np.multiply(x, nx, out=beyond)
             np.multiply(y, ny, out=nothing)
             beyond += nothing

@@ -33,7 +33,7 @@ from service.estimation.effects import (
 )
 from service.estimation.estimate import Estimator
 from service.estimation.models.hysteresis import WIDTHS_N
-from service.estimation.pipeline.model_set import MODEL_NAMES
+from service.estimation.pipeline.params import MODEL_NAMES
 from service.estimation.pipeline.plan import make_plan
 from service.estimation.tare.tare import Tare
 

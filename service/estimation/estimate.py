@@ -9,6 +9,7 @@ records.
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 from typing import Any, Self, cast
 
 import numpy as np
@@ -23,7 +24,7 @@ from service.estimation.foot.contact import is_debounced
 from service.estimation.foot.geometry import interpolate_servo_counts, transform_to_ground_x_m
 from service.estimation.models import denoise
 from service.estimation.pipeline import grf_cop
-from service.estimation.pipeline.params import KernelParams, make_kernel_params
+from service.estimation.pipeline.params import KernelParams
 from service.estimation.pipeline.plan import EstimationPlan
 from service.estimation.pipeline.sample_stage import (
     append_frames_to_buffer,
@@ -42,7 +43,6 @@ from service.estimation.pipeline.state import (
     TileSample,
     TileState,
     compact_or_grow_buffer,
-    initial_state,
     make_frame_buffer,
 )
 from service.estimation.records import Columns, Estimates, RecordArray, view_records_as_bytes
@@ -67,6 +67,7 @@ _COLUMNS = (
     "frame_flags",
 )
 """Columns of frames, in the order of the parameters of `_compute_step`."""
+_FIELDS = tuple(f.name for f in fields(Estimates))
 _ROW_FIELDS = ("release_row", "sample_row", "end_row")
 """Rows of the buffer in `FootState`."""
 KernelOutput = tuple[
@@ -88,9 +89,8 @@ class Estimator:
 
     def __init__(self, plan: EstimationPlan) -> None:
         self.plan = plan
-        self._params = make_kernel_params(plan)
         tiles = len(plan.info.tiles)
-        self._foot_state, self._tile_states = initial_state(tiles)
+        self._foot_state, self._tile_states = FootState.array(1), TileState.array(tiles)
         self._buffer = make_frame_buffer(ROWS_MIN, tiles)
         axes = zip(grf_cop.COLUMNS_BY_AXIS, plan.cop_measured, strict=True)
         self._unmeasured = [row for rows, is_measured in axes if not is_measured for row in rows]
@@ -115,14 +115,16 @@ class Estimator:
         if self._foot_state["end_row"][0] + n > len(self._buffer.rows):
             self._compact_buffer(n)
         columns = [_to_compiled_layout(getattr(frames, name)) for name in _COLUMNS]
-        output = _step(self._params, self._foot_state, self._tile_states, self._buffer, *columns)
+        output = _step(
+            self.plan.params, self._foot_state, self._tile_states, self._buffer, *columns
+        )
         return _make_estimates(output, self._unmeasured)
 
     def finish(self) -> Estimates | None:
         """Return the estimates that still wait for their look-ahead; None if there are none."""
         if self._foot_state["release_row"][0] == self._foot_state["end_row"][0]:
             return None
-        output = _finish(self._params, self._foot_state, self._tile_states, self._buffer)
+        output = _finish(self.plan.params, self._foot_state, self._tile_states, self._buffer)
         return _make_estimates(output, self._unmeasured)
 
     def state_dict(self) -> Columns:
@@ -167,7 +169,7 @@ class Estimator:
     def _compact_buffer(self, new_rows: int) -> None:
         due, sample, end = (int(self._foot_state[name][0]) for name in _ROW_FIELDS)
         first = min(due, max(sample - 1, 0))
-        if self.plan.model_set.has_denoise and end:
+        if "denoise" in self.plan.models and end:
             t_mono_ns = self._buffer.t_mono_ns[:end]
             # The next frame may not be here yet; it will be no earlier than the last that is.
             oldest_ns = t_mono_ns[min(due, end - 1)] - denoise.PAST_NS
@@ -192,27 +194,9 @@ def _make_estimates(output: KernelOutput, unmeasured: list[int]) -> Estimates:
     # Afterwards: masking of the centre of pressure needs the row's position.
     for row in unmeasured:  # mostly none; an index of an empty list takes 5 us
         by_frame[row] = math.nan
-    return Estimates(
-        seq=seq,
-        t_ns=t_ns,
-        gauge_kpa=by_tile[_GAUGE],
-        force_n=by_tile[_FORCE],
-        force_sigma_n=by_tile[_SIGMA],
-        grf_n=by_frame[grf_cop.GRF],
-        grf_sigma_n=by_frame[grf_cop.GRF_SIGMA],
-        grf_lower_bound_n=by_frame[grf_cop.GRF_LOWER_BOUND],
-        cop_x_m=by_frame[grf_cop.COP_X],
-        cop_y_m=by_frame[grf_cop.COP_Y],
-        cop_sigma_x_m=by_frame[grf_cop.COP_SIGMA_X],
-        cop_sigma_y_m=by_frame[grf_cop.COP_SIGMA_Y],
-        cop_index_x=by_frame[grf_cop.COP_INDEX_X],
-        cop_index_y=by_frame[grf_cop.COP_INDEX_Y],
-        cop_ground_x_m=by_frame[grf_cop.COP_GROUND_X],
-        cop_ground_y_m=by_frame[grf_cop.COP_GROUND_Y],
-        angle_rad=by_frame[grf_cop.FOOT_ANGLE],
-        contact=contact,
-        estimate_flags=status,
-    )
+    # Both are in the order of the fields; the last of a frame, `COP_Z`, is none of them.
+    columns = (seq, t_ns, *by_tile, *by_frame[: grf_cop.COP_Z], contact, status)
+    return Estimates(**dict(zip(_FIELDS, columns, strict=True)))
 
 
 @jit_cached

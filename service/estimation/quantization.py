@@ -27,6 +27,7 @@ import numpy.typing as npt
 
 from devices.arrays import Floats
 from service.estimation.models.denoise import PAST_NS, WINDOW_READINGS_MAX
+from service.estimation.models.static import compute_forces
 from service.estimation.pipeline.plan import EstimationPlan
 
 STEPS_PER_SIGMA = 8.0
@@ -109,24 +110,23 @@ def _compute_least_sigmas(plan: EstimationPlan) -> dict[str, Floats]:
     force_n = np.full(len(plan.info.tiles), np.nan)
     force_n[plan.load_bearing_columns] = of_tile_n
     grf_n = np.array([math.sqrt(float((of_tile_n**2).sum()))])
-    most_kpa = float(plan.model_set.static_curves.range_high_kpa.sum())
-    end_n = plan.model_set.static_curves.compute_forces(
-        plan.model_set.static_curves.range_high_kpa[None]
-    ).force_n
-    most_n = float((plan.mount_gain * end_n).sum())
+    bearing, curves = plan.bearing, plan.curves
+    most_kpa = float(curves["range_high_kpa"].sum())
+    end_n = compute_forces(curves, curves["range_high_kpa"][None]).force_n
+    most_n = float((bearing["mount_gain"] * end_n).sum())
     least = {"gauge_kpa": reading_kpa, "force_n": force_n, "force_sigma_n": force_n}
     least |= dict.fromkeys(("grf_n", "grf_sigma_n", "grf_lower_bound_n"), grf_n)
     for name, is_measured, places_m in zip(
-        "xy", plan.cop_measured, plan.tile_positions_m.T, strict=False
+        "xy", plan.cop_measured, bearing["position_m"].T, strict=False
     ):
         sigma_m = (
             of_tile_n.min() * _compute_lever_norm(places_m) / most_n if is_measured else math.nan
         )
         names = f"cop_{name}_m", f"cop_sigma_{name}_m", f"cop_ground_{name}_m"
         least |= dict.fromkeys(names, np.array([sigma_m]))
-    if plan.grid is not None:
-        noise_kpa = float(tare.noise_kpa[plan.load_bearing_columns].min())
-        i, j = (noise_kpa * _compute_lever_norm(index) / most_kpa for index in plan.grid)
+    if plan.params.foot["has_grid"][0]:
+        noise_kpa = float(bearing["noise_kpa"].min())
+        i, j = (noise_kpa * _compute_lever_norm(k) / most_kpa for k in bearing["grid_index"].T)
         least |= {"cop_index_x": np.array([i or j]), "cop_index_y": np.array([j or i])}
     if (servo := plan.info.servo) is not None:
         count_rad = abs(servo.ratio) * 2.0 * math.pi / servo.counts_per_turn
@@ -136,18 +136,18 @@ def _compute_least_sigmas(plan: EstimationPlan) -> dict[str, Floats]:
 
 def _compute_least_tile_sigmas_n(plan: EstimationPlan) -> Floats:
     """Compute the least sigma of each load-bearing tile's force, over its range, fully averaged."""
-    curves, left = plan.model_set.static_curves, np.ones(len(plan.load_bearing_columns))
-    if plan.model_set.has_denoise:
+    bearing, curves, left = plan.bearing, plan.curves, np.ones(len(plan.load_bearing_columns))
+    if "denoise" in plan.models:
         within_s = 1e-9 * (PAST_NS + plan.lookahead_ns)
         rate_hz = _RATE_MARGIN * plan.info.nominal_rate_hz
         readings = min(WINDOW_READINGS_MAX, 2 + math.ceil(rate_hz * within_s))
-        left = plan.variance_inflation[:, readings] / readings
-    of_pressure_kpa = np.sqrt(left * plan.noise_kpa**2 + plan.baseline_sigma_kpa**2)
-    static = curves.compute_forces(
-        np.linspace(0.0, 1.0, _PRESSURES)[:, None] * curves.range_high_kpa
+        left = bearing["variance_inflation"][:, readings] / readings
+    of_pressure_kpa = np.sqrt(left * bearing["noise_kpa"] ** 2 + bearing["baseline_variance"])
+    static = compute_forces(
+        curves, np.linspace(0.0, 1.0, _PRESSURES)[:, None] * curves["range_high_kpa"]
     )
     own_n = np.hypot(static.slope_n_per_kpa * of_pressure_kpa, static.fit_sigma_n)
-    return np.asarray(plan.mount_gain * own_n.min(axis=0))
+    return np.asarray(bearing["mount_gain"] * own_n.min(axis=0))
 
 
 def _compute_lever_norm(places: Floats) -> float:

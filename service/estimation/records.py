@@ -11,6 +11,7 @@ from functools import cache
 from typing import (
     Annotated,
     Any,
+    ClassVar,
     Protocol,
     Self,
     TypeVar,
@@ -25,10 +26,6 @@ import numpy.typing as npt
 
 from devices.arrays import ArrayRecord, Floats, Times
 
-Records = npt.NDArray[np.void]
-"""Records of any type, (n,)."""
-Record = Any
-"""Record whose fields are not checked."""
 Columns = dict[str, npt.NDArray[Any]]
 R_co = TypeVar("R_co", covariant=True)
 
@@ -41,7 +38,7 @@ class RecordArray(Protocol[R_co]):
     def __getitem__(self, key: int, /) -> R_co: ...
     @overload
     def __getitem__(self, key: str, /) -> npt.NDArray[Any]: ...
-    def __setitem__(self, key: str, value: Any, /) -> None: ...
+    def __setitem__(self, key: str | npt.NDArray[np.intp], value: Any, /) -> None: ...
 
 
 class RecordMatrix(Protocol[R_co]):
@@ -58,8 +55,16 @@ class KernelRecord:
     """Base of record types: each annotation declares a field, in this order.
 
     A field is `float`, `int`, a numpy scalar, another record type, or
-    `Annotated[Floats, shape]` or `Annotated[Ints, shape]`. No instance of these classes exists.
+    `Annotated[Floats, shape]` or `Annotated[Ints, shape]`. It begins with the value that the class
+    gives it, else with zero. No instance of these classes exists.
     """
+
+    @classmethod
+    @cache
+    def fields(cls) -> dict[str, Any]:
+        """Return the annotations of the fields by name, in order."""
+        hints = get_type_hints(cls, include_extras=True)
+        return {name: hint for name, hint in hints.items() if get_origin(hint) is not ClassVar}
 
     @classmethod
     @cache
@@ -69,45 +74,39 @@ class KernelRecord:
         numba recognises its arguments by the layout's identity; it compares equal ones field by
         field at each call, which costs some 10 us. Aligned as the processor prefers.
         """
-        hints = get_type_hints(cls, include_extras=True)
-        return make_record_dtype([(name, *_layout(hint)) for name, hint in hints.items()])
+        fields = [(name, *_layout(hint)) for name, hint in cls.fields().items()]
+        return np.dtype(fields, align=True)
 
     @classmethod
     def array(cls, n: int, **columns: Any) -> RecordArray[Self]:
-        """Make n records with these columns, zero elsewhere.
+        """Make n records with these columns, and the initial values elsewhere.
 
         Raises:
             ValueError: a column is no field, or does not fit.
         """
-        return make_records(cls.dtype(), n, **columns)
+        made = np.zeros(n, cls.dtype())
+        cls.fill_with_initial_values(made)
+        for name, values in columns.items():
+            made[name] = values
+        return made
+
+    @classmethod
+    def fill_with_initial_values(cls, records: npt.NDArray[np.void]) -> None:
+        """Set the fields that a class gives a value, also those of records within."""
+        for name, hint in cls.fields().items():
+            if isinstance(hint, type) and issubclass(hint, KernelRecord):
+                hint.fill_with_initial_values(records[name])
+            elif hasattr(cls, name):
+                records[name] = getattr(cls, name)  # ANY: fields of the class itself
 
 
 def _layout(hint: Any) -> tuple[Any, ...]:
     if get_origin(hint) is Annotated:
-        kind, layout = get_args(hint)
-        if isinstance(layout, np.dtype):
-            return (layout,)
-        return (np.float64 if kind == Floats else np.int64, layout)
+        kind, shape = get_args(hint)
+        return (np.float64 if kind == Floats else np.int64, shape)
     if issubclass(hint, KernelRecord):
         return (hint.dtype(),)
     return ({float: np.float64, int: np.int64}.get(hint, hint),)
-
-
-def make_record_dtype(fields: list[Any]) -> np.dtype[np.void]:
-    """Make a record layout from names, types and shapes, aligned as the processor prefers."""
-    return np.dtype(fields, align=True)
-
-
-def make_records(dtype: np.dtype[np.void], n: int, **columns: Any) -> Records:
-    """Make n records with these columns, zero elsewhere.
-
-    Raises:
-        ValueError: a column is no field, or does not fit.
-    """
-    made = np.zeros(n, dtype)
-    for name, values in columns.items():
-        made[name] = values
-    return made
 
 
 def view_records_as_bytes(column: npt.NDArray[Any]) -> npt.NDArray[Any]:

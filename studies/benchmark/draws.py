@@ -26,7 +26,7 @@ from devices.frames import ArrayInfo, FrameBatch
 from devices.scene.scene_file import Scene
 from service.estimation.calibration import Calibration
 from service.estimation.estimate import Estimator
-from service.estimation.pipeline.model_set import MODEL_NAMES
+from service.estimation.pipeline.params import MODEL_NAMES
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from service.estimation.tare.unloaded_windows import compute_recording_tare
 from service.offline.accuracy import ACCURACY_COLUMNS, Accuracy, compute_accuracy

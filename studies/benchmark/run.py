@@ -16,7 +16,7 @@ import numpy as np
 from devices.errors import FootTileError
 from devices.scene.scene_file import Scene
 from service.estimation.calibration import PRESETS
-from service.estimation.pipeline.model_set import MODEL_NAMES
+from service.estimation.pipeline.params import MODEL_NAMES
 from service.offline.process_pool import map_in_processes
 from service.version import SOFTWARE_VERSION
 from studies.benchmark.draws import (

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import fields
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +30,20 @@ def newton_plan(
     tare = make_tare(len(info.tiles), noise_kpa=sigma_n * COUNT_KPA)
     calibration = make_calibration(*(info.serials if tiles is None else tiles))
     return make_plan(info, calibration, tare, models=models, lag_ms=lag_ms)
+
+
+def with_params(
+    plan: EstimationPlan, *, foot: Mapping[str, Any] | None = None, **tiles: Any
+) -> EstimationPlan:
+    """A plan with other parameters of the foot, and of all its tiles."""
+    params = plan.params._replace(
+        foot=copy.copy(plan.params.foot), tiles=copy.copy(plan.params.tiles)
+    )
+    for name, value in (foot or {}).items():
+        params.foot[name] = value
+    for name, value in tiles.items():
+        params.tiles[name] = value
+    return replace(plan, params=params)
 
 
 def estimate(plan: EstimationPlan, *batches: FrameBatch) -> Estimates:

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
+from service.estimation.models.rubber import RubberParams
 from service.estimation.records import RecordArray
+
+
+def make_rubber(parts: Sequence[float], tau_s: Sequence[float]) -> RecordArray[RubberParams]:
+    """Parameters of a tile whose rubber creeps in these parts, with these time constants."""
+    made = RubberParams.array(1, n_terms=len(parts))
+    made["creep_fraction"][0, : len(parts)], made["tau_s"][0, : len(parts)] = parts, tau_s
+    return made
 
 
 def through(

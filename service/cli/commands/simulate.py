@@ -64,7 +64,7 @@ def simulate_command(
     slow for the scene's frame rate.
     """
     # Imported here: the physics imports numba, which would slow down `--help`.
-    from service.estimation.pipeline.model_set import check_known_models_with_static
+    from service.estimation.pipeline.params import check_known_models_with_static
     from service.offline.calibration_lookup import find_calibration, replace_tiles
     from service.offline.simulation import SimulationOptions, run_simulation
     from service.rig.emulated_foot import make_injected_path

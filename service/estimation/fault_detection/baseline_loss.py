@@ -9,6 +9,10 @@ return, so the tile reads too little afterwards as much as it has read too much.
 hardly reads too little at all.
 
 A tile that permanently reads too much cannot be told from a loaded one.
+
+Thermal drift, the shift of the baseline by warmth: without the model `temperature` all of it is
+error, and all tiles err to the same side. The gas follows its chip within seconds, so the larger
+shift counts: the chip's, or its low-pass.
 """
 
 from __future__ import annotations
@@ -17,8 +21,9 @@ import math
 
 import numpy as np
 
+from devices.frames import NOT_READ
 from devices.jit import jit_cached
-from service.estimation.records import KernelRecord, RecordArray
+from service.estimation.records import KernelRecord
 
 ERROR_MIN_KPA = 0.4
 """Four fifths of a newton; creep and hysteresis leave half of that of a fast release."""
@@ -41,24 +46,21 @@ FADING_S = 10.0
 GAP_MAX_S = 0.5
 """Gap in the readings after which the low-pass starts again."""
 NEVER_NS = -(1 << 62)
+CHIP_SMOOTHING_S = 0.5  # long against the noise of half a count
+GAS_LAG_S = 5.0  # of the gas behind its chip, at most
 
 
 class BaselineLossState(KernelRecord):
     """State of a tile."""
 
-    smoothed_kpa: float  # above the baseline; NaN before the first
+    smoothed_kpa: float = np.nan  # above the baseline; NaN before the first
     t_ns: int
-    below_since_ns: int  # `NEVER_NS`: not below
+    below_since_ns: int = NEVER_NS  # `NEVER_NS`: not below
     deepest_kpa: float  # below the baseline
     highest_kpa: float  # above the baseline
     excess_kpa_s: float  # integral above the baseline, fading
     deficit_kpa_s: float  # integral below the baseline, fading
     error_kpa: float
-
-
-def initial_state(tiles: int) -> RecordArray[BaselineLossState]:
-    """Make the states before the first reading, (tiles,)."""
-    return BaselineLossState.array(tiles, smoothed_kpa=np.nan, below_since_ns=NEVER_NS)
 
 
 @jit_cached
@@ -113,3 +115,43 @@ def update_baseline_error_bound_kpa(
                 # Then none of the excess is force.
                 state.error_kpa = max(state.error_kpa, state.highest_kpa, state.deepest_kpa)
     return state.error_kpa
+
+
+class ThermalDriftState(KernelRecord):
+    """State of a tile: counts from the tare's, low-passed; NaN before the first reading."""
+
+    chip_counts: float = np.nan
+    gas_counts: float = np.nan
+    t_ns: int
+
+
+@jit_cached
+def update_thermal_drift_kpa(
+    state: ThermalDriftState,
+    temperature_raw: int,
+    tare_counts: float,
+    kpa_per_count: float,
+    t_ns: int,
+) -> float:
+    """Update the state; return the baseline's signed drift by warmth in kPa, 0 where unknown.
+
+    Args:
+        state: after the tile's readings before; updated.
+        temperature_raw: counts; `NOT_READ` where unknown.
+        tare_counts: at the tare, NaN where unknown.
+        kpa_per_count: shift of the baseline for a count.
+        t_ns: instant.
+    """
+    now = temperature_raw - tare_counts
+    if temperature_raw != NOT_READ and not math.isnan(now):
+        if math.isnan(state.chip_counts):
+            state.chip_counts = state.gas_counts = now
+        else:
+            step_s = max(0.0, (t_ns - state.t_ns) * 1e-9)
+            state.chip_counts += step_s / (CHIP_SMOOTHING_S + step_s) * (now - state.chip_counts)
+            state.gas_counts += (
+                step_s / (GAS_LAG_S + step_s) * (state.chip_counts - state.gas_counts)
+            )
+        state.t_ns = t_ns
+    more = state.chip_counts if abs(state.chip_counts) > abs(state.gas_counts) else state.gas_counts
+    return 0.0 if math.isnan(more) else kpa_per_count * more

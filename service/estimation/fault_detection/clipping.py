@@ -18,11 +18,13 @@ A reading at the edge is a lower bound from then on, as one at the chip's own en
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
 import numpy as np
 
+from devices.arrays import Floats
 from devices.jit import jit_cached
-from service.estimation.records import Record, Records, make_record_dtype, make_records
+from service.estimation.records import KernelRecord
 
 ENOUGH = 11.0
 """Evidence of a clip, natural logarithm: after a healthy loading with a flat top the chance of as
@@ -72,46 +74,40 @@ FOLLOW = 0.5
 SMOOTH = 8.0
 """Readings over which the first loading's highest level is averaged."""
 
-STATE = make_record_dtype(
-    [
-        ("inside", np.int64),  # is it loaded?
-        ("turning", np.int64),  # readings in a row that say otherwise
-        ("smooth_kpa", np.float64),
-        ("peak_kpa", np.float64),  # of this loading
-        ("read_ns", np.int64),  # when it was read last, ...
-        ("felt_kpa", np.float64),  # ... how far above the baseline, at most `most_kpa`, ...
-        ("others_kpa", np.float64),  # ... and how far the other tiles were, in all
-        ("most_kpa", np.float64),  # infinite before the first loading
-        ("readings", np.int64),  # of this loading
-        ("hole_ns", np.int64),  # longest time without a reading
-        ("load_kpa_s", np.float64),  # integral of the pressure, ...
-        ("load_variance", np.float64),  # ... its variance, of noise and of holes, ...
-        ("others_kpa2_s", np.float64),  # ... and integral of the product with that on the others
-        ("at", np.int64),  # readings at the edge, ...
-        ("stay_ns", np.int64),  # ... how long it was there, ...
-        ("at_kpa", np.float64),  # ... and the sum of these, relative to the edge
-        ("middle", np.int64),
-        ("slope", np.int64),
-        ("over", np.int64),
-        ("edge_kpa", np.float64),  # NaN before the first loading
-        ("loads", np.int64),  # how many have counted, ...
-        ("loads_kpa_s", np.float64, (LOADS,)),  # ... the integrals of the last ones, ...
-        ("loads_others_kpa", np.float64, (LOADS,)),  # ... and what the others bore
-        ("evidence", np.float64),  # that the edge is a clip
-        ("end_kpa", np.float64),  # of what can be told; infinite while there is no clip
-    ]
-)
-"""State of one tile's detector."""
 
+class ClippingState(KernelRecord):
+    """State of one tile's detector."""
 
-def initial_clipping_state(tiles: int) -> Records:
-    """Make the detectors' states before the first reading, (tiles,)."""
-    return make_records(STATE, tiles, most_kpa=np.inf, edge_kpa=np.nan, end_kpa=np.inf)
+    inside: int  # 1: it is loaded
+    turning: int  # readings in a row that say otherwise
+    smooth_kpa: float
+    peak_kpa: float  # of this loading
+    read_ns: int  # when it was read last, ...
+    felt_kpa: float  # ... how far above the baseline, at most `most_kpa`, ...
+    others_kpa: float  # ... and how far the other tiles were, in all
+    most_kpa: float = np.inf  # infinite before the first loading
+    readings: int  # of this loading
+    hole_ns: int  # longest time without a reading
+    load_kpa_s: float  # integral of the pressure, ...
+    load_variance: float  # ... its variance, of noise and of holes, ...
+    others_kpa2_s: float  # ... and integral of the product with that on the others
+    at: int  # readings at the edge, ...
+    stay_ns: int  # ... how long it was there, ...
+    at_kpa: float  # ... and the sum of these, relative to the edge
+    middle: int
+    slope: int
+    over: int
+    edge_kpa: float = np.nan  # NaN before the first loading
+    loads: int  # how many have counted, ...
+    loads_kpa_s: Annotated[Floats, (LOADS,)]  # ... the integrals of the last ones, ...
+    loads_others_kpa: Annotated[Floats, (LOADS,)]  # ... and what the others bore
+    evidence: float  # that the edge is a clip
+    end_kpa: float = np.inf  # of what can be told; infinite while there is no clip
 
 
 @jit_cached
 def update_clipping_limit_kpa(
-    tile: Record,
+    tile: ClippingState,
     kpa: float,
     t_ns: int,
     baseline_kpa: float,
@@ -154,12 +150,11 @@ def update_clipping_limit_kpa(
             if tile.inside == 0:
                 _end_of_loading(tile, baseline_kpa, noise_kpa, math.sqrt(variance_inflation))
                 _begin(tile, kpa)
-    end_kpa: float = tile.end_kpa
-    return end_kpa
+    return tile.end_kpa
 
 
 @jit_cached
-def _begin(tile: Record, kpa: float) -> None:
+def _begin(tile: ClippingState, kpa: float) -> None:
     """Reset the measures for a new loading."""
     tile.smooth_kpa = tile.peak_kpa = kpa
     tile.readings = tile.at = tile.middle = tile.slope = tile.over = 0
@@ -169,7 +164,7 @@ def _begin(tile: Record, kpa: float) -> None:
 
 @jit_cached
 def _integrate(
-    tile: Record, passed_s: float, felt_kpa: float, others_kpa: float, noise_kpa: float
+    tile: ClippingState, passed_s: float, felt_kpa: float, others_kpa: float, noise_kpa: float
 ) -> None:
     """Add the time since the reading before to the measures of the load."""
     moved_kpa = felt_kpa - tile.felt_kpa
@@ -182,7 +177,7 @@ def _integrate(
 
 
 @jit_cached
-def _count(tile: Record, kpa: float, passed_ns: int, noise_kpa: float) -> None:
+def _count(tile: ClippingState, kpa: float, passed_ns: int, noise_kpa: float) -> None:
     """Count a reading: at the edge, on the slope below it, or over it."""
     tile.readings += 1
     tile.hole_ns = max(tile.hole_ns, passed_ns)
@@ -202,7 +197,7 @@ def _count(tile: Record, kpa: float, passed_ns: int, noise_kpa: float) -> None:
 
 
 @jit_cached
-def _end_of_loading(tile: Record, baseline_kpa: float, noise: float, lasts: float) -> None:
+def _end_of_loading(tile: ClippingState, baseline_kpa: float, noise: float, lasts: float) -> None:
     """Update edge and evidence from an ended loading.
 
     `lasts` is the standard deviation of means, relative to that of white noise.
@@ -234,7 +229,7 @@ def _end_of_loading(tile: Record, baseline_kpa: float, noise: float, lasts: floa
 
 
 @jit_cached
-def _is_new(tile: Record, noise_kpa: float, lasts: float) -> bool:
+def _is_new(tile: ClippingState, noise_kpa: float, lasts: float) -> bool:
     """Remember the load of this loading, unless it is like one that has counted."""
     others_kpa = tile.others_kpa2_s / tile.load_kpa_s
     sigma_kpa_s = lasts * math.sqrt(tile.load_variance)

@@ -6,8 +6,6 @@ the baseline, by the corrected pressure and by warmth that no model corrects.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from devices.arrays import Bools, Floats
@@ -16,43 +14,33 @@ from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration
 from service.estimation.fault_detection import baseline_loss
-from service.estimation.fault_detection import stuck as stuck_readings
+from service.estimation.fault_detection.stuck import RunLimits, StuckParams, make_stuck_params
+from service.estimation.records import KernelRecord, RecordArray
 from service.estimation.tare.tare import Tare, compute_sealed_gas_shift_kpa
 
 UNLOADED_BAND_SIGMAS = 4.0
 """Distance from the baseline within which a tile is unloaded, in sigmas of a reading."""
 
 
-@dataclass(frozen=True)
-class FaultLimits:
-    """Limits over an array's tiles; the last two over load-bearing tiles only.
+class FaultParams(KernelRecord):
+    """Limits of a tile; the last two are of load-bearing tiles only."""
 
-    Attributes:
-        stuck_check_max_kpa: absolute pressure above which a healthy chip may stand still.
-        unloaded_band_kpa: distance from the baseline within which a tile counts as unloaded.
-        stuck: limits of equal counts in a row.
-        asymmetry: asymmetry for `baseline_loss.update_baseline_error_bound_kpa`.
-        thermal_kpa_per_count: shift of the baseline for a raw temperature count; None if a model
-            corrects it.
-    """
-
-    stuck_check_max_kpa: Floats
-    unloaded_band_kpa: Floats
-    stuck: stuck_readings.StuckLimits
-    asymmetry: Floats
-    thermal_kpa_per_count: Floats | None
+    stuck_check_max_kpa: float  # absolute pressure above which a healthy chip may stand still
+    unloaded_band_kpa: float  # distance from the baseline within which it counts as unloaded
+    stuck: StuckParams
+    asymmetry: float  # for `baseline_loss.update_baseline_error_bound_kpa`
+    thermal_kpa_per_count: float  # shift of the baseline for a raw temperature count
 
 
-def make_fault_limits(
+def make_fault_params(
     info: ArrayInfo,
     calibration: Calibration,
     tare: Tare,
     chip_max_kpa: Floats,
     *,
     is_gas_corrected: Bools,
-    has_thermal_drift: bool,
-) -> FaultLimits:
-    """Compute the limits.
+) -> tuple[RecordArray[FaultParams], RecordArray[RunLimits]]:
+    """Make the limits of the tiles, (tiles,), and of the array, (1,).
 
     Args:
         info: the array.
@@ -60,7 +48,6 @@ def make_fault_limits(
         tare: in force.
         chip_max_kpa: (bearing tiles,), absolute pressure above which a chip saturates.
         is_gas_corrected: (bearing tiles,), whether the tile's gas is corrected.
-        has_thermal_drift: whether no model corrects the temperature.
     """
     tiles = info.tiles
     bearing = np.flatnonzero([not tile.reference for tile in tiles])
@@ -79,12 +66,12 @@ def make_fault_limits(
         entry = calibration.find_tile_or_wildcard(tiles[column].serial)
         if entry is not None and entry.effects.temperature is not None:
             per_count[at] = entry.effects.temperature.kpa_per_k.value / TADC_PER_KELVIN
-    return FaultLimits(
-        stuck_check_max_kpa=end_kpa,
-        unloaded_band_kpa=unloaded_kpa,
-        stuck=stuck_readings.make_stuck_limits(noise, info.nominal_rate_hz),
-        asymmetry=np.where(
-            is_gas_corrected, baseline_loss.LEAK_ASYMMETRY, baseline_loss.LEAK_ASYMMETRY_WITHOUT_GAS
-        ),
-        thermal_kpa_per_count=per_count if has_thermal_drift else None,
+    stuck, limits = make_stuck_params(noise, info.nominal_rate_hz)
+    made = FaultParams.array(
+        len(tiles), stuck_check_max_kpa=end_kpa, unloaded_band_kpa=unloaded_kpa, stuck=stuck
     )
+    made["asymmetry"][bearing] = np.where(
+        is_gas_corrected, baseline_loss.LEAK_ASYMMETRY, baseline_loss.LEAK_ASYMMETRY_WITHOUT_GAS
+    )
+    made["thermal_kpa_per_count"][bearing] = per_count
+    return made, limits

@@ -15,9 +15,8 @@ A repeated count is no measurement of this instant, so the force is unknown: NaN
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cache
-from typing import Protocol
+from typing import Annotated
 
 import numpy as np
 
@@ -50,7 +49,7 @@ _STEP_MIN, _STEP_MAX = 0.02, 20.0
 class StuckState(KernelRecord):
     """State of a tile."""
 
-    pressure_raw: int  # last count; -1 before the first
+    pressure_raw: int = -1  # last count; -1 before the first
     run_length: int  # number of equal counts in a row
     toggles_at_start: int  # of all tiles, when the run began
     was_unloaded: int  # 1: the last reading was
@@ -61,23 +60,18 @@ class StuckState(KernelRecord):
 
 
 class StuckParams(KernelRecord):
-    """Parameters of a tile, as in `StuckLimits`."""
+    """Parameters of a tile: priors of its shares, and a limit of equal counts in a row."""
 
-    equal_share: float
-    double_step_share: float
-    run_max: int
-
-
-class RunLimits(Protocol):
-    """Record with the array's limits of equal counts in a row, as in `StuckLimits`."""
-
-    run_max_by_equal: Ints
-    run_max_by_double_step: Ints
+    equal_share: float  # of equal neighbours
+    double_step_share: float  # of neighbours two counts apart
+    run_max: int  # limit for white noise as at the tare
 
 
-def initial_state(tiles: int) -> RecordArray[StuckState]:
-    """Make the states before the first reading, (tiles,)."""
-    return StuckState.array(tiles, pressure_raw=-1)
+class RunLimits(KernelRecord):
+    """Limits of equal counts in a row for an array, by the shares of a tile's neighbours."""
+
+    run_max_by_equal: Annotated[Ints, (SHARE_STEPS + 1,)]
+    run_max_by_double_step: Annotated[Ints, (SHARE_STEPS + 1,)]
 
 
 def _compute_run_limit_tables(rate_hz: float, tiles: int) -> tuple[Ints, Ints]:
@@ -100,7 +94,7 @@ def _compute_run_limit_tables(rate_hz: float, tiles: int) -> tuple[Ints, Ints]:
 
 @cache  # computed at every tare, during which a server sends no frames
 def _compute_repeat_chances() -> tuple[Floats, Floats]:
-    """Compute the largest chance of a repeat, by either share (see `StuckLimits`)."""
+    """Compute the largest chance of a repeat, by either share."""
     shares = np.arange(SHARE_STEPS + 1) / SHARE_STEPS
     steps = np.geomspace(_STEP_MAX, _STEP_MIN, 2000)
     by_repeats = np.interp(shares, compute_step_share(steps, 0), steps)
@@ -135,36 +129,15 @@ def _compute_unrounded_step_sigma_counts(noise_counts: Floats, correlation: floa
     )
 
 
-@dataclass(frozen=True)
-class StuckLimits:
-    """Limits of equal counts in a row.
+def make_stuck_params(
+    noise_counts: Floats, rate_hz: float
+) -> tuple[RecordArray[StuckParams], RecordArray[RunLimits]]:
+    """Make the parameters (tiles,) and the limits (1,).
 
-    Attributes:
-        equal_share: (tiles,), prior share of equal neighbours.
-        double_step_share: (tiles,), prior share of neighbours two counts apart.
-        run_max: (tiles,), limit for white noise as at the tare.
-        run_max_by_equal: (`SHARE_STEPS` + 1,), limit by the share of equal neighbours.
-        run_max_by_double_step: (`SHARE_STEPS` + 1,), limit by the share of double steps.
+    Args:
+        noise_counts: (tiles,), noise at the tare, in counts with outliers and rounding.
+        rate_hz: of the frames.
     """
-
-    equal_share: Floats
-    double_step_share: Floats
-    run_max: Ints
-    run_max_by_equal: Ints
-    run_max_by_double_step: Ints
-
-    def to_records(self) -> RecordArray[StuckParams]:
-        """Make the kernel's parameters, (tiles,)."""
-        return StuckParams.array(
-            len(self.equal_share),
-            equal_share=self.equal_share,
-            double_step_share=self.double_step_share,
-            run_max=self.run_max,
-        )
-
-
-def make_stuck_limits(noise_counts: Floats, rate_hz: float) -> StuckLimits:
-    """Compute the limits from the noise at the tare, in counts with outliers and rounding."""
     by_equal, by_double_step = _compute_run_limit_tables(rate_hz, len(noise_counts))
     supposed = _compute_unrounded_step_sigma_counts(
         noise_counts, math.exp(-1.0 / (rate_hz * PRIOR_CORRELATION_S))
@@ -172,13 +145,14 @@ def make_stuck_limits(noise_counts: Floats, rate_hz: float) -> StuckLimits:
     white = np.ceil(
         compute_step_share(_compute_unrounded_step_sigma_counts(noise_counts, 0.0), 0) * SHARE_STEPS
     ).astype(np.int64)
-    return StuckLimits(
+    params = StuckParams.array(
+        len(noise_counts),
         equal_share=compute_step_share(supposed, 0),
         double_step_share=compute_step_share(supposed, 2),
         run_max=by_equal[np.minimum(white, SHARE_STEPS)],
-        run_max_by_equal=by_equal,
-        run_max_by_double_step=by_double_step,
     )
+    limits = RunLimits.array(1, run_max_by_equal=by_equal, run_max_by_double_step=by_double_step)
+    return params, limits
 
 
 @jit_cached

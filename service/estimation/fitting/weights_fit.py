@@ -31,7 +31,7 @@ from service.estimation.fitting.least_squares import (
 )
 from service.estimation.fitting.rig.indentation import Indentation, format_origin
 from service.estimation.fitting.rig.loading import WeightHold, measure_holds
-from service.estimation.models.static import StaticCurves
+from service.estimation.models.static import StaticParams, compute_forces
 from service.estimation.records import SIGMAS_95
 
 SMALL_FORCE_N = 2.0
@@ -151,7 +151,7 @@ def fit_curve_to_dead_weights(recordings: Sequence[Indentation]) -> TileCalibrat
 def _make_band(tile: TileCalibration) -> tuple[BandPoint, ...]:
     """Return the curve with the half widths that an estimate of a settled load states."""
     gauge_kpa = np.linspace(0.0, tile.range_kpa[1], _BAND_STEPS + 1)
-    found = StaticCurves([tile]).compute_forces(gauge_kpa[:, None])
+    found = compute_forces(StaticParams.from_calibrations([tile]), gauge_kpa[:, None])
     basis = compute_cubic_basis_through_zero(gauge_kpa, tile.p_offset_kpa, tile.p_scale_kpa)
     mean_n = SIGMAS_95 * np.sqrt(
         np.maximum(((basis @ np.array(tile.covariance)) * basis).sum(1), 0.0)

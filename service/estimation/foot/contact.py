@@ -6,26 +6,9 @@ look-ahead: with a lag of at least `min_ns` contact begins with the first loaded
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from devices.arrays import Times
 from devices.jit import jit_cached, jit_inlined
 from service.estimation.records import KernelRecord
-
-
-@dataclass(frozen=True)
-class ContactThresholds:
-    """Thresholds of contact.
-
-    Attributes:
-        on_n: force at which the candidate becomes contact.
-        off_n: force at which it becomes no contact; in between it stays.
-        min_ns: time for which a candidate has to last.
-    """
-
-    on_n: float
-    off_n: float
-    min_ns: int
 
 
 class ContactState(KernelRecord):
@@ -42,8 +25,8 @@ def update_candidate(
     """Update the candidate of contact with the next frame.
 
     Args:
-        on_n: of `ContactThresholds`.
-        off_n: likewise.
+        on_n: force at which the candidate becomes contact.
+        off_n: force at which it becomes no contact; in between it stays.
         state: after the frame before; updated.
         grf_n: NaN leaves the candidate as it is.
         t_ns: instant.
@@ -64,7 +47,7 @@ def is_debounced(since_ns: Times, t_ns: Times, i: int, end: int, min_ns: int, la
         t_ns: (n,), instants.
         i: frame.
         end: frame after the last that is stored; all within the look-ahead must be.
-        min_ns: of `ContactThresholds`.
+        min_ns: time for which a candidate has to last.
         lag_ns: look-ahead.
     """
     at = i

@@ -8,12 +8,13 @@ because it would enter the forces of all tiles at once.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
-from devices.arrays import Floats
+from devices.errors import UsageError
 from devices.jit import jit_cached
+from service.estimation.models import BearingTiles, ModelParams
 from service.estimation.records import KernelRecord, RecordArray
 
 SMOOTHING_S = 0.03  # long against noise, short against a foot that sinks in
@@ -21,40 +22,41 @@ HELD_S = 0.2
 """Time for which the last reading holds: a foot sinks or is lifted within it."""
 
 
-class AmbientParams(KernelRecord):
-    """Parameters of a tile, as in `AmbientModel`."""
+class AmbientParams(ModelParams):
+    """Parameters of a tile."""
 
-    transmitted_fraction: float
-    relative_sigma: float
+    effect = "temperature"
+    is_needed_of_every_tile = True
+
+    transmitted_fraction: float  # part of the surrounding pressure that reaches the dome's gas
+    relative_sigma: float  # its standard uncertainty, relative
+
+    @classmethod
+    def make(cls, tiles: BearingTiles) -> RecordArray[Self]:
+        """Make the parameters of load-bearing tiles, (tiles,).
+
+        Raises:
+            UsageError: the array has no bare tile.
+        """
+        if not tiles.has_bare_tile:
+            raise UsageError(
+                "model 'ambient' needs a bare reference tile, and the array has none",
+                remedy="Leave it out, or plug in a bare chip and mark it `reference = true`",
+            )
+        give = tiles.wall_per_kpa * tiles.baseline_kpa
+        found = [e for tile in tiles.calibrations if (e := tile.effects.temperature) is not None]
+        wall = [e.wall_per_kpa for e in found]
+        relative = max((w.sigma / w.value if w.value > 0.0 else 1.0 for w in wall), default=1.0)
+        return cls.array(
+            len(give), transmitted_fraction=give / (1.0 + give), relative_sigma=relative
+        )
 
 
 class AmbientState(KernelRecord):
     """Surrounding pressure of the foot."""
 
-    pressure_kpa: float  # low-pass, above the tare's; NaN before the first reading
+    pressure_kpa: float = np.nan  # low-pass, above the tare's; NaN before the first reading
     t_ns: int  # instant of the last reading
-
-
-def initial_state() -> RecordArray[AmbientState]:
-    """Make the state before the first reading."""
-    return AmbientState.array(1, pressure_kpa=np.nan)
-
-
-@dataclass(frozen=True)
-class AmbientModel:
-    """Parameters over load-bearing tiles.
-
-    Attributes:
-        transmitted_fraction: part of the surrounding pressure that reaches the dome's gas.
-        relative_sigma: its standard uncertainty, relative.
-    """
-
-    transmitted_fraction: Floats
-    relative_sigma: float
-
-    def to_records(self) -> RecordArray[AmbientParams]:
-        """Make the kernel's parameters, (tiles,)."""
-        return AmbientParams.array(len(self.transmitted_fraction), **vars(self))
 
 
 @jit_cached

@@ -14,14 +14,12 @@ that is linear between samples. Solved for F at every sample, because s depends 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
-from devices.arrays import Floats
 from devices.jit import jit_cached
 from service.estimation.foot import LONG_GAP_NS
-from service.estimation.records import KernelRecord, RecordArray
+from service.estimation.records import KernelRecord
 
 STROKE_N_PER_S = 10.0
 """R: about that of a rig's slow stroke, so that the stroke determines the fitted value."""
@@ -30,44 +28,21 @@ _CLOSE = 1e-14  # of the force, or of a newton
 
 
 class FlowParams(KernelRecord):
-    """Parameters of a tile, as in `FlowModel`."""
+    """Parameters of a tile; those of a tile without the branch are the initial ones."""
 
-    fraction: float
-    stress_scale_n: float
-    exponent: float
+    fraction: float  # g, part of a change of force that the branch carries at first
+    stress_scale_n: float = (
+        1.0  # S, force on the branch while the force changes by `STROKE_N_PER_S`
+    )
+    exponent: float = 4.0  # n, above 1
 
 
 class FlowState(KernelRecord):
     """State of a tile's viscous branch."""
 
     stress_n: float  # force on the branch
-    force_n: float  # force on the dome at the previous reading; NaN before the first
+    force_n: float = np.nan  # force on the dome at the previous reading; NaN before the first
     t_ns: int  # instant of that reading
-
-
-def initial_state(tiles: int) -> RecordArray[FlowState]:
-    """Make the states before the first reading, (tiles,)."""
-    return FlowState.array(tiles, force_n=np.nan)
-
-
-@dataclass(frozen=True)
-class FlowModel:
-    """Parameters over tiles.
-
-    Attributes:
-        fraction: g, part of a change of force that the branch carries at first; `FlowEffect`
-            bounds it.
-        stress_scale_n: S, force on the branch while the force changes by `STROKE_N_PER_S`.
-        exponent: n, above 1.
-    """
-
-    fraction: Floats
-    stress_scale_n: Floats
-    exponent: Floats
-
-    def to_records(self) -> RecordArray[FlowParams]:
-        """Make the kernel's parameters, (tiles,)."""
-        return FlowParams.array(len(self.fraction), **vars(self))
 
 
 @jit_cached
@@ -106,6 +81,19 @@ def compensate_flow(
     state.stress_n = step_branch_stress(stress, g, scale_n, n, now - before, dt)
     state.force_n, state.t_ns = now, t_ns
     return found
+
+
+@jit_cached
+def copy_state(state: FlowState, to: FlowState) -> None:
+    """Copy a state into another."""
+    to.stress_n, to.force_n, to.t_ns = state.stress_n, state.force_n, state.t_ns
+
+
+@jit_cached
+def is_same_state(one: FlowState, other: FlowState) -> bool:
+    """Return whether two states are equal; NaN does not equal NaN."""
+    forces = one.stress_n == other.stress_n and one.force_n == other.force_n
+    return bool(forces and one.t_ns == other.t_ns)
 
 
 @jit_cached

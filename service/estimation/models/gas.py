@@ -16,60 +16,64 @@ c of its volume for every kPa, so the pressure after cooling is::
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
-from devices.arrays import Floats
 from devices.jit import jit_cached
+from service.estimation.effects import MISFIT_MIN, parameter_values
 from service.estimation.foot import LONG_GAP_NS
+from service.estimation.models import BearingTiles, ModelParams
 from service.estimation.records import KernelRecord, RecordArray
 
 RESTART_TIME_CONSTANTS = 5.0
 """Time without a reading, in gamma tau, after which the gas is as warm as its wall."""
 
 
-class GasParams(KernelRecord):
-    """Parameters of a tile, as in `GasModel`."""
+class GasParams(ModelParams):
+    """Parameters of a tile.
 
-    gamma: float
-    tau_s: float
-    wall_per_kpa: float
-    baseline_kpa: float
+    A tile whose calibration has no gas has that of a median tile, for its uncertainty only.
+    """
+
+    effect = "gas"
+
+    gamma: float  # effective ratio of heat capacities
+    tau_s: float  # time constant of the gas' cooling at constant volume
+    wall_per_kpa: float  # compliance of the wall: part of the bubble's volume for a kPa
+    baseline_kpa: float  # absolute pressure unloaded
+    is_known: int  # 1: the calibration has the tile's gas
+    misfit: float  # uncertain part of the correction
+
+    @classmethod
+    def make(cls, tiles: BearingTiles) -> RecordArray[Self]:
+        """Make the parameters of load-bearing tiles, (tiles,)."""
+        found = [tile.effects.gas for tile in tiles.calibrations]
+        known = [effect for effect in found if effect is not None]
+        gamma = np.median(parameter_values(effect.gamma for effect in known))
+        tau_s = np.median(parameter_values(effect.tau_s for effect in known))
+        return cls.array(
+            len(found),
+            gamma=[gamma if effect is None else effect.gamma.value for effect in found],
+            tau_s=[tau_s if effect is None else effect.tau_s.value for effect in found],
+            wall_per_kpa=tiles.wall_per_kpa,
+            baseline_kpa=tiles.baseline_kpa,
+            is_known=[effect is not None for effect in found],
+            misfit=[1.0 if effect is None else max(effect.misfit, MISFIT_MIN) for effect in found],
+        )
+
+    @classmethod
+    def longest_time_constant_s(cls, params: RecordArray[Self]) -> float:
+        """Return the longest time constant of a tile's cooling."""
+        return float((params["gamma"] * params["tau_s"]).max())
 
 
 class GasState(KernelRecord):
     """State of a tile's gas."""
 
-    temperature_ratio: float  # over the wall's
-    ln_kpa: float  # of the previous reading; NaN before the first
+    temperature_ratio: float = 1.0  # over the wall's
+    ln_kpa: float = np.nan  # of the previous reading; NaN before the first
     t_ns: int  # instant of that reading
-
-
-def initial_state(tiles: int) -> RecordArray[GasState]:
-    """Make the states before the first reading, (tiles,)."""
-    return GasState.array(tiles, temperature_ratio=1.0, ln_kpa=np.nan)
-
-
-@dataclass(frozen=True)
-class GasModel:
-    """Parameters over tiles.
-
-    Attributes:
-        gamma: effective ratio of heat capacities.
-        tau_s: time constant of the gas' cooling at constant volume.
-        wall_per_kpa: compliance of the wall: part of the bubble's volume for a kPa.
-        baseline_kpa: absolute pressure unloaded.
-    """
-
-    gamma: Floats
-    tau_s: Floats
-    wall_per_kpa: Floats
-    baseline_kpa: Floats
-
-    def to_records(self) -> RecordArray[GasParams]:
-        """Make the kernel's parameters, (tiles,)."""
-        return GasParams.array(len(self.gamma), **vars(self))
 
 
 @jit_cached

@@ -12,13 +12,16 @@ comes after `denoise`.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Self
 
 import numpy as np
 
 from devices.arrays import Floats
+from devices.errors import CalibrationError
 from devices.jit import jit_cached
+from service.estimation.effects import parameter_values
+from service.estimation.models import BearingTiles, ModelParams, flow
+from service.estimation.models.flow import FlowParams, FlowState
 from service.estimation.records import KernelRecord, RecordArray
 
 WIDTHS_N = np.array([0.6, 1.5, 4.0])
@@ -30,32 +33,46 @@ _CLOSE = 1e-14
 PLAYS = len(WIDTHS_N)
 
 
-class HysteresisParams(KernelRecord):
-    """Parameters of a tile, as in `HysteresisModel`."""
+class HysteresisParams(ModelParams):
+    """Parameters of a tile; zero for a tile whose calibration has no loop."""
 
-    play_weights: Annotated[Floats, (PLAYS,)]
+    effect = "hysteresis"
+
+    play_weights: Annotated[Floats, (PLAYS,)]  # of half widths `WIDTHS_N`; in sum below 1
+    has_flow: int  # 1: the calibration of any tile has a viscous branch
+    flow: FlowParams
+
+    @classmethod
+    def make(cls, tiles: BearingTiles) -> RecordArray[Self]:
+        """Make the parameters of load-bearing tiles, (tiles,).
+
+        Raises:
+            CalibrationError: a tile has another number of plays.
+        """
+        found = [tile.effects.hysteresis for tile in tiles.calibrations]
+        plays = {len(effect.part) for effect in found if effect is not None}
+        if plays != {PLAYS}:
+            raise CalibrationError(
+                f"its tiles have {sorted(plays)} plays",
+                where=tiles.calibration_label,
+                expected=f"{PLAYS} plays",
+                remedy="Calibrate all of them with this version",
+            )
+        made = cls.array(len(found))
+        for i, effect in enumerate(found):
+            if effect is not None:
+                made["play_weights"][i] = parameter_values(effect.part)
+            if effect is not None and (branch := effect.flow) is not None:
+                made["has_flow"] = 1
+                made["flow"][i] = branch.part.value, branch.stress_n.value, branch.power.value
+        return made
 
 
 class HysteresisState(KernelRecord):
-    """State of a tile's plays."""
+    """State of a tile's plays and viscous branch."""
 
     plays_n: Annotated[Floats, (PLAYS,)]
-
-
-def initial_state(tiles: int) -> RecordArray[HysteresisState]:
-    """Make the states before the first reading, (tiles,)."""
-    return HysteresisState.array(tiles)
-
-
-@dataclass(frozen=True)
-class HysteresisModel:
-    """Weights (tiles, plays) of the plays of half widths `WIDTHS_N`; in sum below 1."""
-
-    play_weights: Floats
-
-    def to_records(self) -> RecordArray[HysteresisParams]:
-        """Make the kernel's parameters, (tiles,)."""
-        return HysteresisParams.array(len(self.play_weights), play_weights=self.play_weights)
+    flow: FlowState
 
 
 @jit_cached
@@ -77,6 +94,23 @@ def compensate_hysteresis(
     for m in range(PLAYS):
         state.plays_n[m] = step_play_closed_at_zero_load(force, WIDTHS_N[m], state.plays_n[m])
     return found
+
+
+@jit_cached
+def copy_state(state: HysteresisState, to: HysteresisState) -> None:
+    """Copy a state into another."""
+    flow.copy_state(state.flow, to.flow)
+    for m in range(PLAYS):
+        to.plays_n[m] = state.plays_n[m]
+
+
+@jit_cached
+def is_same_state(params: HysteresisParams, one: HysteresisState, other: HysteresisState) -> bool:
+    """Return whether two states are equal."""
+    for m in range(PLAYS):
+        if one.plays_n[m] != other.plays_n[m]:
+            return False
+    return params.has_flow == 0 or flow.is_same_state(one.flow, other.flow)
 
 
 @jit_cached

@@ -12,54 +12,58 @@ force appears whole, so the static curve is unchanged.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Self
 
 import numpy as np
 
 from devices.arrays import Floats
 from devices.jit import jit_cached
-from service.estimation.effects import TERMS_MAX
+from service.estimation.effects import MISFIT_MIN, TERMS_MAX, parameter_values
 from service.estimation.foot import LONG_GAP_NS
+from service.estimation.models import BearingTiles, ModelParams
 from service.estimation.records import KernelRecord, RecordArray
 
 
-class RubberParams(KernelRecord):
-    """Parameters of a tile, as in `CreepModel`."""
+class RubberParams(ModelParams):
+    """Parameters of a tile; a tile without creep, or with fewer terms, has fractions of zero."""
 
-    creep_fraction: Annotated[Floats, (TERMS_MAX,)]
-    tau_s: Annotated[Floats, (TERMS_MAX,)]
-    n_terms: int
+    effect = "rubber"
+
+    creep_fraction: Annotated[Floats, (TERMS_MAX,)]  # parts of the force that appear later
+    tau_s: Annotated[Floats, (TERMS_MAX,)]  # time constants
+    n_terms: int  # largest number of terms of any tile
+
+    @classmethod
+    def make(cls, tiles: BearingTiles) -> RecordArray[Self]:
+        """Make the parameters of load-bearing tiles, (tiles,)."""
+        found = [tile.effects.rubber for tile in tiles.calibrations]
+        terms = [0 if effect is None else len(effect.part) for effect in found]
+        made = cls.array(len(found), n_terms=max(terms), tau_s=1.0)
+        for i, effect in enumerate(found):
+            if effect is not None:
+                made["creep_fraction"][i, : terms[i]] = parameter_values(effect.part)
+                made["tau_s"][i, : terms[i]] = parameter_values(effect.tau_s)
+        return made
+
+    @classmethod
+    def longest_time_constant_s(cls, params: RecordArray[Self]) -> float:
+        """Return the longest time constant of a tile's creep."""
+        return float(params["tau_s"][params["creep_fraction"] > 0.0].max())
+
+
+def collect_misfits(tiles: BearingTiles) -> Floats:
+    """Return the uncertain part of each tile's corrections of creep and loop."""
+    found = [tile.effects.rubber for tile in tiles.calibrations]
+    return np.array([0.0 if e is None else max(e.misfit, MISFIT_MIN) for e in found])
 
 
 class RubberState(KernelRecord):
     """State of a tile's creep."""
 
-    force_n: float  # at the previous reading; NaN before the first
+    force_n: float = np.nan  # at the previous reading; NaN before the first
     t_ns: int  # instant of that reading
     crept_n: Annotated[Floats, (TERMS_MAX,)]  # z of each term
     force_share: Annotated[Floats, (TERMS_MAX,)]  # scratch: weight of the present force in z
-
-
-def initial_state(tiles: int) -> RecordArray[RubberState]:
-    """Make the states before the first reading, (tiles,)."""
-    return RubberState.array(tiles, force_n=np.nan)
-
-
-@dataclass(frozen=True)
-class CreepModel:
-    """Parameters (tiles, terms): parts of the force that appear later, and their time constants."""
-
-    creep_fraction: Floats
-    tau_s: Floats
-
-    def to_records(self) -> RecordArray[RubberParams]:
-        """Make the kernel's parameters, (tiles,)."""
-        tiles, terms = self.creep_fraction.shape
-        made = RubberParams.array(tiles, n_terms=terms)
-        made["creep_fraction"][:, :terms] = self.creep_fraction
-        made["tau_s"][:, :terms] = self.tau_s
-        return made
 
 
 @jit_cached
@@ -108,6 +112,23 @@ def compensate_creep(
         state.crept_n[m] += state.force_share[m] * now
     state.force_n, state.t_ns = now, t_ns
     return found
+
+
+@jit_cached
+def copy_state(state: RubberState, to: RubberState) -> None:
+    """Copy a state into another."""
+    to.force_n, to.t_ns = state.force_n, state.t_ns
+    for m in range(len(state.crept_n)):
+        to.crept_n[m] = state.crept_n[m]
+
+
+@jit_cached
+def is_same_state(one: RubberState, other: RubberState) -> bool:
+    """Return whether two states are equal; NaN does not equal NaN."""
+    for m in range(len(one.crept_n)):
+        if one.crept_n[m] != other.crept_n[m]:
+            return False
+    return bool(one.force_n == other.force_n and one.t_ns == other.t_ns)
 
 
 @jit_cached

@@ -11,19 +11,14 @@ import math
 import numpy as np
 
 from devices.jit import jit_cached
-from service.estimation.records import KernelRecord, RecordArray
+from service.estimation.records import KernelRecord
 
 
 class SkewState(KernelRecord):
     """Previous sample of a tile."""
 
-    value: float  # NaN before the first
+    value: float = np.nan  # NaN before the first
     t_ns: int
-
-
-def initial_state(tiles: int) -> RecordArray[SkewState]:
-    """Make the states before the first frame, (tiles,)."""
-    return SkewState.array(tiles, value=np.nan)
 
 
 @jit_cached

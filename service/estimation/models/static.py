@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Self
 
 import numpy as np
 
@@ -22,7 +22,8 @@ from service.estimation.calibration import (
     LOOP_HALF_WIDTH_FORCE_N,
     TileCalibration,
 )
-from service.estimation.records import KernelRecord, RecordArray
+from service.estimation.models import BearingTiles, ModelParams
+from service.estimation.records import RecordArray
 
 
 @dataclass(frozen=True)
@@ -35,9 +36,10 @@ class StaticForce:
     """Standard uncertainty of the calibration: of its coefficients, and of a new loading."""
 
 
-class StaticParams(KernelRecord):
+class StaticParams(ModelParams):
     """Parameters of a tile's curve, as in `TileCalibration`, in newtons."""
 
+    range_low_kpa: float
     range_high_kpa: float
     offset_kpa: float
     scale_kpa: float
@@ -51,19 +53,22 @@ class StaticParams(KernelRecord):
     loop_misfit_n: float
     curve_misfit_n: float
 
+    @classmethod
+    def make(cls, tiles: BearingTiles) -> RecordArray[Self]:
+        """Make the curves of load-bearing tiles, of settled forces if `rubber` is named."""
+        return cls.from_calibrations(tiles.calibrations, use_settled_curve="rubber" in tiles.models)
 
-class StaticCurves:
-    """Static curves of an array's tiles, as arrays over tiles.
+    @classmethod
+    def from_calibrations(
+        cls, tiles: Sequence[TileCalibration], *, use_settled_curve: bool = False
+    ) -> RecordArray[Self]:
+        """Make the curves of tiles, (tiles,).
 
-    Args:
-        tiles: calibrations of the tiles.
-        use_settled_curve: use the curves of settled forces, which lie beneath creep and loop, for
-            the model `rubber`; a tile without that model keeps the curve of its slow strokes.
-    """
-
-    def __init__(
-        self, tiles: Sequence[TileCalibration], *, use_settled_curve: bool = False
-    ) -> None:
+        Args:
+            tiles: calibrations of the tiles.
+            use_settled_curve: use the curves of settled forces, which lie beneath creep and loop,
+                for the model `rubber`; a tile without it keeps the curve of its slow strokes.
+        """
         scatter = curve_misfit_n = np.zeros(len(tiles))
         if use_settled_curve:
             rubbers = [tile.effects.rubber for tile in tiles]
@@ -74,22 +79,19 @@ class StaticCurves:
         scale_kpa = np.array([t.p_scale_kpa for t in tiles])
         c1, c2, c3 = (np.array([t.coefficients[k] * t.f_scale_n for t in tiles]) for k in (1, 2, 3))
         u0 = -offset_kpa / scale_kpa
-        zero_n = [
-            t.f_offset_n + t.f_scale_n * _horner(t, u) if t.zero_mode == "as_fitted" else 0.0
-            for t, u in zip(tiles, u0, strict=True)
-        ]
-        self.range_low_kpa = np.array([t.range_kpa[0] for t in tiles])
-        self.range_high_kpa = np.array([t.range_kpa[1] for t in tiles])
-        self.slope_at_zero_n_per_kpa = (c1 + u0 * (2.0 * c2 + u0 * (3.0 * c3))) / scale_kpa
-        self._params = StaticParams.array(
+        return cls.array(
             len(tiles),
-            range_high_kpa=self.range_high_kpa,
+            range_low_kpa=[t.range_kpa[0] for t in tiles],
+            range_high_kpa=[t.range_kpa[1] for t in tiles],
             offset_kpa=offset_kpa,
             scale_kpa=scale_kpa,
             u_zero=u0,
             coefficients=np.stack([c1, c2, c3], axis=1),
-            zero_n=zero_n,
-            slope_at_zero_n_per_kpa=self.slope_at_zero_n_per_kpa,
+            zero_n=[
+                t.f_offset_n + t.f_scale_n * _horner(t, u) if t.zero_mode == "as_fitted" else 0.0
+                for t, u in zip(tiles, u0, strict=True)
+            ],
+            slope_at_zero_n_per_kpa=(c1 + u0 * (2.0 * c2 + u0 * (3.0 * c3))) / scale_kpa,
             covariance=[np.array(t.covariance) * t.f_scale_n**2 for t in tiles],
             relative_misfit=[t.relative_misfit for t in tiles],
             loading_scatter=scatter,
@@ -97,15 +99,12 @@ class StaticCurves:
             curve_misfit_n=curve_misfit_n,
         )
 
-    def to_records(self) -> RecordArray[StaticParams]:
-        """Return the kernel's parameters, (tiles,)."""
-        return self._params
 
-    def compute_forces(self, gauge_kpa: Floats) -> StaticForce:
-        """Compute force, slope and calibration uncertainty at gauge pressures (n, tiles)."""
-        force, slope, sigma = (np.empty(gauge_kpa.shape) for _ in range(3))
-        _evaluate_curves(self._params, gauge_kpa, force, slope, sigma)
-        return StaticForce(force, slope, sigma)
+def compute_forces(curves: RecordArray[StaticParams], gauge_kpa: Floats) -> StaticForce:
+    """Compute force, slope and calibration uncertainty at gauge pressures (n, tiles)."""
+    force, slope, sigma = (np.empty(gauge_kpa.shape) for _ in range(3))
+    _evaluate_curves(curves, gauge_kpa, force, slope, sigma)
+    return StaticForce(force, slope, sigma)
 
 
 @jit_cached

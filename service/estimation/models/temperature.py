@@ -14,13 +14,15 @@ responds to a squeeze more strongly.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from devices.arrays import Floats, Times
+from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from devices.jit import jit_cached
+from service.estimation.effects import parameter_values
+from service.estimation.models import BearingTiles, ModelParams
 from service.estimation.records import KernelRecord, RecordArray
 
 STARTUP_S = 0.5
@@ -35,73 +37,58 @@ READING_NOISE_COUNTS = 0.5
 """Standard deviation of a raw temperature reading (hardware.md 1.3)."""
 
 
-class TemperatureParams(KernelRecord):
-    """Parameters of a tile, as in `TemperatureModel`; the last two follow from the others."""
+class TemperatureParams(ModelParams):
+    """Parameters of a tile; the last two follow from the others."""
 
-    kpa_per_count: float
-    relative_sigma: float
-    lag_s: float
+    effect = "temperature"
+    is_needed_of_every_tile = True
+
+    kpa_per_count: float  # rise of the baseline for a raw count of the gas; negative
+    relative_sigma: float  # standard uncertainty of that, relative
+    lag_s: float  # of the gas behind its chip; negative where the chip lags
     lag_sigma_s: float
-    tare_counts: float
-    baseline_kpa: float
+    tare_counts: float  # mean raw temperature during the tare
+    baseline_kpa: float  # absolute pressure at the tare
     smoothing_s: float
     noise_counts: float
+
+    @classmethod
+    def make(cls, tiles: BearingTiles) -> RecordArray[Self]:
+        """Make the parameters of load-bearing tiles, (tiles,)."""
+        found = [e for tile in tiles.calibrations if (e := tile.effects.temperature) is not None]
+        lag_s = parameter_values(e.lag_s for e in found)
+        return cls.array(
+            len(found),
+            kpa_per_count=parameter_values(e.kpa_per_k for e in found) / TADC_PER_KELVIN,
+            relative_sigma=[e.kpa_per_k.sigma / e.kpa_per_k.value for e in found],
+            lag_s=lag_s,
+            lag_sigma_s=[e.lag_s.sigma for e in found],
+            tare_counts=tiles.tare_counts,
+            baseline_kpa=tiles.baseline_kpa,
+            smoothing_s=compute_smoothing_s(lag_s),
+            noise_counts=compute_gas_temperature_noise_counts(lag_s, tiles.step_s),
+        )
+
+    @classmethod
+    def longest_time_constant_s(cls, params: RecordArray[Self]) -> float:
+        """Return the longest lag of a tile."""
+        return float(np.abs(params["lag_s"]).max())
 
 
 class TemperatureState(KernelRecord):
     """State of a tile; NaN before the first reading."""
 
-    smoothed_counts: float  # the chip's, through one low-pass
-    smoothed_twice_counts: float  # and through a second one
-    chip_counts: float
-    first_counts: float
+    smoothed_counts: float = np.nan  # the chip's, through one low-pass
+    smoothed_twice_counts: float = np.nan  # and through a second one
+    chip_counts: float = np.nan
+    first_counts: float = np.nan
     first_ns: int
     t_ns: int
-    gas_counts: float
-    rise_counts_per_s: float  # of the gas
+    gas_counts: float = np.nan
+    rise_counts_per_s: float = np.nan  # of the gas
 
 
-def initial_state(tiles: int) -> RecordArray[TemperatureState]:
-    """Make the states before the first reading, (tiles,)."""
-    counts = ("smoothed", "smoothed_twice", "chip", "first", "gas")
-    unknown = {f"{name}_counts": np.nan for name in counts}
-    return TemperatureState.array(tiles, **unknown, rise_counts_per_s=np.nan)
-
-
-@dataclass(frozen=True)
-class TemperatureModel:
-    """Parameters over tiles.
-
-    Attributes:
-        kpa_per_count: rise of the baseline for a raw temperature count of the gas; negative.
-        relative_sigma: standard uncertainty of that, relative.
-        lag_s: lag of the gas behind its chip; negative where the chip lags.
-        lag_sigma_s: standard uncertainty of the lag.
-        tare_counts: mean raw temperature during the tare.
-        baseline_kpa: absolute pressure at the tare.
-        step_s: nominal time between two readings.
-    """
-
-    kpa_per_count: Floats
-    relative_sigma: Floats
-    lag_s: Floats
-    lag_sigma_s: Floats
-    tare_counts: Floats
-    baseline_kpa: Floats
-    step_s: float
-
-    def to_records(self) -> RecordArray[TemperatureParams]:
-        """Make the kernel's parameters, (tiles,)."""
-        given = {name: value for name, value in vars(self).items() if name != "step_s"}
-        return TemperatureParams.array(
-            len(self.lag_s),
-            **given,
-            smoothing_s=_compute_smoothing_s(self.lag_s),
-            noise_counts=compute_gas_temperature_noise_counts(self.lag_s, self.step_s),
-        )
-
-
-def _compute_smoothing_s(lag_s: Floats) -> Floats:
+def compute_smoothing_s(lag_s: Floats) -> Floats:
     """Return the smoothing time of the chip's temperature: the lag, or an eighth of a lead."""
     time_s = np.where(lag_s >= 0.0, lag_s, -SMOOTHING_PER_LAG * lag_s)
     return np.asarray(np.maximum(time_s, SMOOTHING_MIN_S))
@@ -109,7 +96,7 @@ def _compute_smoothing_s(lag_s: Floats) -> Floats:
 
 def compute_gas_temperature_noise_counts(gas_lag_s: Floats, step_s: float) -> Floats:
     """Return the noise of the gas' counts by that of the raw temperature; 0 where the gas lags."""
-    time_s = _compute_smoothing_s(gas_lag_s)
+    time_s = compute_smoothing_s(gas_lag_s)
     lead = np.where(gas_lag_s < 0.0, 1.0 - gas_lag_s / time_s, 0.0)
     # (1 + (1 + lead) S s)/(1 + S s)^2 of white noise; the low-pass of a lag removes nearly all.
     power = step_s * (1.0 + (1.0 + lead) ** 2) / (4.0 * time_s)
@@ -137,10 +124,10 @@ def compute_gas_counts_and_rise_per_s(
     """
     gas, rise = np.empty(temperature_raw.shape), np.empty(temperature_raw.shape)
     params = TemperatureParams.array(
-        len(gas_lag_s), lag_s=gas_lag_s, smoothing_s=_compute_smoothing_s(gas_lag_s)
+        len(gas_lag_s), lag_s=gas_lag_s, smoothing_s=compute_smoothing_s(gas_lag_s)
     )
     _update_gas_temperatures(
-        params, initial_state(len(gas_lag_s)), temperature_raw, t_ns, gas, rise
+        params, TemperatureState.array(len(gas_lag_s)), temperature_raw, t_ns, gas, rise
     )
     return GasTemperatures(gas, rise)
 

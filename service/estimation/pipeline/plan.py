@@ -7,29 +7,36 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Floats, Ints
+from devices.arrays import Floats
 from devices.chips.compensation import Compensation
 from devices.chips.mpl115a2 import PRESSURE_MAX_KPA
 from devices.errors import CalibrationError, UsageError
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration, TileCalibration
-from service.estimation.effects import Parameter
-from service.estimation.fault_detection.fault_limits import FaultLimits, make_fault_limits
-from service.estimation.foot.contact import ContactThresholds
+from service.estimation.fault_detection.fault_limits import make_fault_params
 from service.estimation.foot.geometry import (
-    HalfPlanes,
     compute_grid_indices_from_1,
     compute_hull_half_planes,
+    compute_segment_rad_per_count,
     compute_tilt_loss,
     fit_tile_axis_angles_rad,
 )
-from service.estimation.models import denoise
-from service.estimation.pipeline.model_set import MODEL_NAMES, ModelSet, make_checked_model_set
-from service.estimation.pipeline.saturation import SaturationBounds, make_saturation_bounds
+from service.estimation.models import BearingTiles, denoise, rubber
+from service.estimation.models.static import StaticParams
+from service.estimation.pipeline.params import (
+    MODELS,
+    FootParams,
+    KernelParams,
+    TileParams,
+    make_model_params,
+)
+from service.estimation.pipeline.saturation import make_saturation_params
+from service.estimation.records import RecordArray
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded_windows import compute_variance_inflation
 
@@ -56,67 +63,39 @@ GAP_PERIODS = 1.5
 
 @dataclass(frozen=True)
 class EstimationPlan:
-    """Parameters of one estimate of one stream; arrays over tiles. Made by `make_plan`."""
+    """Parameters of one estimate of one stream. Made by `make_plan`."""
 
     info: ArrayInfo
     calibration: Calibration
     tare: Tare
     models: tuple[str, ...]
     lag_ns: int
-    compensation: Compensation
-    model_set: ModelSet
     load_bearing_columns: npt.NDArray[np.intp]
-    """Columns of the load-bearing tiles; arrays below are over these, unless stated."""
-    reference_columns: npt.NDArray[np.intp]
-    """Columns of bare reference tiles, which no sum contains."""
-    baseline_kpa: Floats
-    baseline_sigma_kpa: Floats
-    noise_kpa: Floats
-    variance_inflation: Floats
-    """(tiles, n), variance of a mean of n readings over that of white noise."""
-    sample_delay_ns: Ints
-    """Delay of a tile's samples behind the instants in its frames."""
-    sample_delay_sigma_s: Floats
-    """Standard uncertainty of the delay, independent between tiles."""
-    sample_delay_common_sigma_s: Floats
-    """Standard uncertainty of the delay that all tiles share."""
-    chip_max_kpa: Floats
-    """Absolute pressure above which a chip saturates: the end of its rated range, or the highest
-    pressure in the rig, if that was higher or the chip saturated there."""
-    saturation: SaturationBounds
-    fault_limits: FaultLimits | None
-    """None: no fault detection, for benchmarks."""
-    unloaded_sigma_kpa: Floats
-    """Standard deviation of a single unloaded reading about the true baseline."""
-    tile_positions_m: Floats
-    """(tiles, 3), positions of the tiles."""
     cop_measured: tuple[bool, bool]
     """Measurement of the centre of pressure along x, and along y; False across a row of tiles."""
-    mount_gain: Floats
-    """Newtons of the ground on a tile's part of the foot for a newton of the dome."""
-    mount_gain_sigma: Floats
-    axis_rad: Floats
-    """Angle of a tile's axis to the segment."""
-    tilt_loss: Floats
-    """Part of a tile's force that is not along the segment, by the angle of its axis."""
-    shear: Parameter | None
-    """Direction of the ground's force on tiles that are not upright; None: unknown."""
-    hull: HalfPlanes
-    grid: tuple[Floats, Floats] | None
-    contact: ContactThresholds
-    is_scale_assumed: bool
-    gap_ns: int
-    cop_sigma_max_m: float = COP_SIGMA_MAX_M
+    params: KernelParams
 
     @property
-    def waits_for_next(self) -> bool:
-        """True if every frame waits for the next one, for outlier replacement."""
-        return self.model_set.has_denoise and self.lag_ns > 0
+    def bearing(self) -> RecordArray[TileParams]:
+        """Parameters of the load-bearing tiles."""
+        found: RecordArray[TileParams] = np.asarray(self.params.tiles)[self.load_bearing_columns]
+        return found
+
+    @property
+    def curves(self) -> RecordArray[StaticParams]:
+        """Static curves of the load-bearing tiles; of settled forces if `rubber` is named."""
+        found: RecordArray[StaticParams] = self.params.tiles["static"][self.load_bearing_columns]
+        return found
+
+    @property
+    def is_scale_assumed(self) -> bool:
+        """True if the newtons of a tile rest on an assumption."""
+        return bool(self.params.foot["is_scale_assumed"][0])
 
     @property
     def lookahead_ns(self) -> int:
         """Look-ahead of windows; 1 ns shorter if frames wait for the next one."""
-        return self.lag_ns - 1 if self.waits_for_next else self.lag_ns
+        return int(self.params.foot["lookahead_ns"][0])
 
 
 def make_plan(
@@ -145,8 +124,17 @@ def make_plan(
     bearing = np.flatnonzero([not tile.reference for tile in info.tiles])
     if not len(bearing):
         raise UsageError("every tile of the array is a reference tile: nothing bears load")
-    model_set = make_checked_model_set(info, calibration, tare, models)
     entries = calibration.get_tiles_or_wildcard([info.tiles[i].serial for i in bearing])
+    seen = BearingTiles(
+        calibrations=entries,
+        calibration_label=f"calibration {calibration.name} ({calibration.id})",
+        models=models,
+        baseline_kpa=tare.baseline_kpa[bearing],
+        tare_counts=tare.temperature_raw_counts[bearing],
+        step_s=1.0 / info.nominal_rate_hz,
+        has_bare_tile=len(bearing) < len(info.tiles),
+    )
+    by_model = make_model_params(seen)
     for i, entry in zip(bearing, entries, strict=True):
         tile = info.tiles[i]
         if entry.coefficient_words not in (None, tile.coefficient_words):
@@ -154,75 +142,147 @@ def make_plan(
                 f"tile {tile.serial} is not the part that was calibrated: its chip has the "
                 f"coefficients {tile.coefficient_words}, the calibrated one "
                 f"{entry.coefficient_words}",
-                where=f"calibration {calibration.name} ({calibration.id})",
+                where=seen.calibration_label,
                 remedy="Press this tile on the test rig and calibrate it, or correct the serial",
             )
-    positions_m = np.array([(tile.x_m, tile.y_m, tile.z_m) for tile in info.tiles])
-    baseline_kpa = tare.baseline_kpa[bearing]
-    chip_end_kpa = np.array(
-        [_compute_chip_max_kpa(*each) for each in zip(entries, baseline_kpa.tolist(), strict=True)]
+    tiles = TileParams.array(len(info.tiles))
+    tiles[bearing] = _make_bearing_params(info, calibration, tare, bearing, seen, by_model)
+    faults, run_limits = make_fault_params(
+        info,
+        calibration,
+        tare,
+        tiles["chip_max_kpa"][bearing],
+        is_gas_corrected=tiles["gas"]["is_known"][bearing] == 1,
     )
-    still_kpa = np.hypot(tare.noise_kpa, tare.baseline_sigma_kpa)[bearing]
-    unloaded_n = float(
-        np.sqrt(((model_set.static_curves.slope_at_zero_n_per_kpa * still_kpa) ** 2).sum())
+    of_all = {
+        **vars(Compensation(info.tiles)),
+        "baseline_kpa": tare.baseline_kpa,
+        "noise_kpa": tare.noise_kpa,
+        "tare_counts": tare.temperature_raw_counts,
+        "faults": faults,
+    }
+    for name, column in of_all.items():
+        tiles[name] = column
+    for name in by_model:
+        tiles[name]["is_named"] = 1
+    normals, offsets_m = compute_hull_half_planes(tiles["position_m"][bearing, :2])
+    foot = _make_foot_params(info, calibration, tare, models, round(lag_ms * 1e6))
+    foot["run_limits"] = run_limits
+    foot["variance_inflation"] = tiles["variance_inflation"][bearing].mean(axis=0)
+    still_n = (
+        tiles["static"]["slope_at_zero_n_per_kpa"][bearing]
+        * _compute_unloaded_sigma_kpa(tare)[bearing]
     )
-    gains = [calibration.find_mount_gain(info.tiles[i].serial) for i in bearing]
-    axis_rad = fit_tile_axis_angles_rad(positions_m[bearing])
+    unloaded_n = float(np.sqrt((still_n**2).sum()))
+    foot["contact_on_n"] = CONTACT_ON_SIGMA * unloaded_n
+    foot["contact_off_n"] = CONTACT_OFF_SIGMA * unloaded_n
+    foot["contact_bound_n"] = CONTACT_ON_SIGMA * unloaded_n * tiles["mount_gain"][bearing].max()
+    foot["has_grid"] = (tiles["grid_index"][bearing] > 0.0).all()
     return EstimationPlan(
         info=info,
         calibration=calibration,
         tare=tare,
-        models=tuple(name for name in MODEL_NAMES if name in models),
+        models=tuple(by_model),
         lag_ns=round(lag_ms * 1e6),
-        compensation=Compensation(info.tiles),
-        model_set=model_set,
         load_bearing_columns=bearing,
-        reference_columns=np.flatnonzero([tile.reference for tile in info.tiles]),
-        baseline_kpa=baseline_kpa,
-        baseline_sigma_kpa=tare.baseline_sigma_kpa[bearing],
-        noise_kpa=tare.noise_kpa[bearing],
-        variance_inflation=_compute_variance_inflation(tare, bearing, info.nominal_rate_hz),
-        sample_delay_ns=np.array(
-            [
-                round(1e9 * late.value) if (late := e.effects.late_s) is not None else 0
-                for e in entries
-            ],
-            dtype=np.int64,
-        ),
-        sample_delay_sigma_s=np.array(
-            [late.sigma if (late := e.effects.late_s) is not None else 0.0 for e in entries]
-        ),
-        sample_delay_common_sigma_s=np.array([e.effects.late_common_s for e in entries]),
-        chip_max_kpa=chip_end_kpa,
-        saturation=make_saturation_bounds(
-            model_set.static_curves, model_set.gas, baseline_kpa, chip_end_kpa
-        ),
-        fault_limits=make_fault_limits(
-            info,
-            calibration,
-            tare,
-            chip_end_kpa,
-            is_gas_corrected=model_set.is_gas_known & (model_set.gas is not None),
-            has_thermal_drift=model_set.temperature is None,
-        ),
-        unloaded_sigma_kpa=still_kpa,
-        tile_positions_m=positions_m[bearing],
         cop_measured=(info.row_place_m[0] is None, info.row_place_m[1] is None),
-        mount_gain=np.array([1.0 if gain is None else gain.value for gain in gains]),
-        mount_gain_sigma=np.array([0.0 if gain is None else gain.sigma for gain in gains]),
+        params=KernelParams(
+            foot, tiles, np.ascontiguousarray(np.column_stack([normals, offsets_m]))
+        ),
+    )
+
+
+def _make_foot_params(
+    info: ArrayInfo, calibration: Calibration, tare: Tare, models: Sequence[str], lag_ns: int
+) -> RecordArray[FootParams]:
+    """Make the parameters that no tile is needed for."""
+    has_denoise, serials = "denoise" in models, [t.serial for t in info.tiles if not t.reference]
+    # With look-ahead and averages, a frame waits for the next one. Without look-ahead the next
+    # frame is not there, and may be of the same instant.
+    waits_for_next = has_denoise and lag_ns > 0
+    gap_ns = round(GAP_PERIODS * 1e9 / info.nominal_rate_hz)
+    columns: dict[str, Any] = {
+        "has_ambient": "ambient" in models,
+        "has_denoise": has_denoise,
+        "is_at_frame_instant": has_denoise and "skew" in models,
+        "has_fault_detection": True,
+        "has_thermal_drift": "temperature" not in models,
+        "waits_for_next": waits_for_next,
+        "lag_ns": lag_ns,
+        "lookahead_ns": lag_ns - 1 if waits_for_next else lag_ns,
+        "gap_ns": gap_ns,
+        "is_tare_lost": tare.is_lost,
+        "tare_ns": tare.t_ns,
+        "is_scale_assumed": calibration.has_assumed_scale(serials),
+        "contact_min_ns": CONTACT_MIN_NS,
+        "contact_pause_ns": max(CONTACT_MIN_NS, gap_ns),
+        "cop_sigma_max_m": COP_SIGMA_MAX_M,
+        "n_load_bearing": len(serials),
+    }
+    shear = None if calibration.mounted is None else calibration.mounted.shear
+    if shear is not None:
+        columns |= {"is_shear_known": 1, "shear": shear.value, "shear_sigma": shear.sigma}
+    if (servo := info.servo) is not None:
+        travel = servo.ankle_travel_m_per_rad
+        columns |= {
+            "has_servo": 1,
+            "counts_per_turn": servo.counts_per_turn,
+            "zero_counts": servo.zero_counts,
+            "rad_per_count": compute_segment_rad_per_count(servo),
+            "travel_m_per_rad": np.nan if travel is None else travel,
+        }
+    return FootParams.array(1, **columns)
+
+
+def _make_bearing_params(
+    info: ArrayInfo,
+    calibration: Calibration,
+    tare: Tare,
+    bearing: npt.NDArray[np.intp],
+    seen: BearingTiles,
+    by_model: dict[str, RecordArray[Any]],
+) -> RecordArray[TileParams]:
+    """Make the parameters of the load-bearing tiles, but for those of all tiles."""
+    entries, curves = seen.calibrations, by_model["static"]
+    chip_max_kpa = np.array(
+        [_compute_chip_max_kpa(*e) for e in zip(entries, seen.baseline_kpa.tolist(), strict=True)]
+    )
+    positions_m = np.array([(t.x_m, t.y_m, t.z_m) for t in info.tiles])[bearing]
+    grid = compute_grid_indices_from_1(positions_m[:, :2])
+    axis_rad = fit_tile_axis_angles_rad(positions_m)
+    gains = [calibration.find_mount_gain(info.tiles[i].serial) for i in bearing]
+    delays = [entry.effects.late_s for entry in entries]
+    return TileParams.array(
+        len(bearing),
+        **by_model,
+        is_load_bearing=1,
+        baseline_variance=tare.baseline_sigma_kpa[bearing] ** 2,
+        sample_delay_ns=[0 if late is None else round(1e9 * late.value) for late in delays],
+        sample_delay_sigma_s=[0.0 if late is None else late.sigma for late in delays],
+        sample_delay_common_sigma_s=[entry.effects.late_common_s for entry in entries],
+        chip_max_kpa=chip_max_kpa,
+        range_low_kpa=curves["range_low_kpa"]
+        - SIGNIFICANCE_SIGMAS * _compute_unloaded_sigma_kpa(tare)[bearing],
+        saturation=make_saturation_params(
+            curves,
+            by_model["gas"]["gamma"] if "gas" in by_model else np.ones(len(bearing)),
+            seen.baseline_kpa,
+            chip_max_kpa,
+        ),
+        dome_misfit=rubber.collect_misfits(seen),
+        position_m=positions_m,
+        mount_gain=[1.0 if gain is None else gain.value for gain in gains],
+        mount_gain_sigma=[0.0 if gain is None else gain.sigma for gain in gains],
         axis_rad=axis_rad,
         tilt_loss=compute_tilt_loss(axis_rad),
-        shear=None if calibration.mounted is None else calibration.mounted.shear,
-        hull=compute_hull_half_planes(positions_m[bearing, :2]),
-        grid=compute_grid_indices_from_1(positions_m[bearing, :2]),
-        contact=ContactThresholds(
-            on_n=CONTACT_ON_SIGMA * unloaded_n,
-            off_n=CONTACT_OFF_SIGMA * unloaded_n,
-            min_ns=CONTACT_MIN_NS,
-        ),
-        is_scale_assumed=calibration.has_assumed_scale([info.tiles[i].serial for i in bearing]),
-        gap_ns=round(GAP_PERIODS * 1e9 / info.nominal_rate_hz),
+        variance_inflation=_compute_variance_inflation(tare, bearing, info.nominal_rate_hz),
+        grid_index=0.0 if grid is None else np.column_stack(grid),
     )
+
+
+def _compute_unloaded_sigma_kpa(tare: Tare) -> Floats:
+    """Compute the standard deviation of a single unloaded reading about the true baseline."""
+    return np.hypot(tare.noise_kpa, tare.baseline_sigma_kpa)
 
 
 def _compute_variance_inflation(
@@ -246,13 +306,6 @@ def _compute_chip_max_kpa(entry: TileCalibration, baseline_kpa: float) -> float:
 
 def compute_settling_time_s(plan: EstimationPlan) -> float:
     """Return the time in seconds until the models have settled."""
-    model_set, longest_s = plan.model_set, 0.0
-    if model_set.gas is not None:
-        longest_s = max(longest_s, float((model_set.gas.gamma * model_set.gas.tau_s).max()))
-    if model_set.rubber is not None:
-        longest_s = max(
-            longest_s, float(model_set.rubber.tau_s[model_set.rubber.creep_fraction > 0.0].max())
-        )
-    if model_set.temperature is not None:
-        longest_s = max(longest_s, float(np.abs(model_set.temperature.lag_s).max()))
+    bearing = plan.bearing
+    longest_s = max(MODELS[name].longest_time_constant_s(bearing[name]) for name in plan.models)
     return max(SETTLING_MIN_S, SETTLING_TIME_CONSTANTS * longest_s)

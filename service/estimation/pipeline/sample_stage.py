@@ -26,10 +26,10 @@ from devices.temperature_hold import HOLD_MAX_NS
 from service.estimation.fault_detection.baseline_loss import (
     ERROR_MIN_KPA,
     update_baseline_error_bound_kpa,
+    update_thermal_drift_kpa,
 )
 from service.estimation.fault_detection.clipping import update_clipping_limit_kpa
 from service.estimation.fault_detection.stuck import update_stuck_and_toggles
-from service.estimation.fault_detection.thermal_drift import update_thermal_drift_kpa
 from service.estimation.foot.contact import update_candidate
 from service.estimation.foot.geometry import store_servo_reading_and_link_to_previous
 from service.estimation.models import gas
@@ -90,8 +90,6 @@ def compute_apparent_forces_and_contact(
     foot_params, row, n = params.foot[0], buffer.rows[i], len(tile_states)
     t_ns = buffer.t_mono_ns[i]
     row.flags = _frame_flags(foot_params, row)
-    # Without a model for the temperature, a tare at another one is old.
-    checks_warmth = foot_params.has_temperature == 0 and foot_params.is_tare_lost == 0
     after = buffer.rows[i + 1] if i + 1 < foot_state.end_row else row
     has_after = i + 1 < foot_state.end_row and after.after_gap == 0
     ambient_kpa, bare_sum_kpa, bare_count = 0.0, 0.0, 0
@@ -101,7 +99,7 @@ def compute_apparent_forces_and_contact(
             foot_kpa += buffer.samples[i, j].pressure_kpa - params.tiles[j].baseline_kpa
     for j in range(n):
         tile_params, sample = params.tiles[j], buffer.samples[i, j]
-        if checks_warmth and _has_temperature_changed(tile_params, sample):
+        if foot_params.is_tare_lost == 0 and _has_temperature_changed(tile_params, sample):
             row.flags |= _TARE_OLD
         after_kpa = buffer.samples[i + 1, j].pressure_kpa if has_after else math.nan
         _detect_faults(
@@ -160,11 +158,14 @@ def _frame_flags(foot_params: FootParams, row: FrameRow) -> int:
 
 @jit_cached
 def _has_temperature_changed(tile_params: TileParams, sample: TileSample) -> bool:
-    """Return whether the temperature since the tare has changed by more than a baseline allows."""
+    """Return whether the temperature since the tare has changed by more than a baseline allows.
+
+    With a model for the temperature it may.
+    """
     moved_counts = abs(sample.temperature_raw - tile_params.tare_counts)
-    is_load_bearing = tile_params.is_load_bearing == 1
+    is_checked = tile_params.is_load_bearing == 1 and tile_params.temperature.is_named == 0
     return (
-        is_load_bearing
+        is_checked
         and moved_counts > TEMPERATURE_CHANGE_MAX_COUNTS
         and not math.isnan(sample.pressure_kpa)
     )
@@ -186,18 +187,18 @@ def _detect_faults(
     as_read_kpa = sample.pressure_kpa
     baseline_kpa, noise_kpa = tile_params.baseline_kpa, tile_params.noise_kpa
     if foot_params.has_fault_detection == 1:
-        unloaded_band_kpa = tile_params.unloaded_band_kpa
+        unloaded_band_kpa = tile_params.faults.unloaded_band_kpa
         if tile_params.is_load_bearing == 1:
             update_clipping_limit_kpa(
                 tile_state.clipping, as_read_kpa, row.t_ns, baseline_kpa, unloaded_band_kpa,
                 noise_kpa, tile_params.variance_inflation[WINDOW_READINGS_MAX],
                 foot_kpa - (as_read_kpa - baseline_kpa),
             )  # fmt: skip
-        may_stand_still = as_read_kpa >= tile_params.stuck_check_max_kpa
+        may_stand_still = as_read_kpa >= tile_params.faults.stuck_check_max_kpa
         above_kpa = math.nan if may_stand_still else as_read_kpa - baseline_kpa
         stuck, foot_state.load_toggles = update_stuck_and_toggles(
-            foot_params, tile_params.stuck, tile_state.stuck, sample.pressure_raw, above_kpa,
-            unloaded_band_kpa, foot_state.load_toggles, tiles,
+            foot_params.run_limits, tile_params.faults.stuck, tile_state.stuck, sample.pressure_raw,
+            above_kpa, unloaded_band_kpa, foot_state.load_toggles, tiles,
         )  # fmt: skip
         if stuck:
             row.flags |= _STUCK
@@ -225,7 +226,7 @@ def _compute_apparent_force(
     """Compute the apparent force on a load-bearing tile; return its curve's slope in N/kPa."""
     flags = 0
     kpa, variance = sample.pressure_kpa, tile_params.baseline_variance
-    if foot_params.has_temperature == 1:
+    if tile_params.temperature.is_named == 1:
         is_read = sample.temperature_raw != NOT_READ
         counts = float(sample.temperature_raw) if is_read else math.nan
         kpa, sigma_kpa = refer_to_tare_temperature_with_sigma(
@@ -248,13 +249,13 @@ def _compute_apparent_force(
     # As if the chip's end had been read, less the shares of warmth and surroundings.
     least_kpa = kpa - (sample.pressure_kpa - end_kpa if is_hidden else 0.0)
     cooled_kpa, gas_kpa, gas_alt_kpa = kpa, 0.0, 0.0
-    if foot_params.has_gas == 1:
+    if tile_params.gas.is_named == 1:
         found_kpa, gas_alt_kpa = _isothermal_pressure(
             tile_params, tile_state, kpa, least_kpa, t_ns, is_hidden
         )
         gas_kpa = found_kpa - kpa
         # A tile whose rig recording does not determine its gas has no correction, but this sigma.
-        cooled_kpa = found_kpa if tile_params.is_gas_known == 1 else kpa
+        cooled_kpa = found_kpa if tile_params.gas.is_known == 1 else kpa
         least_kpa = gas.compute_isothermal_lower_bound_kpa(tile_params.gas, least_kpa)
     static_kpa = (least_kpa if is_hidden else cooled_kpa) - tile_params.baseline_kpa
     drift_kpa = baseline_error_kpa = 0.0
@@ -262,12 +263,13 @@ def _compute_apparent_force(
         if foot_params.has_thermal_drift == 1:
             drift_kpa = update_thermal_drift_kpa(
                 tile_state.thermal_drift, sample.temperature_raw, tile_params.tare_counts,
-                tile_params.thermal_kpa_per_count, t_ns,
+                tile_params.faults.thermal_kpa_per_count, t_ns,
             )  # fmt: skip
         seen_kpa = math.nan if is_hidden else static_kpa
         baseline_error_kpa = update_baseline_error_bound_kpa(
-            tile_state.baseline_loss, tile_params.asymmetry, seen_kpa, variance, drift_kpa, t_ns
-        )
+            tile_state.baseline_loss, tile_params.faults.asymmetry, seen_kpa, variance, drift_kpa,
+            t_ns,
+        )  # fmt: skip
         if baseline_error_kpa > 0.0 or abs(drift_kpa) > ERROR_MIN_KPA:
             flags |= _BASELINE_LOST
     variance += baseline_error_kpa**2
@@ -289,14 +291,14 @@ def _compute_apparent_force(
         flags |= _OVER_RATED
     if static_kpa < tile_params.range_low_kpa:
         flags |= _EXTRAPOLATED
-    if foot_params.has_skew == 1 and foot_params.has_denoise == 0:
+    if tile_params.skew.is_named == 1 and foot_params.has_denoise == 0:
         force_n = interpolate_to_frame(
             tile_state.skew, force_n, t_ns, frame_t_ns, row.after_gap == 1
         )
     row.flags |= flags
     sample.apparent_n, sample.is_saturated = force_n, 1 if is_saturated else 0
     sample.systematic_sigma_n = math.sqrt(slope**2 * variance + fit_sigma_n**2)
-    sample.gas_error_n = slope * tile_params.gas_misfit * gas_kpa
+    sample.gas_error_n = slope * tile_params.gas.misfit * gas_kpa
     sample.gas_alt_error_n, sample.thermal_error_n = slope * gas_alt_kpa, slope * drift_kpa
     return slope
 
@@ -414,7 +416,7 @@ def append_frames_to_buffer(
                 p, t = float(sample.pressure_raw), float(sample.temperature_raw)
                 chip = tile_params
                 kpa = _kpa_of(p, t, chip.a0, chip.b1, chip.b2, chip.c12)
-                if foot_params.has_unwrap == 1:
+                if tile_params.unwrap.is_named == 1:
                     kpa = unwrap_pressure(kpa, _kpa_per_count_of(t, chip.b1, chip.c12))
                 if kpa >= PRESSURE_MIN_KPA:
                     sample.pressure_kpa = kpa

@@ -9,15 +9,12 @@ estimates.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from devices.arrays import Floats
 from devices.jit import jit_cached
 from service.estimation.foot import LONG_GAP_NS
-from service.estimation.models.gas import GasModel
-from service.estimation.models.static import StaticCurves
+from service.estimation.models.static import StaticParams, compute_forces
 from service.estimation.records import KernelRecord, RecordArray
 
 FORCE_MAX_FACTOR = 2.0
@@ -30,39 +27,14 @@ reach a little farther."""
 
 
 class SaturationParams(KernelRecord):
-    """Parameters of a tile, as in `SaturationBounds`."""
+    """Bounds of the load on a tile during saturation and gaps."""
 
-    range_high_kpa: float
-    range_end_n: float
-    slope_n_per_kpa: float
-    force_max_n: float
-    range_end_hot_kpa: float
-    force_max_hot_kpa: float
-
-
-@dataclass(frozen=True)
-class SaturationBounds:
-    """Bounds of the load during saturation and gaps, over the load-bearing tiles.
-
-    Attributes:
-        range_high_kpa: gauge pressure at the calibrated range's end.
-        range_end_n: load there.
-        slope_n_per_kpa: slope with which the curve is extrapolated.
-        force_max_n: largest possible load during saturation.
-        range_end_hot_kpa: absolute pressure of the load at the range's end before its gas cools.
-        force_max_hot_kpa: same of the largest possible load.
-    """
-
-    range_high_kpa: Floats
-    range_end_n: Floats
-    slope_n_per_kpa: Floats
-    force_max_n: Floats
-    range_end_hot_kpa: Floats
-    force_max_hot_kpa: Floats
-
-    def to_records(self) -> RecordArray[SaturationParams]:
-        """Make the kernel's parameters, (tiles,)."""
-        return SaturationParams.array(len(self.range_end_n), **vars(self))
+    range_high_kpa: float  # gauge pressure at the calibrated range's end
+    range_end_n: float  # load there
+    slope_n_per_kpa: float  # slope with which the curve is extrapolated
+    force_max_n: float  # largest possible load during saturation
+    range_end_hot_kpa: float  # absolute pressure of the load at the range's end, before gas cools
+    force_max_hot_kpa: float  # same of the largest possible load
 
 
 @jit_cached
@@ -79,32 +51,39 @@ def extrapolate_capped_force_n(params: SaturationParams, curve_n: float, gauge_k
     return params.force_max_n if guess > params.force_max_n else guess
 
 
-def make_saturation_bounds(
-    curves: StaticCurves, gas: GasModel | None, baseline_kpa: Floats, chip_max_kpa: Floats
-) -> SaturationBounds:
-    """Compute the bounds.
+def make_saturation_params(
+    curves: RecordArray[StaticParams], gamma: Floats, baseline_kpa: Floats, chip_max_kpa: Floats
+) -> RecordArray[SaturationParams]:
+    """Make the bounds of load-bearing tiles, (tiles,).
 
     Args:
-        curves: static curves of the load-bearing tiles.
-        gas: their gas model; None: it is not named.
+        curves: static curves of the tiles.
+        gamma: (tiles,), ratio of heat capacities of their gas; 1 if no heat is corrected.
         baseline_kpa: (tiles,), absolute pressure unloaded.
         chip_max_kpa: (tiles,), absolute pressure above which the chip saturates.
     """
-    at_end = curves.compute_forces(curves.range_high_kpa[None])
+    high_kpa = curves["range_high_kpa"]
+    at_end = compute_forces(curves, high_kpa[None])
     end_n, slope = at_end.force_n[0], at_end.slope_n_per_kpa[0]
     # A preset's curve may bend over where it ends.
-    slope = np.where(slope > 0.0, slope, end_n / curves.range_high_kpa)
-    tells_kpa = np.maximum(curves.range_high_kpa, chip_max_kpa - baseline_kpa)
-    most_n = FORCE_MAX_FACTOR * (end_n + slope * (tells_kpa - curves.range_high_kpa))
-    most_kpa = curves.range_high_kpa + (most_n - end_n) / slope
-    gamma = np.ones(len(end_n)) if gas is None else gas.gamma
+    slope = np.where(slope > 0.0, slope, end_n / high_kpa)
+    tells_kpa = np.maximum(high_kpa, chip_max_kpa - baseline_kpa)
+    most_n = FORCE_MAX_FACTOR * (end_n + slope * (tells_kpa - high_kpa))
+    most_kpa = high_kpa + (most_n - end_n) / slope
     # The baseline is 0 before the first tare.
     base_kpa = np.maximum(baseline_kpa, 1.0)
     end_hot_kpa, most_hot_kpa = (
-        base_kpa * (1.0 + gauge_kpa / base_kpa) ** gamma
-        for gauge_kpa in (curves.range_high_kpa, most_kpa)
+        base_kpa * (1.0 + gauge_kpa / base_kpa) ** gamma for gauge_kpa in (high_kpa, most_kpa)
     )
-    return SaturationBounds(curves.range_high_kpa, end_n, slope, most_n, end_hot_kpa, most_hot_kpa)
+    return SaturationParams.array(
+        len(high_kpa),
+        range_high_kpa=high_kpa,
+        range_end_n=end_n,
+        slope_n_per_kpa=slope,
+        force_max_n=most_n,
+        range_end_hot_kpa=end_hot_kpa,
+        force_max_hot_kpa=most_hot_kpa,
+    )
 
 
 @jit_cached

@@ -13,7 +13,7 @@ from typing import Annotated
 from devices.arrays import Floats
 from devices.jit import jit_cached, jit_inlined
 from service.estimation.models import denoise, flow, hysteresis, rubber
-from service.estimation.pipeline.params import FootParams, KernelParams, TileParams
+from service.estimation.pipeline.params import KernelParams, TileParams
 from service.estimation.pipeline.saturation import (
     UNIFORM_SIGMA,
     is_after_long_gap,
@@ -89,25 +89,16 @@ def compute_forces_and_after_saturation(
         if tile_params.is_load_bearing == 1:
             at_ns = (
                 buffer.t_mono_ns[i]
-                if _is_at_frame_instant(foot_params)
+                if foot_params.is_at_frame_instant == 1
                 else buffer.sampled_ns[i, j]
             )
-            alt_n = _correct_force(
-                foot_params, tile_params, tile_states[j], sample, forces[j], at_ns
-            )
+            alt_n = _correct_force(tile_params, tile_states[j], sample, forces[j], at_ns)
             unsettled = unsettled or (sample.is_saturated == 0 and alt_n > buffer.noise_n[i, j])
     return unsettled
 
 
 @jit_cached
-def _is_at_frame_instant(foot_params: FootParams) -> bool:
-    """Return whether averages are evaluated at the frame's instant instead of each tile's."""
-    return bool(foot_params.has_skew == 1 and foot_params.has_denoise == 1)
-
-
-@jit_cached
 def _correct_force(
-    foot_params: FootParams,
     tile_params: TileParams,
     tile_state: TileState,
     sample: TileSample,
@@ -117,9 +108,9 @@ def _correct_force(
     """Correct a tile's averaged force in place; return its sigma by saturation and gaps, in N."""
     averaged_n, dome_alt_n = force.force_n, 0.0
     force_n = averaged_n
-    if foot_params.has_hysteresis == 1 or foot_params.has_rubber == 1:
+    if tile_params.hysteresis.is_named == 1 or tile_params.rubber.is_named == 1:
         force_n, dome_alt_n = _remove_hysteresis_and_creep(
-            foot_params, tile_params, tile_state, sample, averaged_n, at_ns
+            tile_params, tile_state, sample, averaged_n, at_ns
         )
     rate = _update_rise_rate(tile_state, force_n, at_ns)
     independent_n = math.sqrt(
@@ -129,7 +120,7 @@ def _correct_force(
     )
     common_n = force.sigma_common_n
     common_n[0] = sample.gas_error_n
-    common_n[1] = tile_params.rubber_misfit * (force_n - averaged_n)
+    common_n[1] = tile_params.dome_misfit * (force_n - averaged_n)
     common_n[2], common_n[3] = sample.gas_alt_error_n, dome_alt_n
     common_n[4], common_n[5] = force.smoothing_error_n, sample.thermal_error_n
     common_n[6] = rate * tile_params.sample_delay_common_sigma_s
@@ -174,7 +165,7 @@ def denoise_forces_and_scale_noise(
     """
     foot_params, n, within = params.foot[0], len(params.tiles), denoise.ALL_ROWS
     columns = buffer.usable_n, buffer.noise_n, buffer.sampled_ns, buffer.run
-    at_frame, frame_ns = _is_at_frame_instant(foot_params), buffer.t_mono_ns[i]
+    at_frame, frame_ns = foot_params.is_at_frame_instant == 1, buffer.t_mono_ns[i]
     if foot_params.n_load_bearing > 1 and not math.isnan(buffer.usable_n[i, n]):
         at_ns = frame_ns if at_frame else buffer.sampled_ns[i, n]
         _, within = denoise.denoise_sample(
@@ -197,7 +188,6 @@ def denoise_forces_and_scale_noise(
 
 @jit_cached
 def _remove_hysteresis_and_creep(
-    foot_params: FootParams,
     tile_params: TileParams,
     tile_state: TileState,
     sample: TileSample,
@@ -206,11 +196,11 @@ def _remove_hysteresis_and_creep(
 ) -> tuple[float, float]:
     """Return the force without loop and creep, and its sigma by saturation and gaps before."""
     is_saturated, had_gap = sample.is_saturated == 1, False
-    if foot_params.has_rubber == 1:
+    if tile_params.rubber.is_named == 1:
         last = tile_state.dome.rubber
         had_gap = not math.isnan(last.force_n) and is_after_long_gap(at_ns, last.t_ns)
-    elif foot_params.has_flow == 1:
-        last_of_flow = tile_state.dome.flow
+    elif tile_params.hysteresis.has_flow == 1:
+        last_of_flow = tile_state.dome.hysteresis.flow
         had_gap = not math.isnan(last_of_flow.force_n) and is_after_long_gap(
             at_ns, last_of_flow.t_ns
         )
@@ -218,13 +208,13 @@ def _remove_hysteresis_and_creep(
     state_force_n = sample.extrapolated_n if is_saturated else math.nan
     if tile_state.has_dome_alt == 0 and not is_saturated and not had_gap:
         found_n = _invert_dome_models(
-            foot_params, tile_params, tile_state.dome, force_n, at_ns, state_force_n, math.nan
+            tile_params, tile_state.dome, force_n, at_ns, state_force_n, math.nan
         )
         return found_n, 0.0
     if tile_state.has_dome_alt == 0:
         _copy_dome_state(tile_state.dome, tile_state.dome_alt)
     found_n = _invert_dome_models(
-        foot_params, tile_params, tile_state.dome, force_n, at_ns, state_force_n, math.nan
+        tile_params, tile_state.dome, force_n, at_ns, state_force_n, math.nan
     )
     bounds = tile_params.saturation
     if is_saturated:
@@ -232,10 +222,10 @@ def _remove_hysteresis_and_creep(
             sample.extrapolated_n, sample.apparent_n, bounds.force_max_n
         )
     alt_n = _invert_dome_models(
-        foot_params, tile_params, tile_state.dome_alt, force_n, at_ns, state_force_n,
+        tile_params, tile_state.dome_alt, force_n, at_ns, state_force_n,
         bounds.range_end_n,
     )  # fmt: skip
-    is_same = _is_same_dome_state(foot_params, tile_state.dome, tile_state.dome_alt)
+    is_same = _is_same_dome_state(tile_params, tile_state.dome, tile_state.dome_alt)
     tile_state.has_dome_alt = 0 if is_same else 1
     if is_saturated:
         return alt_n if alt_n < found_n else found_n, 0.0
@@ -244,7 +234,6 @@ def _remove_hysteresis_and_creep(
 
 @jit_cached
 def _invert_dome_models(
-    foot_params: FootParams,
     tile_params: TileParams,
     dome_state: DomeState,
     force_n: float,
@@ -252,15 +241,14 @@ def _invert_dome_models(
     state_force_n: float,
     gap_force_n: float,
 ) -> float:
-    if foot_params.has_flow == 1:
+    loop, loop_state = tile_params.hysteresis, dome_state.hysteresis
+    if loop.has_flow == 1:
         force_n = flow.compensate_flow(
-            tile_params.flow, dome_state.flow, force_n, at_ns, state_force_n, gap_force_n
+            loop.flow, loop_state.flow, force_n, at_ns, state_force_n, gap_force_n
         )
-    if foot_params.has_hysteresis == 1:
-        force_n = hysteresis.compensate_hysteresis(
-            tile_params.hysteresis, dome_state.hysteresis, force_n, state_force_n
-        )
-    if foot_params.has_rubber == 1:
+    if loop.is_named == 1:
+        force_n = hysteresis.compensate_hysteresis(loop, loop_state, force_n, state_force_n)
+    if tile_params.rubber.is_named == 1:
         force_n = rubber.compensate_creep(
             tile_params.rubber, dome_state.rubber, force_n, at_ns, state_force_n, gap_force_n
         )
@@ -269,37 +257,17 @@ def _invert_dome_models(
 
 @jit_cached
 def _copy_dome_state(dome_state: DomeState, to: DomeState) -> None:
-    to.flow.stress_n, to.flow.force_n, to.flow.t_ns = (
-        dome_state.flow.stress_n,
-        dome_state.flow.force_n,
-        dome_state.flow.t_ns,
-    )
-    to.rubber.force_n, to.rubber.t_ns = dome_state.rubber.force_n, dome_state.rubber.t_ns
-    for m in range(len(dome_state.rubber.crept_n)):
-        to.rubber.crept_n[m] = dome_state.rubber.crept_n[m]
-    for m in range(len(dome_state.hysteresis.plays_n)):
-        to.hysteresis.plays_n[m] = dome_state.hysteresis.plays_n[m]
+    hysteresis.copy_state(dome_state.hysteresis, to.hysteresis)
+    rubber.copy_state(dome_state.rubber, to.rubber)
 
 
 @jit_cached
-def _is_same_dome_state(foot_params: FootParams, one: DomeState, other: DomeState) -> bool:
+def _is_same_dome_state(tile_params: TileParams, one: DomeState, other: DomeState) -> bool:
     """Return whether two states are equal in the models that are named."""
-    for m in range(len(one.hysteresis.plays_n)):
-        if one.hysteresis.plays_n[m] != other.hysteresis.plays_n[m]:
-            return False
-    if foot_params.has_flow == 1 and (
-        one.flow.stress_n != other.flow.stress_n
-        or one.flow.force_n != other.flow.force_n
-        or one.flow.t_ns != other.flow.t_ns
-    ):
-        return False
-    if foot_params.has_rubber == 0:
-        return True
-    for m in range(len(one.rubber.crept_n)):
-        if one.rubber.crept_n[m] != other.rubber.crept_n[m]:
-            return False
-    forces = one.rubber.force_n == other.rubber.force_n
-    return bool(forces and one.rubber.t_ns == other.rubber.t_ns)
+    is_same = hysteresis.is_same_state(tile_params.hysteresis, one.hysteresis, other.hysteresis)
+    if tile_params.rubber.is_named == 1:
+        is_same = is_same and rubber.is_same_state(one.rubber, other.rubber)
+    return is_same
 
 
 @jit_cached

@@ -21,7 +21,7 @@ from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.compilation import is_compiling
 from service.estimation.foot import LONG_GAP_NS
-from service.estimation.models.static import StaticCurves
+from service.estimation.models.static import StaticParams, compute_forces
 from service.estimation.pipeline.plan import make_plan
 from service.estimation.tare.automatic import (
     HISTORY_NS,
@@ -63,7 +63,10 @@ class TileRanges:
         """
         serials = info.serials
         bearing = [i for i, tile in enumerate(info.tiles) if not tile.reference]
-        curves = StaticCurves(calibration.get_tiles_or_wildcard([serials[i] for i in bearing]))
+        curves = StaticParams.from_calibrations(
+            calibration.get_tiles_or_wildcard([serials[i] for i in bearing])
+        )
+        high_kpa = curves["range_high_kpa"]
         gains = [calibration.find_mount_gain(serials[i]) for i in bearing]
         gain = np.array([1.0 if one is None else one.value for one in gains])
 
@@ -74,11 +77,9 @@ class TileRanges:
 
         return cls(
             entries=tuple(calibration.find_tile_or_wildcard(serial) for serial in serials),
-            end_kpa=by_tile(curves.range_high_kpa),
-            full_scale_n=by_tile(
-                gain * curves.compute_forces(curves.range_high_kpa[None]).force_n[0]
-            ),
-            slope_n_per_kpa=by_tile(gain * curves.slope_at_zero_n_per_kpa),
+            end_kpa=by_tile(high_kpa),
+            full_scale_n=by_tile(gain * compute_forces(curves, high_kpa[None]).force_n[0]),
+            slope_n_per_kpa=by_tile(gain * curves["slope_at_zero_n_per_kpa"]),
             is_scale_assumed=calibration.has_assumed_scale([serials[i] for i in bearing]),
         )
 

@@ -18,7 +18,7 @@ from service.estimation.calibration import (
     is_increasing_cubic,
     make_paper_shape_preset,
 )
-from service.estimation.models.static import StaticCurves
+from service.estimation.models.static import StaticParams, compute_forces
 from tests.builders.calibrations import make_calibration, newton_tile
 
 NUMBERS = st.floats(-100, 100)
@@ -219,7 +219,9 @@ def test_the_papers_preset_has_the_papers_shape_at_41_45_n_per_unit() -> None:
     tile = PRESETS["paper-eq2-shape"]().get_tile_or_wildcard("any serial at all")
     assert tile.f_scale_n == pytest.approx(41.45, abs=0.005)
     gauge_kpa = np.linspace(0.0, 15.0, 61)
-    force_n = StaticCurves([tile]).compute_forces(gauge_kpa[:, None]).force_n[:, 0]
+    force_n = compute_forces(StaticParams.from_calibrations([tile]), gauge_kpa[:, None]).force_n[
+        :, 0
+    ]
     p = gauge_kpa / 15.0
     assert force_n == pytest.approx((0.13 * p**3 + 0.02354 * p**2 + 0.5702 * p) * 41.45, abs=0.004)
     assert (force_n[0], force_n[-1]) == (0.0, pytest.approx(30.0, abs=1e-12))

@@ -12,7 +12,7 @@ import pytest
 import service.estimation
 from service.estimation import compilation
 from service.estimation.estimate import Estimator
-from service.estimation.pipeline.model_set import MODEL_NAMES
+from service.estimation.pipeline.params import MODEL_NAMES
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from storage.schema import wire_schema
 from storage.wire import decode_message, encode_frames

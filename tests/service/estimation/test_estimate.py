@@ -20,12 +20,12 @@ from devices.flags import EstimateFlag
 from devices.frames import NOT_READ, FrameBatch
 from devices.temperature_hold import hold_temperature
 from service.estimation.estimate import Estimator
-from service.estimation.pipeline.model_set import MODEL_NAMES
+from service.estimation.pipeline.params import MODEL_NAMES
 from service.estimation.pipeline.plan import make_plan
 from service.estimation.tare.unloaded_windows import compute_recording_tare
 from tests.builders.arrays import COUNT_KPA, DATA_SHEET_CHIP, FORUM_CHIP, array_at, make_servo
 from tests.builders.calibrations import make_calibration, make_effects, make_tare, newton_tile
-from tests.builders.estimates import estimate, joined, newton_plan
+from tests.builders.estimates import estimate, joined, newton_plan, with_params
 from tests.builders.frames import assert_same_bits, cut_up, loaded_frames
 from tests.service.estimation.feet import SQUARE, draw_wild_frames, estimate_load, repeat_load
 
@@ -252,9 +252,9 @@ def test_pressures_have_the_bits_of_those_for_tare_and_calibration(seed: int) ->
     frames = draw_wild_frames(60, 4, seed)
     frames.temperature_raw[rng.random(frames.temperature_raw.shape) < 0.5] = NOT_READ
     plan = newton_plan(array_at(SQUARE), models=("static",))
-    kpa = plan.compensation.compute_usable_kpa(hold_temperature(frames)[0])
+    kpa = Compensation(plan.info.tiles).compute_usable_kpa(hold_temperature(frames)[0])
     kpa[~(kpa >= PRESSURE_MIN_KPA)] = np.nan
-    gauge_kpa = estimate(replace(plan, fault_limits=None), frames).gauge_kpa
+    gauge_kpa = estimate(with_params(plan, foot={"has_fault_detection": 0}), frames).gauge_kpa
     assert gauge_kpa.tobytes() == (kpa - plan.tare.baseline_kpa).tobytes()
 
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from devices.flags import EstimateFlag, TileFlag
-from service.estimation.models.temperature import TemperatureModel
-from service.estimation.pipeline.model_set import MODEL_NAMES
+from service.estimation.pipeline.params import MODEL_NAMES
 from service.estimation.pipeline.plan import make_plan
 from service.estimation.tare.tare import Tare
 from tests.builders.arrays import COUNT_KPA, array_at, make_servo
@@ -160,10 +159,10 @@ def test_a_tare_at_another_temperature_is_flagged_as_an_old_one() -> None:
     counts[7, 3] = 300  # of a tile that bears no load it does not matter
     flags = estimate_load([9] * 4, plan, temperature_raw=counts).estimate_flags
     assert find(EstimateFlag.TARE_OLD, flags) == [4, 6]
-    none, tare = np.zeros(3), np.full(3, 480.0)
-    model = TemperatureModel(none, none, np.ones(3), none, tare, np.full(3, 100.0), step_s=0.002)
-    corrected = replace(plan, model_set=replace(plan.model_set, temperature=model))
-    unknown = replace(plan, tare=replace(plan.tare, temperature_raw_counts=np.full(4, np.nan)))
+    tiles = [newton_tile(serial, effects=make_effects()) for serial in plan.info.serials]
+    corrected = newton_plan(plan.info, models=("unwrap", "temperature", "static"), tiles=tiles)
+    tare = replace(plan.tare, temperature_raw_counts=np.full(4, np.nan))
+    unknown = make_plan(plan.info, plan.calibration, tare, models=plan.models)
     for other in (corrected, unknown):
         flags = estimate_load([9] * 4, other, temperature_raw=counts).estimate_flags
         assert find(EstimateFlag.TARE_OLD, flags) == []

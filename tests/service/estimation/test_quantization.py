@@ -96,7 +96,9 @@ def test_a_step_is_a_power_of_two_and_at_most_an_eighth_of_sigma(
         least = np.where(np.isnan(found[of]), np.inf, found[of]).min(axis=0)
         assert np.all(np.frexp(steps[name])[0] == 0.5), name
         assert np.all(steps[name] <= least / STEPS_PER_SIGMA * (1.0 + 1e-12)), name
-    assert np.all(steps["gauge_kpa"] <= plan.noise_kpa * np.hypot(1.0, 0.05) / STEPS_PER_SIGMA)
+    assert np.all(
+        steps["gauge_kpa"] <= plan.bearing["noise_kpa"] * np.hypot(1.0, 0.05) / STEPS_PER_SIGMA
+    )
 
 
 def test_the_steps_suit_a_foot_at_rest() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.estimation.pipeline.model_set import MODEL_NAMES
+from service.estimation.pipeline.params import MODEL_NAMES
 from studies.benchmark.draws import list_missing_models, list_model_sets
 
 LADDER = (

@@ -6,7 +6,6 @@ design, not from the estimator; it takes the same float64 inputs.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from service.estimation.pipeline.smoothing_stage import BOUND_SIGMAS
 from service.estimation.records import Estimates
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP, array_at
 from tests.builders.calibrations import make_calibration, make_tare, newton_tile
-from tests.builders.estimates import estimate
+from tests.builders.estimates import estimate, with_params
 from tests.builders.frames import loaded_frames
 from tests.service.estimation.exact import sample_stage
 from tests.service.estimation.exact.digits import Exact, apart
@@ -130,7 +129,7 @@ def plan_with(*chips: tuple[int, int, int, int]) -> EstimationPlan:
     )
     info = array_at(POSITIONS_M, chips=chips)
     plan = make_plan(info, make_calibration(*TILES), tare, models=("unwrap", "static"))
-    return replace(plan, cop_sigma_max_m=1.0)
+    return with_params(plan, foot={"cop_sigma_max_m": 1.0})
 
 
 def frames_of(pressure_raw: Any, temperature_raw: Any, tile_flags: Any = 0) -> FrameBatch:

@@ -13,7 +13,7 @@ from mpmath import mp, mpf
 from devices.flags import EstimateFlag, TileFlag
 from devices.frames import NOT_READ, FrameBatch
 from service.estimation.effects import FlowEffect, Parameter
-from service.estimation.pipeline.model_set import MODEL_NAMES
+from service.estimation.pipeline.params import MODEL_NAMES
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from service.estimation.pipeline.smoothing_stage import BOUND_SIGMAS
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP, array_at

@@ -14,7 +14,7 @@ from mpmath import mpf
 from service.estimation.models import ambient, denoise, flow, gas, hysteresis, rubber, temperature
 from service.estimation.tare.unloaded_windows import compute_variance_inflation
 from tests.builders.averages import denoised
-from tests.builders.readings import through
+from tests.builders.readings import make_rubber, through
 from tests.service.estimation.exact import digits, sample_stage, smoothing_stage
 
 GOAL = 1e-9
@@ -45,10 +45,10 @@ def test_gas_is_within_a_micropascal(gamma: float, tau_s: float, seed: int) -> N
     rng = np.random.default_rng(seed)
     kpa = damage(rng, 100.0 + np.cumsum(rng.normal(0, 2.0, 40)))
     t_ns = draw_instants(rng, 40)
-    model = gas.GasModel(*(np.array([x]) for x in (gamma, tau_s, 0.00124, 100.1)))
-    found = through(
-        gas.compute_isothermal_pressure, model.to_records(), gas.initial_state(1), kpa, t_ns, NAN
+    model = gas.GasParams.array(
+        1, gamma=gamma, tau_s=tau_s, wall_per_kpa=0.00124, baseline_kpa=100.1
     )
+    found = through(gas.compute_isothermal_pressure, model, gas.GasState.array(1), kpa, t_ns, NAN)
     parameters = (mpf(gamma), mpf(tau_s), mpf(0.00124), mpf(100.1))
     expected = sample_stage.gas(digits.exact(kpa), t_ns.tolist(), *parameters)
     assert digits.apart(found[:, None], expected) < GOAL
@@ -66,9 +66,9 @@ def test_rubber_is_within_a_nanonewton(
     rng = np.random.default_rng(seed)
     apparent_n = damage(rng, 15.0 + np.cumsum(rng.normal(0, 2.0, 40)))
     t_ns = draw_instants(rng, 40)
-    model = rubber.CreepModel(np.array([parts]), np.array([taus_s]))
+    model = make_rubber(parts, taus_s)
     seen = apparent_n, t_ns, NAN, NAN
-    found = through(rubber.compensate_creep, model.to_records(), rubber.initial_state(1), *seen)
+    found = through(rubber.compensate_creep, model, rubber.RubberState.array(1), *seen)
     expected = smoothing_stage.rubber(
         digits.exact(apparent_n),
         t_ns.tolist(),
@@ -92,9 +92,9 @@ def test_flow_is_within_a_nanonewton(
     rng = np.random.default_rng(seed)
     apparent_n = damage(rng, 3.0 + np.cumsum(rng.normal(0, swing_n, 40)))
     t_ns = draw_instants(rng, 40)
-    model = flow.FlowModel(np.array([part]), np.array([stress_n]), np.array([power]))
+    model = flow.FlowParams.array(1, fraction=part, stress_scale_n=stress_n, exponent=power)
     seen = apparent_n, t_ns, NAN, NAN
-    found = through(flow.compensate_flow, model.to_records(), flow.initial_state(1), *seen)
+    found = through(flow.compensate_flow, model, flow.FlowState.array(1), *seen)
     expected = smoothing_stage.flow(
         digits.exact(apparent_n), t_ns.tolist(), mpf(part), mpf(stress_n), mpf(power)
     )
@@ -112,9 +112,9 @@ def test_hysteresis_is_within_a_nanonewton(
 ) -> None:
     rng = np.random.default_rng(seed)
     apparent_n = damage(rng, rng.choice([0.0, 3.0, 20.0]) + np.cumsum(rng.normal(0, swing_n, 40)))
-    model = hysteresis.HysteresisModel(np.array([parts], dtype=float))
-    state = hysteresis.initial_state(1)
-    found = through(hysteresis.compensate_hysteresis, model.to_records(), state, apparent_n, NAN)
+    model = hysteresis.HysteresisParams.array(1, play_weights=[parts])
+    state = hysteresis.HysteresisState.array(1)
+    found = through(hysteresis.compensate_hysteresis, model, state, apparent_n, NAN)
     expected = smoothing_stage.hysteresis(digits.exact(apparent_n), [mpf(w) for w in parts])
     assert digits.apart(found[:, None], expected) < GOAL * max(1.0, swing_n)
 
@@ -139,7 +139,7 @@ def test_ambient_is_within_a_micropascal(seed: int) -> None:
     rng = np.random.default_rng(seed)
     kpa = damage(rng, rng.normal(0, 1.0, 60))
     t_ns = draw_instants(rng, 60)
-    found = through(ambient.low_pass_ambient_kpa, None, ambient.initial_state(), kpa, t_ns)
+    found = through(ambient.low_pass_ambient_kpa, None, ambient.AmbientState.array(1), kpa, t_ns)
     expected = sample_stage.smoothed(digits.exact(kpa), t_ns.tolist())
     assert digits.apart(found[:, None], expected) < GOAL
 

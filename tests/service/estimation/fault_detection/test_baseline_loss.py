@@ -13,7 +13,6 @@ from service.estimation.fault_detection.baseline_loss import (
     LEAK_ASYMMETRY,
     TOLERANCE_SIGMAS,
     BaselineLossState,
-    initial_state,
     update_baseline_error_bound_kpa,
 )
 from service.estimation.records import RecordArray
@@ -24,7 +23,7 @@ STEP_NS = round(1e9 / RATE_HZ)
 
 def bound_error(gauge_kpa: Floats, explained_kpa: float = 0.03) -> Floats:
     out = np.empty(len(gauge_kpa))
-    _update_all(initial_state(1), gauge_kpa, (explained_kpa / TOLERANCE_SIGMAS) ** 2, out)
+    _update_all(BaselineLossState.array(1), gauge_kpa, (explained_kpa / TOLERANCE_SIGMAS) ** 2, out)
     return out
 
 

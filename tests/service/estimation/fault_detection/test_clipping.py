@@ -10,10 +10,10 @@ import pytest
 from devices.arrays import Bools, Floats, Times
 from devices.jit import jit_cached
 from service.estimation.fault_detection.clipping import (
-    initial_clipping_state,
+    ClippingState,
     update_clipping_limit_kpa,
 )
-from service.estimation.records import Records
+from service.estimation.records import RecordArray
 from tests.builders.noise import draw_lasting_noise
 
 RATE_HZ = 447.0
@@ -44,14 +44,14 @@ def follow(
     end_kpa, evidence = np.empty((2, np.count_nonzero(taken)))
     others = np.broadcast_to(others_kpa, kpa.shape)[taken]
     _update_all(
-        initial_clipping_state(1), t_ns[taken], kpa[taken], others, noise_left, end_kpa, evidence
+        ClippingState.array(1), t_ns[taken], kpa[taken], others, noise_left, end_kpa, evidence
     )
     return end_kpa, evidence
 
 
 @jit_cached
 def _update_all(
-    state: Records,
+    state: RecordArray[ClippingState],
     t_ns: Times,
     kpa: Floats,
     others: Floats,

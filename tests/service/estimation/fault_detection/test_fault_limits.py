@@ -13,7 +13,7 @@ from devices.arrays import Floats
 from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from devices.flags import EstimateFlag
 from devices.frames import FrameBatch
-from service.estimation.pipeline.model_set import MODEL_NAMES
+from service.estimation.pipeline.params import MODEL_NAMES
 from service.estimation.pipeline.plan import EstimationPlan
 from tests.builders.arrays import COUNT_KPA, PERIOD_NS, array_at
 from tests.builders.calibrations import make_effects, newton_tile

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -11,16 +9,14 @@ import pytest
 from devices.arrays import Bools, Floats, Ints
 from devices.jit import jit_cached
 from service.estimation.fault_detection.stuck import (
-    SHARE_STEPS,
-    StuckLimits,
+    RunLimits,
     StuckParams,
     StuckState,
     compute_step_share,
-    initial_state,
-    make_stuck_limits,
+    make_stuck_params,
     update_stuck_and_toggles,
 )
-from service.estimation.records import KernelRecord, RecordArray
+from service.estimation.records import RecordArray
 from tests.builders.noise import draw_lasting_noise
 
 RATE_HZ = 447.0
@@ -35,41 +31,32 @@ def draw_noise(
     return counts * draw_lasting_noise(n, tiles, part=1.0, readings=readings, seed=seed)
 
 
-def make_limits(counts: float, tiles: int) -> StuckLimits:
+def make_limits(
+    counts: float, tiles: int
+) -> tuple[RecordArray[StuckParams], RecordArray[RunLimits]]:
     # The noise of a tare has rounding and outliers.
     tared = 1.25 * np.hypot(counts, np.sqrt(1.0 / 12.0))
-    return make_stuck_limits(np.full(tiles, tared), RATE_HZ)
-
-
-class LimitTables(KernelRecord):
-    """Limits of an array, as the parameters of a foot have them."""
-
-    run_max_by_equal: Annotated[Ints, (SHARE_STEPS + 1,)]
-    run_max_by_double_step: Annotated[Ints, (SHARE_STEPS + 1,)]
+    return make_stuck_params(np.full(tiles, tared), RATE_HZ)
 
 
 def find_repeats(
-    limits: StuckLimits,
+    limits: tuple[RecordArray[StuckParams], RecordArray[RunLimits]],
     states: RecordArray[StuckState],
     pressure_raw: npt.NDArray[np.uint16],
     kpa: Floats,
     unloaded_kpa: float,
 ) -> npt.NDArray[np.bool_]:
     """Find readings (n, tiles) that repeat more than noise explains."""
-    tables = LimitTables.array(
-        1,
-        run_max_by_equal=limits.run_max_by_equal,
-        run_max_by_double_step=limits.run_max_by_double_step,
-    )
+    params, tables = limits
     out = np.empty(kpa.shape, dtype=bool)
     counts = pressure_raw.astype(np.int64)
-    _update_all(tables, limits.to_records(), states, counts, kpa, unloaded_kpa, out)
+    _update_all(tables, params, states, counts, kpa, unloaded_kpa, out)
     return out
 
 
 @jit_cached
 def _update_all(
-    limits: RecordArray[LimitTables],
+    limits: RecordArray[RunLimits],
     params: RecordArray[StuckParams],
     states: RecordArray[StuckState],
     pressure_raw: Ints,
@@ -95,7 +82,7 @@ def find_stuck(level: Floats, counts: float) -> npt.NDArray[np.bool_]:
     kpa = COUNT_KPA * (400.0 - pressure_raw.astype(np.float64))
     unloaded_kpa = 4.0 * COUNT_KPA * np.hypot(counts, 0.3)
     stuck = find_repeats(
-        make_limits(counts, tiles), initial_state(tiles), pressure_raw, kpa, unloaded_kpa
+        make_limits(counts, tiles), StuckState.array(tiles), pressure_raw, kpa, unloaded_kpa
     )
     assert not stuck[:447].any()
     return stuck[447:]
@@ -150,7 +137,7 @@ def test_a_quiet_unloaded_tile_is_never_stuck() -> None:
 
 def test_unreadable_counts_are_not_stuck() -> None:
     pressure_raw = np.full((500, 1), 65535, dtype=np.uint16)
-    state = initial_state(1)
+    state = StuckState.array(1)
     stuck = find_repeats(make_limits(0.85, 1), state, pressure_raw, np.full((500, 1), np.nan), 1.0)
     assert not stuck.any()
     assert state["unloaded_pairs"].tolist() == [0]

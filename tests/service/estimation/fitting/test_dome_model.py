@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from service.estimation.fitting.dome_model import DomeResponse, compute_dome_response
 from service.estimation.models import flow, gas, hysteresis, rubber
 from service.estimation.models.hysteresis import WIDTHS_N
-from tests.builders.readings import through
+from tests.builders.readings import make_rubber, through
 
 CURVE = np.array([22.0, 5.0, 5.0])
 SCALE_KPA, BASE_KPA, WALL = 16.0, 100.3, 0.00124
@@ -67,24 +67,20 @@ def test_creep_and_loop_are_compensated_to_a_nanonewton(seed: int) -> None:
     t_ns, force_n = draw_load(seed)
     law = (0.08, 0.3, 4.7)
     out = respond(t_ns, force_n, part=PART, loop=LOOP, flow=law)
-    sprung, loop = (
-        flow.FlowModel(*(np.array([x]) for x in law)),
-        hysteresis.HysteresisModel(np.array([LOOP])),
-    )
-    creep, nan = rubber.CreepModel(np.array([PART]), np.array([CREEP_S])), math.nan
+    sprung = flow.FlowParams.array(1, fraction=law[0], stress_scale_n=law[1], exponent=law[2])
+    loop = hysteresis.HysteresisParams.array(1, play_weights=[LOOP])
+    creep, nan = make_rubber(PART, CREEP_S), math.nan
     felt_n = compute_apparent_n(out.kpa)
-    felt_n = through(
-        flow.compensate_flow, sprung.to_records(), flow.initial_state(1), felt_n, t_ns, nan, nan
-    )
+    felt_n = through(flow.compensate_flow, sprung, flow.FlowState.array(1), felt_n, t_ns, nan, nan)
     felt_n = through(
         hysteresis.compensate_hysteresis,
-        loop.to_records(),
-        hysteresis.initial_state(1),
+        loop,
+        hysteresis.HysteresisState.array(1),
         felt_n,
         nan,
     )
     felt_n = through(
-        rubber.compensate_creep, creep.to_records(), rubber.initial_state(1), felt_n, t_ns, nan, nan
+        rubber.compensate_creep, creep, rubber.RubberState.array(1), felt_n, t_ns, nan, nan
     )
     assert felt_n == pytest.approx(force_n, abs=1e-9)
     assert out.force_lag_n == pytest.approx(force_n - compute_apparent_n(out.kpa), abs=1e-9)
@@ -98,11 +94,13 @@ def test_the_gas_is_compensated_as_exactly_as_the_forward_model_is_solved(
     # Six rounds, each of which leaves less than k = (gamma - 1)/gamma of the error.
     t_ns, force_n = draw_load(seed)
     out = respond(t_ns, force_n, gamma=gamma)
-    model = gas.GasModel(*(np.array([x]) for x in (gamma, 0.011, WALL, BASE_KPA)))
+    model = gas.GasParams.array(
+        1, gamma=gamma, tau_s=0.011, wall_per_kpa=WALL, baseline_kpa=BASE_KPA
+    )
     settled = through(
         gas.compute_isothermal_pressure,
-        model.to_records(),
-        gas.initial_state(1),
+        model,
+        gas.GasState.array(1),
         out.kpa,
         t_ns,
         math.nan,

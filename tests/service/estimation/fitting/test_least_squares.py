@@ -28,7 +28,7 @@ from service.estimation.fitting.least_squares import (
 )
 from service.estimation.fitting.output_error import OutputErrorProblem
 from service.estimation.fitting.static_fit import fit_static_curve
-from service.estimation.models.static import StaticCurves
+from service.estimation.models.static import StaticParams, compute_forces
 from tests.builders.calibrations import newton_tile
 from tests.service.estimation.fitting.recordings import record
 
@@ -168,7 +168,9 @@ def test_the_band_of_a_new_loading_is_t_times_the_sigma_of_an_estimate() -> None
         repeats=4,
     )
     gauge_kpa = np.linspace(0.0, tile.range_kpa[1], 11)
-    sigma_n = StaticCurves([tile]).compute_forces(gauge_kpa[:, None]).fit_sigma_n[:, 0]
+    sigma_n = compute_forces(
+        StaticParams.from_calibrations([tile]), gauge_kpa[:, None]
+    ).fit_sigma_n[:, 0]
     found_n = compute_new_loading_half_width_95_n(tile, gauge_kpa)
     assert found_n == pytest.approx(compute_student_t_95(4) * sigma_n, rel=1e-9)
     assert found_n[0] == 0.0

@@ -15,7 +15,7 @@ from devices.errors import CalibrationError
 from service.estimation.calibration import TileCalibration
 from service.estimation.fitting.rig.indentation import Indentation
 from service.estimation.fitting.static_fit import fit_static_curve
-from service.estimation.models.static import StaticCurves
+from service.estimation.models.static import StaticParams, compute_forces
 
 Curve = Callable[[np.ndarray], np.ndarray]
 
@@ -77,7 +77,7 @@ def record(
 
 
 def compute_fitted_n(tile: TileCalibration, gauge_kpa: np.ndarray) -> np.ndarray:
-    return StaticCurves([tile]).compute_forces(gauge_kpa[:, None]).force_n[:, 0]
+    return compute_forces(StaticParams.from_calibrations([tile]), gauge_kpa[:, None]).force_n[:, 0]
 
 
 def test_a_known_cubic_is_recovered_without_noise() -> None:

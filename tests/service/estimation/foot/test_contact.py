@@ -11,12 +11,11 @@ from hypothesis import strategies as st
 
 from service.estimation.foot.contact import (
     ContactState,
-    ContactThresholds,
     is_debounced,
     update_candidate,
 )
 
-RULE = ContactThresholds(on_n=5.0, off_n=3.0, min_ns=10_000_000)
+ON_N, OFF_N, MIN_NS = 5.0, 3.0, 10_000_000
 MS = 1_000_000
 
 
@@ -32,12 +31,12 @@ def detect_contact(
     t_ns = np.array(t_ms if t_ms is not None else range(0, 2 * n, 2), dtype=np.int64) * MS
     states, since_ns, loaded = ContactState.array(1), np.empty(n, np.int64), []
     for i, force_n in enumerate(grf_n):
-        update_candidate(RULE.on_n, RULE.off_n, states[0], float(force_n), t_ns[i], i in gaps)
+        update_candidate(ON_N, OFF_N, states[0], float(force_n), t_ns[i], i in gaps)
         since_ns[i] = states["since_ns"][0]
         loaded.append(int(states["is_loaded"][0]))
     contact, out = 0, []
     for i in range(n):
-        if is_debounced(since_ns, t_ns, i, n, RULE.min_ns, lag_ms * MS):
+        if is_debounced(since_ns, t_ns, i, n, MIN_NS, lag_ms * MS):
             contact = loaded[i]
         out.append(contact)
     return out
@@ -50,14 +49,14 @@ def detect_plainly(
     candidates: list[int] = []
     for force_n in grf_n:
         before = candidates[-1] if candidates else 0
-        candidates.append(1 if force_n >= RULE.on_n else 0 if force_n <= RULE.off_n else before)
+        candidates.append(1 if force_n >= ON_N else 0 if force_n <= OFF_N else before)
     changes = np.diff(candidates, prepend=0) != 0
     run = np.cumsum([i in gaps or changes[i] for i in range(len(grf_n))])
     contact, out = 0, []
     for i, t in enumerate(t_ms):
         visible = [t_ms[j] for j in range(len(t_ms)) if run[j] == run[i] and t_ms[j] <= t + lag_ms]
         # The first run has no known begin: it counts as long.
-        if run[i] == 0 or (max(visible) - min(visible)) * MS >= RULE.min_ns:
+        if run[i] == 0 or (max(visible) - min(visible)) * MS >= MIN_NS:
             contact = candidates[i]
         out.append(contact)
     return out

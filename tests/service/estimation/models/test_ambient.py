@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from devices.errors import UsageError
-from service.estimation.models.ambient import SMOOTHING_S, initial_state, low_pass_ambient_kpa
+from service.estimation.models.ambient import SMOOTHING_S, AmbientState, low_pass_ambient_kpa
 from tests.builders.arrays import array_at
 from tests.builders.calibrations import make_effects, newton_tile
 from tests.builders.estimates import newton_plan
@@ -17,7 +17,7 @@ def test_a_step_of_water_follows_a_low_pass_of_thirty_milliseconds() -> None:
     t_s = np.array([0.0, 0.001, 0.031, 0.061, 60.0])
     t_ns = np.rint(1e9 * t_s).astype(np.int64)
     kpa = np.array([0.0, 1.0, 1.0, 1.0, 1.0])
-    smoothed_kpa = through(low_pass_ambient_kpa, None, initial_state(), kpa, t_ns)
+    smoothed_kpa = through(low_pass_ambient_kpa, None, AmbientState.array(1), kpa, t_ns)
     expected_kpa = [0.0, *(1 - np.exp(-t_s[1:] / SMOOTHING_S))]
     assert smoothed_kpa == pytest.approx(expected_kpa, abs=1e-9)
 
@@ -25,7 +25,7 @@ def test_a_step_of_water_follows_a_low_pass_of_thirty_milliseconds() -> None:
 def test_a_silent_bare_tile_keeps_its_pressure_for_a_fifth_of_a_second() -> None:
     t_ns = np.arange(300, dtype=np.int64) * 2_000_000
     kpa = np.where(np.arange(300) < 100, 1.0, np.nan)
-    state = initial_state()
+    state = AmbientState.array(1)
     ambient_kpa = through(low_pass_ambient_kpa, None, state, kpa, t_ns)
     assert ambient_kpa[:200] == pytest.approx(1.0)
     assert np.isnan(ambient_kpa[200:]).all()
@@ -38,9 +38,8 @@ def test_a_dome_transmits_ambient_pressure_as_its_wall_yields() -> None:
     tiles = [newton_tile("T01", effects=make_effects())]
     bare = array_at([(0.0, 0.0, 0.0), (0.1, 0.0, 0.0)], references=[1])
     plan = newton_plan(bare, models=("static", "ambient"), tiles=tiles)
-    assert plan.model_set.ambient is not None
-    yielded = 0.0013 * plan.baseline_kpa[0]
-    assert plan.model_set.ambient.transmitted_fraction == pytest.approx([yielded / (1 + yielded)])
-    assert plan.model_set.ambient.relative_sigma == pytest.approx(0.0002 / 0.0013)
+    found, yielded = plan.bearing["ambient"], 0.0013 * plan.tare.baseline_kpa[0]
+    assert found["transmitted_fraction"] == pytest.approx([yielded / (1 + yielded)])
+    assert found["relative_sigma"] == pytest.approx([0.0002 / 0.0013])
     with pytest.raises(UsageError, match="bare reference tile"):
         newton_plan(array_at([(0.0, 0.0, 0.0)]), models=("static", "ambient"), tiles=tiles)

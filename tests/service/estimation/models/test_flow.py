@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from service.estimation.models import flow
-from service.estimation.models.flow import STROKE_N_PER_S, FlowModel
+from service.estimation.models.flow import STROKE_N_PER_S, FlowParams, FlowState
 from tests.builders.readings import through
 
 PART, STRESS_N = 0.08, 0.3
@@ -22,10 +22,10 @@ STEP_S = 0.002
 def compensate(
     apparent_n: Any, t_s: Any, *, power: float = 4.0, away_n: float = math.nan
 ) -> np.ndarray:
-    model = FlowModel(np.array([PART]), np.array([STRESS_N]), np.array([power]))
+    model = FlowParams.array(1, fraction=PART, stress_scale_n=STRESS_N, exponent=power)
     t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
     readings = np.asarray(apparent_n, dtype=float), t_ns, math.nan, away_n
-    return through(flow.compensate_flow, model.to_records(), flow.initial_state(1), *readings)
+    return through(flow.compensate_flow, model, FlowState.array(1), *readings)
 
 
 def solve_branch_stress(t_s: np.ndarray, force_n: np.ndarray, power: float) -> np.ndarray:

@@ -11,18 +11,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.estimation.models import gas
-from service.estimation.models.gas import RESTART_TIME_CONSTANTS, GasModel
+from service.estimation.models.gas import RESTART_TIME_CONSTANTS, GasParams, GasState
 from tests.builders.readings import through
 
 GAMMA, TAU_S, WALL, BASE_KPA = 1.28, 0.011, 0.00124, 100.0
 
 
 def settle(kpa: Any, t_s: Any, *, gamma: float = GAMMA, wall: float = WALL) -> np.ndarray:
-    model = GasModel(*(np.array([x]) for x in (gamma, TAU_S, wall, BASE_KPA)))
+    model = GasParams.array(1, gamma=gamma, tau_s=TAU_S, wall_per_kpa=wall, baseline_kpa=BASE_KPA)
     t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
     readings = np.asarray(kpa, dtype=float), t_ns, math.nan
     kernel = gas.compute_isothermal_pressure
-    return through(kernel, model.to_records(), gas.initial_state(1), *readings)
+    return through(kernel, model, GasState.array(1), *readings)
 
 
 def test_a_constant_pressure_stays() -> None:

@@ -17,10 +17,10 @@ PART = (0.05, 0.04, 0.03)
 
 
 def compensate(apparent_n: list[float], part: tuple[float, ...] = PART) -> np.ndarray:
-    model = hysteresis.HysteresisModel(np.array([part])).to_records()
+    model = hysteresis.HysteresisParams.array(1, play_weights=[part])
     readings = np.array(apparent_n, dtype=float), math.nan
     kernel = hysteresis.compensate_hysteresis
-    return through(kernel, model, hysteresis.initial_state(1), *readings)
+    return through(kernel, model, hysteresis.HysteresisState.array(1), *readings)
 
 
 @given(

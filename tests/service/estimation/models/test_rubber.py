@@ -11,16 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.estimation.models import rubber
-from tests.builders.readings import through
+from tests.builders.readings import make_rubber, through
 
 PART, TAU_S = (0.05, 0.04), (0.06, 1.1)
 
 
 def compensate(apparent_n: Any, t_s: Any) -> np.ndarray:
-    model = rubber.CreepModel(np.array([PART]), np.array([TAU_S]))
+    model = make_rubber(PART, TAU_S)
     t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
     readings = np.asarray(apparent_n, dtype=float), t_ns, math.nan, math.nan
-    return through(rubber.compensate_creep, model.to_records(), rubber.initial_state(1), *readings)
+    return through(rubber.compensate_creep, model, rubber.RubberState.array(1), *readings)
 
 
 @pytest.mark.parametrize("step_s", [0.0001, 0.002, 0.5, 60.0])

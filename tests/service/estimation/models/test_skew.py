@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.estimation.models.skew import initial_state, interpolate_to_frame
+from service.estimation.models.skew import SkewState, interpolate_to_frame
 
 
 def align(
     values: list[float], t_ns: list[int], frame_t_ns: list[int], broken: Sequence[int] = ()
 ) -> list[float]:
-    state = initial_state(1)[0]
+    state = SkewState.array(1)[0]
     frames = enumerate(zip(values, t_ns, frame_t_ns, strict=True))
     return [float(interpolate_to_frame(state, *frame, i in broken)) for i, frame in frames]
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.estimation.calibration import make_paper_shape_preset
-from service.estimation.models.static import StaticCurves, StaticForce
+from service.estimation.models.static import StaticForce, StaticParams, compute_forces
 from tests.builders.calibrations import newton_tile
 
 # F = 0.5 u + 0.1 u^2 + 0.02 u^3 with u = (p - 3) / 2, times 4; rising everywhere
@@ -36,7 +36,7 @@ AT_7_N, END_N = compute_by_definition_n(7.0), compute_by_definition_n(15.0)
 
 def compute(*gauge_kpa: float, **changes: Any) -> StaticForce:
     tile = newton_tile("T01", **CURVE | changes)
-    return StaticCurves([tile]).compute_forces(np.array(gauge_kpa)[:, None])
+    return compute_forces(StaticParams.from_calibrations([tile]), np.array(gauge_kpa)[:, None])
 
 
 @given(st.floats(0, 15))
@@ -93,10 +93,12 @@ def test_the_slope_is_the_derivative_of_the_force(gauge_kpa: float) -> None:
 
 def test_every_tile_has_its_own_curve() -> None:
     paper = make_paper_shape_preset().get_tile_or_wildcard("T02")
-    curves = StaticCurves([newton_tile("T01", **CURVE), paper, newton_tile("T03")])
-    force_n = curves.compute_forces(np.array([[7.0, 15.0, 13 / 1023]])).force_n
+    curves = StaticParams.from_calibrations(
+        [newton_tile("T01", **CURVE), paper, newton_tile("T03")]
+    )
+    force_n = compute_forces(curves, np.array([[7.0, 15.0, 13 / 1023]])).force_n
     assert force_n[0] == pytest.approx([AT_7_N, 30.0, 0.1])
-    assert curves.slope_at_zero_n_per_kpa[0] == pytest.approx(SLOPE_AT_ZERO)
+    assert curves["slope_at_zero_n_per_kpa"][0] == pytest.approx(SLOPE_AT_ZERO)
 
 
 def test_the_fits_sigma_is_the_covariance_of_its_coefficients() -> None:

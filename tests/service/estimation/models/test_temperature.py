@@ -11,9 +11,10 @@ import pytest
 from service.estimation.models.temperature import (
     READING_NOISE_COUNTS,
     STARTUP_S,
-    TemperatureModel,
+    TemperatureParams,
+    TemperatureState,
     compute_gas_temperature_noise_counts,
-    initial_state,
+    compute_smoothing_s,
     refer_to_tare_temperature_with_sigma,
 )
 from tests.builders.readings import through
@@ -30,12 +31,23 @@ def refer(
     kpa_per_count: float = KPA_PER_COUNT,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Refer pressures to the tare's temperature; return them and their uncertainty."""
-    values = (kpa_per_count, 0.02, lag_s, LAG_SIGMA_S, TARE, BASE_KPA)
-    per_count, relative, lag, lag_sigma, tare, base = (np.array([x]) for x in values)
-    model = TemperatureModel(per_count, relative, lag, lag_sigma, tare, base, 0.002).to_records()
+    lag = np.array([lag_s])
+    model = TemperatureParams.array(
+        1,
+        kpa_per_count=kpa_per_count,
+        relative_sigma=0.02,
+        lag_s=lag,
+        lag_sigma_s=LAG_SIGMA_S,
+        tare_counts=TARE,
+        baseline_kpa=BASE_KPA,
+        smoothing_s=compute_smoothing_s(lag),
+        noise_counts=compute_gas_temperature_noise_counts(lag, 0.002),
+    )
     t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
     readings = kpa, np.asarray(temperature_raw, dtype=float), t_ns
-    referred = through(refer_to_tare_temperature_with_sigma, model, initial_state(1), *readings)
+    referred = through(
+        refer_to_tare_temperature_with_sigma, model, TemperatureState.array(1), *readings
+    )
     return referred[:, 0], referred[:, 1]
 
 

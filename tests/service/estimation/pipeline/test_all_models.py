@@ -16,12 +16,12 @@ from hypothesis import strategies as st
 
 from devices.flags import EstimateFlag, TileFlag
 from devices.frames import NOT_READ, FrameBatch
-from service.estimation.pipeline.model_set import MODEL_NAMES
+from service.estimation.pipeline.params import MODEL_NAMES
 from service.estimation.pipeline.plan import EstimationPlan
 from service.estimation.records import Estimates
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP, array_at, make_servo
 from tests.builders.calibrations import make_effects, newton_tile
-from tests.builders.estimates import estimate, newton_plan
+from tests.builders.estimates import estimate, newton_plan, with_params
 from tests.builders.frames import LAYOUTS, assert_same_bits, cut_up, loaded_frames, with_columns
 from tests.service.estimation.feet import SQUARE, draw_wild_frames
 
@@ -260,8 +260,8 @@ def test_the_centre_moves_and_grows_with_the_tiles(
 ) -> None:
     moved = [(scale * x + x_m, scale * y + y_m, z) for x, y, z in SQUARE]
     frames = loaded_frames(draw_walk(80, 4, seed))
-    one = estimate(replace(make_full_plan(), cop_sigma_max_m=1.0), frames)
-    two = estimate(replace(make_full_plan(moved), cop_sigma_max_m=1.0), frames)
+    one = estimate(with_params(make_full_plan(), foot={"cop_sigma_max_m": 1.0}), frames)
+    two = estimate(with_params(make_full_plan(moved), foot={"cop_sigma_max_m": 1.0}), frames)
     assert two.grf_n.tobytes() == one.grf_n.tobytes()
     assert two.cop_x_m == pytest.approx(scale * one.cop_x_m + x_m, abs=1e-9, nan_ok=True)
     assert two.cop_y_m == pytest.approx(scale * one.cop_y_m + y_m, abs=1e-9, nan_ok=True)

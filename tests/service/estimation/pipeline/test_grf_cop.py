@@ -11,9 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from devices.chips.compensation import Compensation
 from devices.flags import EstimateFlag, FrameFlag
 from devices.frames import NO_SERVO_COUNTS
 from service.estimation.calibration import make_paper_shape_preset
+from service.estimation.pipeline.plan import make_plan
 from service.estimation.records import Estimates
 from tests.builders.arrays import COUNT_KPA, array_at, make_servo
 from tests.builders.calibrations import newton_tile
@@ -51,8 +53,9 @@ def test_the_sum_has_no_bias_in_flight() -> None:
 
 def test_zero_load_has_no_centre_and_no_warning() -> None:
     plan = newton_plan(array_at(SQUARE))
-    unloaded_kpa = plan.compensation.compute_kpa([[500] * 4], [[480] * 4])[0]
-    plan = replace(plan, tare=replace(plan.tare, baseline_kpa=unloaded_kpa))
+    unloaded_kpa = Compensation(plan.info.tiles).compute_kpa([[500] * 4], [[480] * 4])[0]
+    tare = replace(plan.tare, baseline_kpa=unloaded_kpa)
+    plan = make_plan(plan.info, plan.calibration, tare, models=plan.models)
     e = estimate_load([0] * 4, plan)
     assert e.grf_n.tolist() == [0.0] * 12
     assert all(np.isnan(getattr(e, name)).all() for name in COP)

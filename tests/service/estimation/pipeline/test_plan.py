@@ -21,28 +21,36 @@ INFO = array_at(LINE)
 
 def test_contact_thresholds_are_five_and_three_sigma_of_the_unloaded_sum() -> None:
     # three tiles of 0.5 N each: sqrt(3) * 0.5
-    rule = newton_plan(INFO, sigma_n=0.5).contact
-    assert [rule.on_n, rule.off_n] == pytest.approx(np.array([5, 3]) * 0.5 * np.sqrt(3))
-    assert rule.min_ns == 10_000_000
+    rule = newton_plan(INFO, sigma_n=0.5).params.foot
+    assert [*rule["contact_on_n"], *rule["contact_off_n"]] == pytest.approx(
+        np.array([5, 3]) * 0.5 * np.sqrt(3)
+    )
+    assert rule["contact_min_ns"] == 10_000_000
     plan = newton_plan(INFO, sigma_n=0.3)
     tare = replace(plan.tare, baseline_sigma_kpa=np.full(3, 0.4 * COUNT_KPA))
     uncertain = make_plan(plan.info, plan.calibration, tare, models=plan.models)
-    assert uncertain.contact.on_n == pytest.approx(rule.on_n), "0.3 N and 0.4 N of the baseline"
+    on_n = uncertain.params.foot["contact_on_n"]
+    assert on_n == pytest.approx(rule["contact_on_n"]), "0.3 N and 0.4 N of the baseline"
 
 
 def test_a_reference_tile_is_in_no_sum_no_hull_and_no_grid() -> None:
     plan = newton_plan(array_at([*LINE, (0.5, 0.5, -0.15)], references=[3]), sigma_n=0.5)
-    assert (plan.load_bearing_columns.tolist(), plan.reference_columns.tolist()) == ([0, 1, 2], [3])
-    assert plan.contact.on_n == newton_plan(INFO, sigma_n=0.5).contact.on_n
-    assert sorted(plan.hull[1].tolist()) == pytest.approx([0.0, 0.028])
-    assert plan.grid is not None
-    assert plan.grid[0].tolist() == [1.0, 2.0, 3.0]
+    assert plan.load_bearing_columns.tolist() == [0, 1, 2]
+    assert plan.params.tiles["is_load_bearing"].tolist() == [1, 1, 1, 0]
+    foot, without = plan.params.foot, newton_plan(INFO, sigma_n=0.5).params.foot
+    assert foot["n_load_bearing"] == 3
+    assert foot["contact_on_n"] == without["contact_on_n"]
+    assert sorted(plan.params.hull[:, 2].tolist()) == pytest.approx([0.0, 0.028])
+    assert foot["has_grid"] == 1
+    assert plan.bearing["grid_index"][:, 0].tolist() == [1.0, 2.0, 3.0]
 
 
 def test_options_are_in_ladder_order_nanoseconds_and_periods() -> None:
     plan = newton_plan(INFO, models=["static", "unwrap"], lag_ms=9.2)
     assert (plan.models, plan.lag_ns) == (("unwrap", "static"), 9_200_000)
-    assert plan.gap_ns == 3_000_000, "a frame one and a half periods late comes after a gap"
+    assert plan.params.foot["gap_ns"] == 3_000_000, (
+        "a frame one and a half periods late comes after a gap"
+    )
 
 
 def test_one_assumed_scale_makes_the_whole_sum_assumed() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -20,17 +18,17 @@ from devices.errors import CalibrationError
 from devices.flags import EstimateFlag
 from service.estimation.effects import Effects, GasEffect, Parameter
 from service.estimation.fitting.dome_model import DomeModel
-from service.estimation.models.gas import GasModel, compute_isothermal_lower_bound_kpa
+from service.estimation.models.gas import GasParams, compute_isothermal_lower_bound_kpa
 from service.estimation.pipeline.plan import EstimationPlan
 from service.estimation.pipeline.saturation import is_after_long_gap, select_farther_bound
-from service.estimation.records import Estimates
+from service.estimation.records import Estimates, RecordArray
 from tests.builders.arrays import COUNT_KPA, PERIOD_NS, UNLOADED_KPA, make_array
 from tests.builders.calibrations import make_effects, newton_tile
-from tests.builders.estimates import estimate, newton_plan
+from tests.builders.estimates import estimate, newton_plan, with_params
 from tests.builders.frames import loaded_frames, make_frames
 
 BASE_KPA = 100.0
-FASTEST_GAS = GasModel(*(np.array([x]) for x in (1.4, 10.0, 0.0, BASE_KPA)))
+FASTEST_GAS = GasParams.array(1, gamma=1.4, tau_s=10.0, wall_per_kpa=0.0, baseline_kpa=BASE_KPA)
 
 
 def squeeze(force_n: Floats, gamma: float, tau_s: float, wall: float) -> tuple[Floats, Floats]:
@@ -40,8 +38,8 @@ def squeeze(force_n: Floats, gamma: float, tau_s: float, wall: float) -> tuple[F
     return response.kpa, response.isothermal_kpa
 
 
-def bound_kpa(gas: GasModel, kpa: float) -> float:
-    return float(compute_isothermal_lower_bound_kpa(gas.to_records()[0], float(kpa)))
+def bound_kpa(gas: RecordArray[GasParams], kpa: float) -> float:
+    return float(compute_isothermal_lower_bound_kpa(gas[0], float(kpa)))
 
 
 LOADS = st.lists(st.tuples(st.floats(0.0, 45.0), st.integers(1, 60)), min_size=1, max_size=12).map(
@@ -59,7 +57,7 @@ def test_a_pressure_beyond_the_chips_end_settles_above_its_bound(
     force_n: Floats, gamma: float, tau_s: float, wall: float
 ) -> None:
     read_kpa, settled_kpa = squeeze(force_n, gamma, tau_s, wall)
-    gas = GasModel(*(np.array([x]) for x in (gamma, tau_s, wall, BASE_KPA)))
+    gas = GasParams.array(1, gamma=gamma, tau_s=tau_s, wall_per_kpa=wall, baseline_kpa=BASE_KPA)
     assert BASE_KPA < bound_kpa(gas, 115.0) < 115.0
     assert (settled_kpa[read_kpa > 115.0] > bound_kpa(gas, 115.0) - 0.02).all()
 
@@ -158,7 +156,7 @@ def test_a_bound_is_valid_for_a_warmer_and_a_colder_dome(warmer_k: float) -> Non
     kpa = (UNLOADED_KPA + true_n * COUNT_KPA) * (1.0 + warmer_k * 0.3 / UNLOADED_KPA)
     pressure_raw = round(float(compute_padc(kpa, temperature_raw, chip)))
     read_kpa = compensate_kpa(pressure_raw, temperature_raw, chip.a0, chip.b1, chip.b2, chip.c12)
-    plan = replace(plan, chip_max_kpa=np.full(2, float(read_kpa) - 0.05))
+    plan = with_params(plan, chip_max_kpa=float(read_kpa) - 0.05)
     # So long after the first frame that the gas is as warm as the chip.
     t_mono_ns = 60_000_000_000 + PERIOD_NS * np.arange(20)
     t_mono_ns[0] = 0

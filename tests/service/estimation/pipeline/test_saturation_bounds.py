@@ -20,7 +20,7 @@ from devices.flags import EstimateFlag, TileFlag
 from devices.frames import FrameBatch
 from service.estimation.effects import GasEffect, HysteresisEffect, Parameter, RubberEffect
 from service.estimation.fitting.dome_model import DomeModel
-from service.estimation.pipeline.model_set import MODEL_NAMES
+from service.estimation.pipeline.params import MODEL_NAMES
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from service.estimation.records import Estimates
 from tests.builders.arrays import UNLOADED_KPA, make_array

@@ -10,7 +10,7 @@ import numpy as np
 from devices.arrays import Floats
 from devices.jit import jit_cached
 from service.estimation.models import denoise
-from service.estimation.pipeline.params import KernelParams, make_kernel_params
+from service.estimation.pipeline.params import KernelParams
 from service.estimation.pipeline.smoothing_stage import (
     TILE_FORCE,
     TileForce,
@@ -28,9 +28,7 @@ def smooth(forces_n: Floats) -> Floats:
     """Average forces of tiles, (n, tiles), all sampled with their frame."""
     n, tiles = forces_n.shape
     info = array_at([(0.01 * j, 0.0, 0.0) for j in range(tiles)])
-    params = make_kernel_params(
-        newton_plan(info, models=("static", "skew", "denoise"), lag_ms=100.0)
-    )
+    params = newton_plan(info, models=("static", "skew", "denoise"), lag_ms=100.0).params
     buffer = make_frame_buffer(n, tiles)
     buffer.t_mono_ns[:] = PERIOD_NS * np.arange(n)
     buffer.sampled_ns[:] = buffer.t_mono_ns[:, None]

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from devices.errors import DamagedFileError, FileFormatError, TareError
 from devices.frames import FrameBatch
-from service.estimation.pipeline.model_set import MODEL_NAMES
+from service.estimation.pipeline.params import MODEL_NAMES
 from service.offline.estimate.preparation import EstimateRequest
 from service.offline.estimate.session import (
     estimate_next_chunk,
