@@ -9,7 +9,6 @@ records.
 from __future__ import annotations
 
 import math
-from dataclasses import fields
 from typing import Any, Self, cast
 
 import numpy as np
@@ -67,7 +66,6 @@ _COLUMNS = (
     "frame_flags",
 )
 """Columns of frames, in the order of the parameters of `_compute_step`."""
-_FIELDS = tuple(f.name for f in fields(Estimates))
 _ROW_FIELDS = ("release_row", "sample_row", "end_row")
 """Rows of the buffer in `FootState`."""
 KernelOutput = tuple[
@@ -194,9 +192,9 @@ def _make_estimates(output: KernelOutput, unmeasured: list[int]) -> Estimates:
     # Afterwards: masking of the centre of pressure needs the row's position.
     for row in unmeasured:  # mostly none; an index of an empty list takes 5 us
         by_frame[row] = math.nan
-    # Both are in the order of the fields; the last of a frame, `COP_Z`, is none of them.
-    columns = (seq, t_ns, *by_tile, *by_frame[: grf_cop.COP_Z], contact, status)
-    return Estimates(**dict(zip(_FIELDS, columns, strict=True)))
+    # In the order of the fields; the last row of a frame, `COP_Z`, is none of them.
+    columns: list[Any] = [seq, t_ns, *by_tile, *by_frame[: grf_cop.COP_Z], contact, status]
+    return Estimates(*columns)
 
 
 @jit_cached

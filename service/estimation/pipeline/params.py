@@ -1,8 +1,8 @@
 """Parameters of an estimate as records for compiled code: of the models, the foot and the tiles.
 
-`ModelRegistry` lists the models in the order of their use. Sample stage, reading by reading: unwrap,
-temperature, ambient, gas, static, skew. Smoothing stage, within the look-ahead: denoise, hysteresis,
-rubber. Fields `has_` and `is_` are 0 or 1.
+`ModelRegistry` lists the models in the order of their use. Those up to `skew` belong to the sample
+stage, reading by reading; the others to the smoothing stage, within the look-ahead. Fields `has_`
+and `is_` are 0 or 1.
 """
 
 from __future__ import annotations
