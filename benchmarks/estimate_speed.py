@@ -22,7 +22,7 @@ from static_kernel import StaticKernel
 
 from devices.frames import FrameBatch
 from service.estimation.calibration import make_paper_shape_preset
-from service.estimation.estimate import Estimator
+from service.estimation.estimate import ModelEstimator
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -76,7 +76,7 @@ def frames_of(n: int, count: int = 4) -> FrameBatch:
 
 def estimate(plan: EstimationPlan, frames: FrameBatch, batch: int) -> None:
     """All frames in batches."""
-    estimator = Estimator(plan)
+    estimator = ModelEstimator(plan)
     for begin in range(0, len(frames), batch):
         estimator.process_frames(frames.slice_rows(begin, min(begin + batch, len(frames))))
     estimator.finish()
@@ -101,7 +101,7 @@ def by_hand(kernel: StaticKernel, frames: FrameBatch, batch: int) -> None:
 def check_same(plan: EstimationPlan, frames: FrameBatch) -> None:
     """The kernel does the same job, or a comparison of times means nothing."""
     theirs = StaticKernel(plan, len(frames))(frames)
-    estimator = Estimator(plan)
+    estimator = ModelEstimator(plan)
     first, last = estimator.process_frames(frames), estimator.finish()
     assert last is not None
     for name, values in theirs.items():

@@ -27,7 +27,7 @@ from devices.frames import ArrayInfo, FrameBatch
 from service.cli.main import main as foottile
 from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
-from service.estimation.estimate import Estimator
+from service.estimation.estimate import ModelEstimator
 from service.estimation.pipeline.plan import make_plan
 from service.estimation.tare.automatic import HISTORY_NS, compute_newest_unloaded_tare
 from service.estimation.tare.tare import Tare
@@ -105,7 +105,7 @@ def record_walk(scene: str, folder: Path, seconds: float) -> Walk:
 def _estimate_grf(walk: Walk, tare: Tare, first: int, end: int) -> tuple[Floats, Floats]:
     """Return GRF and its sigma of the frames `first` to `end`."""
     plan = make_plan(walk.info, walk.calibration, tare, models=walk.models, lag_ms=LIVE_LAG_MS)
-    estimator = Estimator(plan)
+    estimator = ModelEstimator(plan)
     pieces = [estimator.process_frames(walk.frames.slice_rows(first, end)), estimator.finish()]
     due = [piece for piece in pieces if piece is not None]
     return (

@@ -37,7 +37,7 @@ from devices.flags import EstimateFlag, FrameFlag
 from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, ArrayInfo, FrameBatch, allocate_columns
 from devices.scene.scene_file import Scene, load_scene
 from service.estimation.calibration import Calibration
-from service.estimation.estimate import Estimator
+from service.estimation.estimate import ModelEstimator
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from service.estimation.records import Estimates
 from service.estimation.tare.unloaded_windows import compute_recording_tare
@@ -93,7 +93,7 @@ def record(scene: Scene, foot: EmulatedFoot, seconds: float | None) -> Recorded:
 
 def estimated(plan: EstimationPlan, frames: FrameBatch) -> Estimates:
     """All estimates of a recording."""
-    estimator, pieces = Estimator(plan), []
+    estimator, pieces = ModelEstimator(plan), []
     for begin in range(0, len(frames), CHUNK):
         pieces.append(
             estimator.process_frames(frames.slice_rows(begin, min(begin + CHUNK, len(frames))))
@@ -325,11 +325,11 @@ def count_alarms(
 ) -> None:
     """Add hours, onsets and evidence of these frames to each share that is lost."""
     rngs = [np.random.default_rng(seed) for _ in shares]
-    estimators: list[list[Estimator]] = []
+    estimators: list[list[ModelEstimator]] = []
     for batch in frames:
         if not estimators:
             first = replace(recorded, frames=batch)
-            estimators = [[Estimator(plan_of(first, m)) for m in ladders] for _ in shares]
+            estimators = [[ModelEstimator(plan_of(first, m)) for m in ladders] for _ in shares]
         for share, rng, alarms, of_share in zip(shares, rngs, found, estimators, strict=True):
             alarms.hours += len(batch) / recorded.info.nominal_rate_hz / 3600.0
             taken = without(batch, share, rng)

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from devices.frames import FrameBatch
-from service.estimation.estimate import Estimator
+from service.estimation.estimate import ModelEstimator
 from service.estimation.pipeline.plan import EstimationPlan
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -61,7 +61,7 @@ def frames_of(n: int, tiles: int) -> FrameBatch:
 
 def cpu_s(plan: EstimationPlan, frames: FrameBatch, batch: int) -> float:
     """CPU time of all frames, in steps of so many."""
-    estimator, edges = Estimator(plan), range(0, len(frames), batch)
+    estimator, edges = ModelEstimator(plan), range(0, len(frames), batch)
     batches = [frames.slice_rows(begin, min(begin + batch, len(frames))) for begin in edges]
     began_s = time.process_time()
     for each in batches:

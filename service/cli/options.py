@@ -52,6 +52,12 @@ UnquantizedOption = Annotated[
     bool,
     typer.Option("--no-quantize", help="Keep estimates as computed: do not round off their noise."),
 ]
+EstimatorOption = Annotated[
+    str,
+    typer.Option(
+        help="models; or low-pass: for comparison, the static curve and a low-pass of 5 ms."
+    ),
+]
 CaOption = Annotated[
     Path | None,
     typer.Option(

@@ -31,7 +31,7 @@ from service.estimation.effects import (
     RubberEffect,
     TemperatureEffect,
 )
-from service.estimation.estimate import Estimator
+from service.estimation.estimate import ModelEstimator
 from service.estimation.models.hysteresis import WIDTHS_N
 from service.estimation.pipeline.params import MODEL_NAMES
 from service.estimation.pipeline.plan import make_plan
@@ -91,7 +91,7 @@ def compile_models() -> None:
     # Fault detection tracks thermal drift only without the model `temperature`.
     for models in (MODEL_NAMES, ("static",)):
         plan = make_plan(info, _calibration(), tare, models=models, lag_ms=4.0)
-        estimator = Estimator(plan)
+        estimator = ModelEstimator(plan)
         estimator.process_frames(_frames())
         estimator.finish()
 

@@ -9,7 +9,7 @@ records.
 from __future__ import annotations
 
 import math
-from typing import Any, Self, cast
+from typing import Any, ClassVar, Protocol, Self, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -78,12 +78,47 @@ KernelOutput = tuple[
 ]
 
 
-class Estimator:
+class Estimator(Protocol):
     """Estimator of consecutive frames of one stream, with one tare.
+
+    Every frame has exactly one estimate, in order. Any batches give the same bits, also if a state
+    is taken between them. A frame without a reading of a tile has NaN and a flag, never a number.
+    """
+
+    name: ClassVar[str]
+    """Name in options and in the notes of a file."""
+
+    def __init__(self, plan: EstimationPlan) -> None: ...
+
+    def process_frames(self, frames: FrameBatch) -> Estimates:
+        """Add the next frames, with rising `seq` and `t_mono_ns`; return the estimates now due."""
+        ...
+
+    def finish(self) -> Estimates | None:
+        """Return the estimates that still wait for their look-ahead; None if there are none."""
+
+    def state_dict(self) -> Columns:
+        """Return a copy of the state for `from_state`."""
+        ...
+
+    @classmethod
+    def from_state(cls, plan: EstimationPlan, state: Columns) -> Self:
+        """Make an estimator that continues from a state, with the bits of an uninterrupted one.
+
+        Raises:
+            ValueError: the state is of another plan.
+        """
+        ...
+
+
+class ModelEstimator:
+    """Estimator by the models of a plan, with their look-ahead.
 
     Args:
         plan: parameters of the estimate.
     """
+
+    name: ClassVar = "models"
 
     def __init__(self, plan: EstimationPlan) -> None:
         self.plan = plan

@@ -15,7 +15,7 @@ from devices.arrays import Bools
 from devices.errors import FootTileError
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
-from service.estimation.estimate import Estimator
+from service.estimation.estimate import ModelEstimator
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from service.estimation.tare.tare import Tare
 
@@ -47,7 +47,7 @@ class OmittedModelEffect:
         self._named = tuple(name for name in models if name != "denoise")
         self._tare: Tare | None = None
         self._offered: tuple[str, ...] | None = None
-        self._estimators: dict[str, Estimator] = {}
+        self._estimators: dict[str, ModelEstimator] = {}
         self._sums: dict[str, int] = {}
         self._frames = 0
         self._last_t_mono_ns = 0
@@ -63,7 +63,7 @@ class OmittedModelEffect:
         if tare is not self._tare:
             self._start_tare(tare)
         if int(frames.t_mono_ns[0]) < self._last_t_mono_ns:  # the node was switched on again
-            self._estimators = {n: Estimator(e.plan) for n, e in self._estimators.items()}
+            self._estimators = {n: ModelEstimator(e.plan) for n, e in self._estimators.items()}
         self._last_t_mono_ns = int(frames.t_mono_ns[-1])
         grf_n = {name: each.process_frames(frames).grf_n for name, each in self._estimators.items()}
         if not grf_n:
@@ -100,7 +100,7 @@ class OmittedModelEffect:
         plans = {_ALL_MODELS: self._make_plan(every, tare)}
         for name in self._offered:
             plans[name] = self._make_plan([other for other in every if other != name], tare)
-        self._estimators = {name: Estimator(plan) for name, plan in plans.items()}
+        self._estimators = {name: ModelEstimator(plan) for name, plan in plans.items()}
 
     def _is_offered(self, name: str, tare: Tare) -> bool:
         try:

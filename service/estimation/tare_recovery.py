@@ -14,7 +14,7 @@ import numpy as np
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
-from service.estimation.estimate import Estimator
+from service.estimation.estimate import ModelEstimator
 from service.estimation.pipeline.plan import make_plan
 from service.estimation.tare.automatic import HISTORY_NS
 from service.estimation.tare.tare import Tare
@@ -54,7 +54,7 @@ def remove_recovery(
         return tare
     end = int(np.searchsorted(frames.t_ns, tare.t_ns, side="right"))
     plan = make_plan(info, calibration, tare, models=models, lag_ms=LIVE_LAG_MS)
-    estimator = Estimator(plan)
+    estimator = ModelEstimator(plan)
     due = estimator.process_frames(frames.slice_rows(first, end))
     last = estimator.finish()
     force_n = due.force_n if last is None else np.concatenate([due.force_n, last.force_n])

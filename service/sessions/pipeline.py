@@ -22,7 +22,7 @@ from devices.errors import TareError, UsageError
 from devices.flags import FrameFlag
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
-from service.estimation.estimate import Estimator
+from service.estimation.estimate import Estimator, ModelEstimator
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from service.estimation.quantization import Quantization
 from service.estimation.records import Estimates
@@ -51,14 +51,16 @@ class EstimateOptions:
     """Tares of the time of recording, oldest first; they win over a tare found in the frames."""
     unquantized: bool = False
     """True: nothing is rounded."""
+    estimator: type[Estimator] = ModelEstimator
 
 
 class EstimateRun:
     """Estimates of consecutive frames with one tare, returned together with the frames."""
 
-    def __init__(self, plan: EstimationPlan) -> None:
+    def __init__(self, plan: EstimationPlan, estimator: type[Estimator] = ModelEstimator) -> None:
         self.plan = plan
-        self._estimator = Estimator(plan)
+        self._make_estimator = estimator
+        self._estimator = estimator(plan)
         self._waiting: deque[tuple[FrameBatch, Extra]] = deque()
 
     def state_dict(self) -> Columns:
@@ -74,10 +76,12 @@ class EstimateRun:
         return {f"run/{name}": c for name, c in self._estimator.state_dict().items()} | waiting
 
     @classmethod
-    def from_state(cls, plan: EstimationPlan, state: Columns) -> Self:
+    def from_state(
+        cls, plan: EstimationPlan, state: Columns, estimator: type[Estimator] = ModelEstimator
+    ) -> Self:
         """Create a run from the state of another one, as `Estimator.from_state`."""
-        new = cls(plan)
-        new._estimator = Estimator.from_state(plan, _strip_prefix("run/", state))
+        new = cls(plan, estimator)
+        new._estimator = estimator.from_state(plan, _strip_prefix("run/", state))
         if waiting := _strip_prefix("held/", state):
             new._waiting.append((FrameBatch(**waiting), _strip_prefix("with/", state)))
         return new
@@ -101,7 +105,7 @@ class EstimateRun:
     def flush(self) -> Iterator[tuple[FrameBatch, Columns]]:
         """Yield the frames that still wait for their look-ahead: no more frames will come."""
         last = self._estimator.finish()
-        self._estimator = Estimator(self.plan)
+        self._estimator = self._make_estimator(self.plan)
         if last is not None:
             yield from _pair_with_frames(self._waiting, last)
 
@@ -172,7 +176,9 @@ class EstimateStream:
         self._start_run(self._options.tares[0] if self._options.tares else first)
         tares = (first, *self._options.tares[1:])
         self.tare = tares[self._tare_changes]
-        self._run = EstimateRun.from_state(self.make_plan(self.tare), state)
+        self._run = EstimateRun.from_state(
+            self.make_plan(self.tare), state, self._options.estimator
+        )
 
     def find_tare_in_first_frames(self, batches: Iterable[tuple[FrameBatch, Extra]]) -> Tare:
         """Find the tare that `estimate_batches` would use; read no more than needed.
@@ -208,7 +214,7 @@ class EstimateStream:
                     rest = rest.slice_rows(count, len(rest))
                     rest_of = {name: v[count:] for name, v in rest_of.items()}
                 yield from run.flush()
-                self._run = run = EstimateRun(self.make_plan(tare))
+                self._run = run = EstimateRun(self.make_plan(tare), self._options.estimator)
                 self.tare = tare
                 self._tare_changes += 1
             if len(rest):
@@ -221,7 +227,7 @@ class EstimateStream:
         if not self._options.unquantized:
             later = map(self.make_plan, self._options.tares[1:])
             self.rounding = Quantization.for_plans(chain([self.plan], later))
-        self._run, self.tare = EstimateRun(self.plan), tare
+        self._run, self.tare = EstimateRun(self.plan, self._options.estimator), tare
         return self._run
 
     def _next_tare(self) -> Tare | None:

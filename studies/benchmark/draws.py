@@ -25,7 +25,7 @@ from devices.errors import FootTileError
 from devices.frames import ArrayInfo, FrameBatch
 from devices.scene.scene_file import Scene
 from service.estimation.calibration import Calibration
-from service.estimation.estimate import Estimator
+from service.estimation.estimate import Estimator, ModelEstimator
 from service.estimation.pipeline.params import MODEL_NAMES
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from service.estimation.tare.unloaded_windows import compute_recording_tare
@@ -155,6 +155,7 @@ def time_model_sets(
     model_sets: Sequence[ComparedModelSet],
     frames_per_repetition: Mapping[str, int],
     repetitions: int,
+    estimator: type[Estimator] = ModelEstimator,
 ) -> tuple[dict[tuple[str, str], list[float]], list[MeasurementFailure]]:
     """Measure ns per frame in every repetition, by mode and label of the model set.
 
@@ -163,6 +164,7 @@ def time_model_sets(
         model_sets: model sets to time.
         frames_per_repetition: frames per repetition, by mode.
         repetitions: number of repetitions.
+        estimator: to time.
 
     Returns:
         The times, and the model sets that could not be timed.
@@ -175,7 +177,7 @@ def time_model_sets(
             try:
                 plan = make_recording_plan(recording, model_set.models, LAGS_MS[mode])
                 measure_ns_per_frame(
-                    plan, stream, _WARM_UP_STEPS * BATCH_FRAMES[mode], BATCH_FRAMES[mode]
+                    estimator(plan), stream, _WARM_UP_STEPS * BATCH_FRAMES[mode], BATCH_FRAMES[mode]
                 )
             except Exception as error:
                 failures.append(
@@ -187,7 +189,7 @@ def time_model_sets(
     for _ in range(repetitions):
         for (mode, label), plan in plans.items():
             spent_ns = measure_ns_per_frame(
-                plan, stream, frames_per_repetition[mode], BATCH_FRAMES[mode]
+                estimator(plan), stream, frames_per_repetition[mode], BATCH_FRAMES[mode]
             )
             times[mode, label].append(spent_ns)
     return times, failures
@@ -209,10 +211,9 @@ def make_recording_plan(
 
 
 def measure_ns_per_frame(
-    plan: EstimationPlan, stream: RepeatedRecording, frames: int, batch_frames: int
+    estimator: Estimator, stream: RepeatedRecording, frames: int, batch_frames: int
 ) -> float:
     """Measure the CPU time per frame in ns, over `frames` frames, `batch_frames` per step."""
-    estimator = Estimator(plan)
     spent_ns = 0
     for begin in range(0, frames, batch_frames):
         rows = stream.get_frames(begin, min(begin + batch_frames, frames))
@@ -251,6 +252,7 @@ class DrawTask:
     seconds: float | None
     draw: int
     model_sets: tuple[ComparedModelSet, ...]
+    estimator: type[Estimator] = ModelEstimator
 
 
 @dataclass(frozen=True)
@@ -344,27 +346,35 @@ def record_with_calibration(
 
 
 def compute_recording_accuracy(
-    recording: DrawRecording, models: tuple[str, ...], lag_ms: float
+    recording: DrawRecording,
+    models: tuple[str, ...],
+    lag_ms: float,
+    estimator: type[Estimator] = ModelEstimator,
 ) -> Accuracy:
     """Estimate a recording, with the tare from its lead-in, and compute the errors.
 
     Raises:
         FootTileError: the recording cannot be estimated with these models.
     """
-    return compute_accuracy(
-        compute_estimates(recording, models, lag_ms, ACCURACY_COLUMNS), lag_ms=lag_ms
-    )
+    columns = compute_estimates(recording, models, lag_ms, ACCURACY_COLUMNS, estimator)
+    return compute_accuracy(columns, lag_ms=lag_ms)
 
 
 def compute_estimates(
-    recording: DrawRecording, models: tuple[str, ...], lag_ms: float, column_names: Sequence[str]
+    recording: DrawRecording,
+    models: tuple[str, ...],
+    lag_ms: float,
+    column_names: Sequence[str],
+    estimator: type[Estimator] = ModelEstimator,
 ) -> dict[str, npt.NDArray[Any]]:
     """Estimate a recording; return columns of estimates and truth, one row per frame.
 
     Raises:
         FootTileError: the recording cannot be estimated with these models.
     """
-    options = EstimateOptions(recording.calibration, models, lag_ms, unquantized=True)
+    options = EstimateOptions(
+        recording.calibration, models, lag_ms, unquantized=True, estimator=estimator
+    )
     stream = EstimateStream(recording.info, options)
     judged: list[Mapping[str, npt.NDArray[Any]]] = []
     for frames, columns in stream.estimate_batches([(recording.frames, recording.truth)]):
@@ -387,7 +397,7 @@ def run_draw(task: DrawTask) -> DrawResult:
         for mode, lag_ms in LAGS_MS.items():
             try:
                 accuracy[mode, model_set.label] = compute_recording_accuracy(
-                    recording, model_set.models, lag_ms
+                    recording, model_set.models, lag_ms, task.estimator
                 )
             except Exception as error:
                 what = f"draw {task.draw}, {model_set.label}, {mode}"

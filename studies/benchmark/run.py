@@ -16,6 +16,7 @@ import numpy as np
 from devices.errors import FootTileError
 from devices.scene.scene_file import Scene
 from service.estimation.calibration import PRESETS
+from service.estimation.estimate import Estimator, ModelEstimator
 from service.estimation.pipeline.params import MODEL_NAMES
 from service.offline.process_pool import map_in_processes
 from service.version import SOFTWARE_VERSION
@@ -58,6 +59,7 @@ class BenchmarkOptions:
     """Standard deviation between loadings of the emulated domes; None: the scenes'."""
     correlated_ms: float | None = None
     """Correlation time of the emulated noise; None: the scenes'."""
+    estimator: type[Estimator] = ModelEstimator
 
     def apply_emulation_options(self, scene: Scene) -> Scene:
         """Return the scene with the options of its emulation replaced."""
@@ -96,6 +98,7 @@ class BenchmarkResult:
             "made": self.run_at,
             "machine": self.machine,
             "draws": options.draws,
+            "estimator": options.estimator.name,
             "emulation": {
                 "repeatability": options.repeatability,
                 "correlated_ms": options.correlated_ms,
@@ -125,9 +128,14 @@ def run_benchmark(options: BenchmarkOptions, on_progress: Callable[[str], None])
     scenes = []
     for scene in map(options.apply_emulation_options, options.scenes):
         model_set = list_model_sets(scene.models, extra_models=_list_supported_models(scene))
+        if options.estimator is not ModelEstimator:
+            model_set = list_model_sets(("static",))
         if options.full_only:
             model_set = tuple(model_set for model_set in model_set if model_set.is_full_set)
-        tasks = [DrawTask(scene, options.seconds, seed, model_set) for seed in range(options.draws)]
+        tasks = [
+            DrawTask(scene, options.seconds, seed, model_set, options.estimator)
+            for seed in range(options.draws)
+        ]
         draws: list[DrawResult] = []
         for draw in run_draws(tasks, options.process_count):
             draws.append(draw)
@@ -162,7 +170,9 @@ def _measure_scene(
     tell(f"{scene.name}: timing")
     recording = record_draw(scene, options.seconds, good[0].draw)
     frames = {"live": options.live_frames, "offline": options.offline_frames}
-    times_ns, not_timed = time_model_sets(recording, model_set, frames, options.repetitions)
+    times_ns, not_timed = time_model_sets(
+        recording, model_set, frames, options.repetitions, options.estimator
+    )
     return SceneFigures(
         scene=scene.name,
         tile_count=len(scene.tile),

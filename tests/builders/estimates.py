@@ -11,7 +11,7 @@ import numpy as np
 
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import TileCalibration
-from service.estimation.estimate import Estimator
+from service.estimation.estimate import ModelEstimator
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from service.estimation.records import Estimates
 from tests.builders.arrays import COUNT_KPA
@@ -48,7 +48,7 @@ def with_params(
 
 def estimate(plan: EstimationPlan, *batches: FrameBatch) -> Estimates:
     """All estimates of these batches, stepped through one after the other."""
-    estimator = Estimator(plan)
+    estimator = ModelEstimator(plan)
     pieces = [estimator.process_frames(batch) for batch in batches]
     last = estimator.finish()
     return joined(pieces if last is None else [*pieces, last])

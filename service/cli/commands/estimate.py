@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from devices.errors import require_extra
+from devices.errors import UsageError, require_extra
 from service.cli.multi_session import (
     EXIT_INCOMPLETE,
     JobsOption,
@@ -20,6 +20,7 @@ from service.cli.multi_session import (
 )
 from service.cli.options import (
     EndOption,
+    EstimatorOption,
     JsonOption,
     StartOption,
     UnquantizedOption,
@@ -66,6 +67,7 @@ def estimate_command(
     lag_ms: Annotated[
         float, typer.Option(help="Look-ahead of smoothing and contact.")
     ] = OFFLINE_LAG_MS,
+    estimator: EstimatorOption = "models",
     scene: Annotated[
         str | None,
         typer.Option(help="Scene for models, calibration and tile positions."),
@@ -95,6 +97,7 @@ def estimate_command(
     """
     from devices.scene.scene_file import load_scene
     from service.cli.report import make_findings_json, print_findings
+    from service.estimation.estimate import ModelEstimator
     from service.estimation.model_sensitivity import REASONS_BY_MODEL
     from service.offline.archive.locations import is_remote
     from service.offline.archive.tasks import EstimateTask
@@ -104,7 +107,12 @@ def estimate_command(
         read_stored_estimates,
     )
     from storage.formats.slice import Slice
+    from studies.estimators import get_estimator
 
+    used = get_estimator(estimator)
+    if used is not ModelEstimator and models is not None:
+        raise UsageError(f"--estimator {estimator} and --models", expected="one or the other")
+    models = models if used is ModelEstimator else "static"
     task = EstimateTask(
         calibration=calibration,
         models=None if models is None else tuple(models.split(",")),
@@ -113,6 +121,7 @@ def estimate_command(
         tare_s=parse_pair(tare_s, "--tare-s"),
         part=Slice(start_s, end_s),
         unquantized=unquantized,
+        estimator=used,
     )
     if not is_single_session(sessions, manifest) or is_remote(out):
         task = replace(task, calibration=_embed_calibration(calibration))

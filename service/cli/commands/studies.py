@@ -14,6 +14,7 @@ from devices.scene.emulation_sections import PartFamily
 from devices.scene.scene_file import load_scene
 from service.cli.options import (
     SEED_MAX,
+    EstimatorOption,
     JsonOption,
     check_emulated,
     echo,
@@ -159,6 +160,7 @@ def benchmark_command(
         int | None,
         typer.Option(min=1, max=JOBS_MAX, help="Parallel draws; default: one per core."),
     ] = None,
+    estimator: EstimatorOption = "models",
     full_only: Annotated[
         bool,
         typer.Option("--full-only", help="Full model sets of the scenes only, for many draws."),
@@ -214,6 +216,7 @@ def benchmark_command(
             "--frames": frames,
             "--correlated-ms": correlated_ms,
             "--full-only": full_only or None,
+            "--estimator": None if estimator == "models" else estimator,
         },
     ):
         with open_result_folder(out) as folder:
@@ -232,6 +235,7 @@ def benchmark_command(
     from studies.benchmark.plot import plot_benchmark
     from studies.benchmark.report import format_benchmark_report
     from studies.benchmark.run import BenchmarkOptions, run_benchmark
+    from studies.estimators import get_estimator
 
     scenes = tuple(load_scene(name) for name in scene or SCENES)
     names = [the_scene.name for the_scene in scenes]
@@ -253,6 +257,7 @@ def benchmark_command(
         full_only=full_only,
         repeatability=repeatability,
         correlated_ms=correlated_ms,
+        estimator=get_estimator(estimator),
     )
     with open_result_folder(out) as folder:
         with show_progress("starting") as report_step:

@@ -117,6 +117,7 @@ class EstimateTask(EstimateRequest):
         named = self.calibration
         return {
             **{name: value for name, value in vars(self).items() if name != "piece_frames"},
+            "estimator": self.estimator.name,
             "calibration": named.id if isinstance(named, Calibration) else named,
             "scene": None if self.scene is None else self.scene.model_dump(mode="json"),
             "part": vars(self.part),

@@ -19,6 +19,7 @@ from devices.frames import ArrayInfo, FrameBatch
 from devices.scene.emulation_sections import PartFamily
 from devices.scene.scene_file import Scene
 from service.estimation.calibration import Calibration
+from service.estimation.estimate import Estimator, ModelEstimator
 from service.estimation.pipeline.plan import EstimationPlan, compute_settling_time_s
 from service.estimation.tare.tare import Tare
 from service.offline.calibration_lookup import EMULATED_RIG, find_calibration
@@ -45,6 +46,7 @@ class EstimateRequest:
         tare_s: unloaded interval, in seconds from the first frame of the session.
         part: time range to estimate; only the needed part of the file is read.
         unquantized: True to store unquantized values.
+        estimator: of the frames.
     """
 
     calibration: str | Calibration | None
@@ -54,6 +56,7 @@ class EstimateRequest:
     tare_s: tuple[float, float] | None
     part: Slice = _ALL
     unquantized: bool = False
+    estimator: type[Estimator] = ModelEstimator
 
 
 BatchWithColumns = tuple[FrameBatch, Extra]
@@ -180,6 +183,7 @@ def prepare_estimate(
         tare_s=request.tare_s,
         tares=_read_tares(session) if request.tare_s is None else (),
         unquantized=request.unquantized,
+        estimator=request.estimator,
     )
     kept = tuple(
         c.name

@@ -20,6 +20,7 @@ import numpy as np
 
 from devices.errors import DamagedFileError, FileFormatError, UsageError
 from devices.frames import ArrayInfo
+from service.estimation.estimate import ModelEstimator
 from service.estimation.model_sensitivity import OmittedModelEffect
 from service.estimation.pipeline.plan import EstimationPlan
 from service.estimation.records import Columns
@@ -49,6 +50,8 @@ from storage.sessions.writer import SealedFileWriter
 
 _WHOLE_SESSION_NOTES = frozenset({"session", "ledger"})
 """Notes of a session that do not hold for a part of it."""
+_ESTIMATOR_NOTE = "estimator"
+"""Note of the estimator, if it is not that of the models."""
 
 
 @dataclass(frozen=True)
@@ -164,10 +167,13 @@ def _write_estimates(
     if first is None:
         return 0
     assert stream.plan is not None  # noqa: S101  # it exists before the first output
+    options = prepared_estimate.options
     notes = {
-        **notes,
-        **make_estimate_metadata(stream.plan, stream.rounding, prepared_estimate.options.tares),
+        **{name: note for name, note in notes.items() if name != _ESTIMATOR_NOTE},
+        **make_estimate_metadata(stream.plan, stream.rounding, options.tares),
     }
+    if options.estimator is not ModelEstimator:
+        notes[_ESTIMATOR_NOTE] = options.estimator.name
     stances, frames = StancesWriter(), 0
     with SealedFileWriter(out, prepared_estimate.info, notes) as writer:
         for batch, extra in chain((first,), left):

@@ -11,7 +11,7 @@ import pytest
 
 import service.estimation
 from service.estimation import compilation
-from service.estimation.estimate import Estimator
+from service.estimation.estimate import ModelEstimator
 from service.estimation.pipeline.params import MODEL_NAMES
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from storage.schema import wire_schema
@@ -52,7 +52,7 @@ def test_nothing_is_compiled_after_the_warm_up(
         3, baseline_kpa=97.0, baseline_sigma_kpa=0.01, noise_kpa=0.1, temperature_raw_counts=507.0
     )
     plan = make_plan(info, calibration, tare, models=models, lag_ms=10.0)
-    estimator = Estimator(plan)
+    estimator = ModelEstimator(plan)
     first = compilation._frames()
     for number in range(6):  # as from the wire: read-only views of the message
         later = with_columns(

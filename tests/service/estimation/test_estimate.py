@@ -1,4 +1,4 @@
-"""`Estimator`: batches, states, contact, pressures, and valid uncertainty.
+"""`ModelEstimator`: batches, states, contact, pressures, and valid uncertainty.
 
 Tiles read one newton a count (see tests/builders), so forces below are their loads.
 """
@@ -19,7 +19,7 @@ from devices.chips.mpl115a2 import PRESSURE_MIN_KPA, Coefficients, compensate_kp
 from devices.flags import EstimateFlag
 from devices.frames import NOT_READ, FrameBatch
 from devices.temperature_hold import hold_temperature
-from service.estimation.estimate import Estimator
+from service.estimation.estimate import ModelEstimator
 from service.estimation.pipeline.params import MODEL_NAMES
 from service.estimation.pipeline.plan import make_plan
 from service.estimation.tare.unloaded_windows import compute_recording_tare
@@ -75,9 +75,9 @@ def test_an_estimator_continues_from_a_state_with_the_same_bits(
     known = [newton_tile(serial, effects=make_effects()) for serial in info.serials]
     plan = newton_plan(info, models=models, lag_ms=lag_ms, tiles=known)
     frames = draw_wild_frames(3000, 4, seed)
-    estimator, found = Estimator(plan), []
+    estimator, found = ModelEstimator(plan), []
     for begin, end in pairwise([0, *sorted(cuts), 3000]):
-        estimator = Estimator.from_state(plan, estimator.state_dict())
+        estimator = ModelEstimator.from_state(plan, estimator.state_dict())
         found.append(estimator.process_frames(frames.slice_rows(begin, end)))
     last = estimator.finish()
     assert_same_bits(joined(found if last is None else [*found, last]), estimate(plan, frames))
@@ -85,17 +85,17 @@ def test_an_estimator_continues_from_a_state_with_the_same_bits(
 
 def test_a_state_of_another_plan_is_refused() -> None:
     plan, wider = newton_plan(array_at(SQUARE)), newton_plan(array_at((*SQUARE, (0.3, 0.0, 0.0))))
-    estimator = Estimator(plan)
+    estimator = ModelEstimator(plan)
     estimator.process_frames(draw_wild_frames(50, 4, 1))
     state = estimator.state_dict()
     with pytest.raises(ValueError, match="tile_states is uint8"):
-        Estimator.from_state(wider, state)
+        ModelEstimator.from_state(wider, state)
     with pytest.raises(ValueError, match="rows is uint8"):
-        Estimator.from_state(plan, state | {"rows": state["rows"][:-1]})
+        ModelEstimator.from_state(plan, state | {"rows": state["rows"][:-1]})
     foot_state = np.zeros_like(state["foot_state"])
     foot_state[:] = 0xFF
     with pytest.raises(ValueError, match="its rows are -1"):
-        Estimator.from_state(plan, state | {"foot_state": foot_state})
+        ModelEstimator.from_state(plan, state | {"foot_state": foot_state})
 
 
 # --- steps and states -----------------------------------------------------------------------------
@@ -103,7 +103,7 @@ def test_a_state_of_another_plan_is_refused() -> None:
 
 def test_estimates_come_when_their_look_ahead_is_complete() -> None:
     plan, frames = newton_plan(array_at(SQUARE), lag_ms=10), loaded_frames(repeat_load([0] * 4, 9))
-    estimator = Estimator(plan)
+    estimator = ModelEstimator(plan)
     due = [estimator.process_frames(frames.slice_rows(i, i + 1)).seq.tolist() for i in range(9)]
     assert due == [[], [], [], [], [], [0], [1], [2], [3]]  # frame 0 at 0 ms, due at 10 ms
     last = estimator.finish()
@@ -113,16 +113,16 @@ def test_estimates_come_when_their_look_ahead_is_complete() -> None:
 
 def test_estimates_without_look_ahead_come_at_once() -> None:
     plan = newton_plan(array_at(SQUARE))
-    estimator = Estimator(plan)
+    estimator = ModelEstimator(plan)
     assert len(estimator.process_frames(loaded_frames(repeat_load([0] * 4, 3)))) == 3
     assert estimator.finish() is None
-    assert Estimator(plan).finish() is None
+    assert ModelEstimator(plan).finish() is None
 
 
 def test_a_step_changes_neither_its_frames_nor_earlier_estimates() -> None:
     plan = newton_plan(array_at(SQUARE, servo=make_servo()), lag_ms=10)
     frames = draw_wild_frames(60, 4, 3)
-    before, estimator = copy.deepcopy(frames), Estimator(plan)
+    before, estimator = copy.deepcopy(frames), ModelEstimator(plan)
     first = estimator.process_frames(frames.slice_rows(0, 30))
     given = copy.deepcopy(first)
     estimator.process_frames(frames.slice_rows(30, 60))

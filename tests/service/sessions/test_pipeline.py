@@ -16,7 +16,7 @@ from devices.errors import CalibrationError, TareError, UsageError
 from devices.flags import TileFlag
 from devices.frames import FrameBatch
 from service.estimation.calibration import Calibration
-from service.estimation.estimate import Estimator
+from service.estimation.estimate import ModelEstimator
 from service.estimation.pipeline.plan import make_plan
 from service.estimation.records import Estimates
 from service.estimation.tare.tare import Tare
@@ -220,7 +220,7 @@ def test_the_notes_are_enough_to_make_the_same_estimates_again() -> None:
         models=notes["models"],
         lag_ms=notes["lag_ms"],
     )
-    estimator = Estimator(plan)
+    estimator = ModelEstimator(plan)
     first, last = estimator.process_frames(batch), estimator.finish()
     assert last is not None
     again = {

@@ -7,7 +7,7 @@ import pytest
 
 from devices.flags import EstimateFlag
 from devices.scene.scene_file import load_scene
-from service.estimation.estimate import Estimator
+from service.estimation.estimate import ModelEstimator
 from studies.benchmark.draws import (
     ComparedModelSet,
     DrawRecording,
@@ -37,7 +37,7 @@ def test_an_endless_recording_rises_without_a_gap(recording: DrawRecording) -> N
     pieces = [stream.get_frames(begin, begin + 7) for begin in range(n - 10, n + 11, 7)]
     assert (np.concatenate([p.t_ns for p in pieces]) == rows.t_ns[n - 10 : n + 11]).all()
     plan = make_recording_plan(recording, ("unwrap", "static"), 0.0)
-    estimates = Estimator(plan).process_frames(rows)
+    estimates = ModelEstimator(plan).process_frames(rows)
     assert not (estimates.estimate_flags & EstimateFlag.GAP).any()
 
 

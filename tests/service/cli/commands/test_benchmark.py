@@ -67,6 +67,18 @@ def test_goals_that_are_not_met_are_named_and_code_3_if_asked_for(run: Run, scen
     assert "| NO |" in outcome.out
 
 
+def test_another_estimator_is_measured_with_the_static_curve_alone(
+    run: Run, scene: Path, tmp_path: Path
+) -> None:
+    options = ("--estimator", "low-pass", "--out", "o")
+    run("benchmark", "--scene", scene, "--draws", 1, *QUICK, *options).succeeds()
+    content = json.loads((tmp_path / "o" / "benchmark.json").read_text())
+    (rolling,) = content["scenes"]
+    assert (content["estimator"], rolling["failures"]) == ("low-pass", [])
+    assert [each["models"] for each in rolling["model_sets"]] == [["static"]]
+    run("benchmark", "--estimator", "kalman", "--out", "o").fails(2, "--estimator kalman")
+
+
 def test_a_draw_that_fails_is_reported_and_the_others_count(
     run: Run, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

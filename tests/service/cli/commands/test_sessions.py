@@ -145,6 +145,24 @@ def test_estimating_again_gives_the_bits_of_the_simulation(run: Run, simulate: S
         assert before[name].equals(after[name]), name
 
 
+def test_another_estimator_is_noted_in_its_file_until_the_models_estimate_again(run: Run) -> None:
+    preset = 'calibration = "paper-eq2-shape"\n' + static_only(scene_text("standing"))
+    Path("paper.toml").write_text(preset)
+    run("simulate", "--scene", "paper.toml", "--seconds", 3, "--out", "s.parquet").succeeds()
+    low_pass = ("--estimator", "low-pass", "--out", "low.parquet")
+    assert run("estimate", "s.parquet", *low_pass, "--json").printed()["models"] == ["static"]
+    run("estimate", "low.parquet", "--out", "again.parquet").succeeds()
+    notes = {}
+    for name in ("s", "low", "again"):
+        with SealedFileReader(Path(f"{name}.parquet")) as session:
+            notes[name] = session.notes.get("estimator")
+    assert notes == {"s": None, "low": "low-pass", "again": None}
+    before, low, again = (pq.read_table(f"{name}.parquet")["grf_n"] for name in notes)
+    assert before.equals(again)
+    assert not before.equals(low)
+    run("estimate", "s.parquet", *low_pass, "--models", "static").fails(2, "one or the other")
+
+
 def test_an_assumed_scale_is_named_on_the_terminal_and_in_the_file(run: Run) -> None:
     Path("paper.toml").write_text(
         'calibration = "paper-eq2-shape"\n' + static_only(scene_text("standing"))

@@ -1,0 +1,119 @@
+"""Estimators by name: that of the models, and a plain low-pass that shows what the models gain.
+
+The low-pass has no model but the static curve, whose force it smooths tile by tile, without
+look-ahead. A missing reading is NaN, and the low-pass starts again after it.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from devices.arrays import Floats, Ints
+from devices.chips.compensation import Compensation
+from devices.errors import UsageError
+from devices.flags import EstimateFlag
+from devices.frames import FrameBatch
+from service.estimation.estimate import Estimator, ModelEstimator
+from service.estimation.foot import CONTACT_UNKNOWN
+from service.estimation.models.static import compute_forces
+from service.estimation.pipeline.plan import SIGNIFICANCE_SIGMAS, EstimationPlan
+from service.estimation.pipeline.smoothing_stage import BOUND_SIGMAS
+from service.estimation.records import Columns, Estimates
+
+TIME_CONSTANT_S = 0.005  # two or three readings: shorter than a step, longer than their noise
+
+
+class LowPassEstimator:
+    """Estimator by the static curve and a low-pass; of the plan's models only `static` is used."""
+
+    name: ClassVar = "low-pass"
+
+    def __init__(self, plan: EstimationPlan) -> None:
+        self.plan = plan
+        unknown_n = np.full(len(plan.load_bearing_columns), np.nan)  # there the low-pass starts
+        # The last frame's forces; its instant in ns, and its contact.
+        self._state: Columns = {"force_n": unknown_n, "last": np.zeros(2, np.int64)}
+
+    def process_frames(self, frames: FrameBatch) -> Estimates:
+        """Return the estimates of the next frames, all at once."""
+        plan, bearing, curves = self.plan, self.plan.bearing, self.plan.curves
+        places, gain = plan.load_bearing_columns, bearing["mount_gain"]
+        kpa = Compensation(plan.info.tiles).compute_usable_kpa(frames)
+        gauge_kpa = kpa - plan.tare.baseline_kpa
+        static = compute_forces(curves, np.ascontiguousarray(gauge_kpa[:, places]))
+        still_kpa = np.hypot(bearing["noise_kpa"], np.sqrt(bearing["baseline_variance"]))
+        sigma_n = gain * np.hypot(static.slope_n_per_kpa * still_kpa, static.fit_sigma_n)
+        force_n = self._smooth(frames.t_mono_ns.tolist(), gain * static.force_n)
+        is_saturated = gauge_kpa[:, places] > curves["range_high_kpa"]
+        bounds_n = np.where(is_saturated, force_n - BOUND_SIGMAS * sigma_n, force_n)
+        sigma_n = np.where(is_saturated | np.isnan(force_n), np.nan, sigma_n)
+        grf_n, variance, bound_n, x, y = np.zeros((5, len(frames)))
+        for j, (x_m, y_m, _) in enumerate(bearing["position_m"]):  # the same order for any batch
+            measured_n = np.where(is_saturated[:, j], np.nan, force_n[:, j])
+            grf_n, x, y = grf_n + measured_n, x + x_m * measured_n, y + y_m * measured_n
+            variance += np.nan_to_num(sigma_n[:, j]) ** 2
+            bound_n += np.nan_to_num(bounds_n[:, j])
+        grf_sigma_n = np.where(np.isnan(grf_n), np.nan, np.sqrt(variance))
+        contact = self._detect_contact(grf_n.tolist())
+        is_masked = ~((contact == 1) & (grf_n >= SIGNIFICANCE_SIGMAS * grf_sigma_n))
+        divisor_n, nothing = np.where(is_masked, np.nan, grf_n), np.full(len(frames), np.nan)
+        flags = EstimateFlag.TILE_MISSING * np.isnan(force_n).any(axis=1)
+        flags |= EstimateFlag.SATURATED * is_saturated.any(axis=1)
+        flags |= EstimateFlag.COP_MASKED * is_masked
+        flags |= EstimateFlag.ASSUMED_SCALE * plan.is_scale_assumed
+        flags |= EstimateFlag.TARE_LOST * plan.tare.is_lost
+        by_tile = np.full((2, *kpa.shape), np.nan)
+        by_tile[:, :, places] = bounds_n, sigma_n
+        bound_n = np.where(np.isnan(force_n).all(axis=1), np.nan, bound_n)
+        columns: list[Any] = [frames.seq, frames.t_ns, gauge_kpa, *by_tile, grf_n, grf_sigma_n]
+        columns += [bound_n - BOUND_SIGMAS * np.sqrt(variance), x / divisor_n, y / divisor_n]
+        return Estimates(
+            *[*columns, *[nothing] * 7, contact.astype(np.uint8), flags.astype(np.uint16)]
+        )
+
+    def finish(self) -> None:
+        """Return None: no estimate waits."""
+
+    def state_dict(self) -> Columns:
+        """Return a copy of the state for `from_state`."""
+        return {name: column.copy() for name, column in self._state.items()}
+
+    @classmethod
+    def from_state(cls, plan: EstimationPlan, state: Columns) -> Self:
+        """Make an estimator that continues from a state; ValueError if it is of another plan."""
+        new = cls(plan)
+        for name, memory in new._state.items():
+            if (state[name].dtype, state[name].shape) != (memory.dtype, memory.shape):
+                raise ValueError(f"{name} is {state[name].shape}, not {memory.shape}")
+            memory[...] = state[name]
+        return new
+
+    def _smooth(self, t_ns: list[int], force_n: Floats) -> Floats:
+        smooth_n, last = np.empty_like(force_n), self._state["force_n"]
+        for i, now_ns in enumerate(t_ns):
+            step_s = max(0.0, 1e-9 * (now_ns - int(self._state["last"][0])))
+            moved_n = last + step_s / (TIME_CONSTANT_S + step_s) * (force_n[i] - last)
+            smooth_n[i] = last[:] = np.where(np.isnan(last), force_n[i], moved_n)
+            self._state["last"][0] = now_ns
+        return smooth_n
+
+    def _detect_contact(self, grf_n: list[float]) -> Ints:
+        last, foot = self._state["last"], self.plan.params.foot
+        contact = np.empty(len(grf_n), np.int64)
+        on_n, off_n = float(foot["contact_on_n"][0]), float(foot["contact_off_n"][0])
+        for i, force_n in enumerate(grf_n):
+            last[1] = 1 if force_n >= on_n else 0 if force_n <= off_n else last[1]
+            contact[i] = CONTACT_UNKNOWN if np.isnan(force_n) else last[1]
+        return contact
+
+
+ESTIMATORS: dict[str, type[Estimator]] = {e.name: e for e in (ModelEstimator, LowPassEstimator)}
+
+
+def get_estimator(name: str) -> type[Estimator]:
+    """Return the estimator of a name; raise UsageError if there is none."""
+    if name not in ESTIMATORS:
+        raise UsageError(f"--estimator {name}", expected=" or ".join(ESTIMATORS))
+    return ESTIMATORS[name]
