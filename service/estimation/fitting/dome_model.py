@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -45,8 +45,10 @@ class DomeResponse(NamedTuple):
     force_lag_n: Floats
 
 
-@dataclass(frozen=True)
-class DomeModel:
+_NONE = np.zeros(0)
+
+
+class DomeModel(NamedTuple):
     """Parameters of one tile; the defaults are those of the static curve alone.
 
     Attributes:
@@ -73,33 +75,17 @@ class DomeModel:
     wall_per_kpa: float
     gamma: float = 1.0
     tau_s: float = 1.0
-    part: Floats = field(default_factory=lambda: np.zeros(0))
-    creep_s: Floats = field(default_factory=lambda: np.zeros(0))
-    loop: Floats = field(default_factory=lambda: np.zeros(0))
+    part: Floats = _NONE
+    creep_s: Floats = _NONE
+    loop: Floats = _NONE
     flow_part: float = 0.0
     flow_n: float = 1.0
     flow_power: float = 4.0
     late_s: float = 0.0
 
     def compute_response(self, t_s: Floats, force_n: Floats) -> DomeResponse:
-        """Compute the response to forces, as `compute_dome_response`."""
-        return compute_dome_response(
-            t_s,
-            force_n,
-            self.curve,
-            self.scale_kpa,
-            self.baseline_kpa,
-            self.gamma,
-            self.tau_s,
-            self.wall_per_kpa,
-            self.part,
-            self.creep_s,
-            self.loop,
-            WIDTHS_N[: len(self.loop)],
-            self.flow_part,
-            self.flow_n,
-            self.flow_power,
-        )
+        """Compute the response to forces that are linear between instants, (n,) each."""
+        return _compute_dome_response(self, t_s, force_n)
 
 
 def make_clamped_pchip_force(t_s: Floats, force_n: Floats) -> Callable[[Floats], Floats]:
@@ -149,48 +135,14 @@ def _solve_heated_pressure(
 
 
 @jit_cached
-def compute_dome_response(
-    t_s: Floats,
-    force_n: Floats,
-    curve: Floats,
-    scale_kpa: float,
-    baseline_kpa: float,
-    gamma: float,
-    tau_s: float,
-    wall_per_kpa: float,
-    creep_fraction: Floats,
-    creep_s: Floats,
-    play_weights: Floats,
-    play_widths_n: Floats,
-    flow_part: float,
-    flow_n: float,
-    flow_power: float,
-) -> DomeResponse:
-    """Compute a tile's response to forces that are linear between instants.
-
-    Args:
-        t_s: (n,) instants.
-        force_n: (n,) forces on the dome.
-        curve: this and the others as in `DomeModel`.
-        scale_kpa: end of the curve.
-        baseline_kpa: pressure unloaded.
-        gamma: ratio of heat capacities.
-        tau_s: the gas' time constant.
-        wall_per_kpa: compliance of the wall.
-        creep_fraction: fractions of the creep.
-        creep_s: its time constants.
-        play_weights: weights of the plays.
-        play_widths_n: their half widths.
-        flow_part: fraction of the viscous branch.
-        flow_n: force on it during a slow stroke.
-        flow_power: exponent of its flow.
-    """
+def _compute_dome_response(model: DomeModel, t_s: Floats, force_n: Floats) -> DomeResponse:
     n = len(t_s)
     out = DomeResponse(np.empty(n), np.empty(n), np.empty(n))
-    crept = np.zeros(len(creep_fraction))
-    plays = np.zeros(len(play_weights))
-    c1, c2, c3 = curve[0], curve[1], curve[2]
+    c1, c2, c3 = model.curve[0], model.curve[1], model.curve[2]
     flattest = _FLATTEST * c1
+    gamma, baseline_kpa = model.gamma, model.baseline_kpa
+    part, creep_s, loop = model.part, model.creep_s, model.loop
+    crept, plays = np.zeros(len(part)), np.zeros(len(loop))
     k = (gamma - 1.0) / gamma
     x, warm, force, time = 0.0, 1.0, 0.0, t_s[0]
     stress, through = 0.0, 0.0
@@ -198,18 +150,18 @@ def compute_dome_response(
     for i in range(n):
         dt = t_s[i] - time
         apparent = force_n[i]
-        for m in range(len(creep_fraction)):
+        for m in range(len(part)):
             decay, of_before, of_now = compute_creep_weights(dt / creep_s[m])
             crept[m] = decay * crept[m] + of_before * force + of_now * force_n[i]
-            apparent -= creep_fraction[m] * (force_n[i] - crept[m])
+            apparent -= part[m] * (force_n[i] - crept[m])
         lag = 0.0
-        for m in range(len(play_weights)):
-            plays[m] = step_play_closed_at_zero_load(apparent, play_widths_n[m], plays[m])
-            lag += play_weights[m] * (plays[m] - apparent)
+        for m in range(len(loop)):
+            plays[m] = step_play_closed_at_zero_load(apparent, WIDTHS_N[m], plays[m])
+            lag += loop[m] * (plays[m] - apparent)
         apparent += lag
-        if flow_part > 0.0:
+        if model.flow_part > 0.0:
             stress = step_branch_stress(
-                stress, flow_part, flow_n, flow_power, apparent - through, dt
+                stress, model.flow_part, model.flow_n, model.flow_power, apparent - through, dt
             )
             through = apparent
             apparent -= stress
@@ -221,11 +173,11 @@ def compute_dome_response(
             x += step
             if abs(step) < _CLOSE:
                 break
-        static = baseline_kpa + x * scale_kpa
+        static = baseline_kpa + x * model.scale_kpa
         p = static * warm
         if gamma > 1.0:
             p, warm = _solve_heated_pressure(
-                static, baseline_kpa, ln_p, warm, dt / (gamma * tau_s), k, wall_per_kpa
+                static, baseline_kpa, ln_p, warm, dt / (gamma * model.tau_s), k, model.wall_per_kpa
             )
         out.kpa[i], out.isothermal_kpa[i], out.force_lag_n[i] = p, static, force_n[i] - apparent
         ln_p, force, time = math.log(p), force_n[i], t_s[i]

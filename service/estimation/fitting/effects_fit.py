@@ -193,16 +193,16 @@ def _make_dome_model(effects: Effects, tile: TileCalibration, baseline_kpa: floa
         curve, tile.range_kpa[1], baseline_kpa, effects.wall_compliance_or_default_per_kpa
     )
     if gas is not None:
-        model = replace(model, gamma=gas.gamma.value, tau_s=gas.tau_s.value)
+        model = model._replace(gamma=gas.gamma.value, tau_s=gas.tau_s.value)
     if rubber is not None:
-        model = replace(
-            model, part=parameter_values(rubber.part), creep_s=parameter_values(rubber.tau_s)
+        model = model._replace(
+            part=parameter_values(rubber.part), creep_s=parameter_values(rubber.tau_s)
         )
     if loop is not None:
-        model = replace(model, loop=parameter_values(loop.part))
+        model = model._replace(loop=parameter_values(loop.part))
         if (flow := loop.flow) is not None:
             part, flow_n, power = parameter_values((flow.part, flow.stress_n, flow.power)).tolist()
-            model = replace(model, flow_part=part, flow_n=flow_n, flow_power=power)
+            model = model._replace(flow_part=part, flow_n=flow_n, flow_power=power)
     return model
 
 

@@ -7,7 +7,7 @@ are found in closed form; their scatter is a result.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -243,19 +243,19 @@ class OutputErrorProblem:
         return CorrectionMisfits(gas=float(gas), rubber=float(rubber), curve_n=curve_n)
 
     def _make_model(self, x: Floats, at: dict[str, slice]) -> DomeModel:
-        model = replace(self._static, curve=x[at["curve"]])
+        model = self._static._replace(curve=x[at["curve"]])
         if "late_s" in at:
-            model = replace(model, late_s=float(x[at["late_s"]][0]))
+            model = model._replace(late_s=float(x[at["late_s"]][0]))
         if "gamma" in at:
             gamma, tau_s = float(x[at["gamma"]][0]), float(np.exp(x[at["ln_tau"]][0]))
-            model = replace(model, gamma=gamma, tau_s=tau_s)
+            model = model._replace(gamma=gamma, tau_s=tau_s)
         if "part" in at:
-            model = replace(model, part=x[at["part"]], creep_s=np.exp(x[at["ln_creep"]]))
+            model = model._replace(part=x[at["part"]], creep_s=np.exp(x[at["ln_creep"]]))
         if "flow_part" in at:
             part, flow_n = float(x[at["flow_part"]][0]), float(np.exp(x[at["ln_flow_n"]][0]))
             power = float(x[at["flow_power"]][0])
-            model = replace(model, flow_part=part, flow_n=flow_n, flow_power=power)
-        return replace(model, loop=x[at["loop"]]) if "loop" in at else model
+            model = model._replace(flow_part=part, flow_n=flow_n, flow_power=power)
+        return model._replace(loop=x[at["loop"]]) if "loop" in at else model
 
     def _fit_gains(self, model: DomeModel, scatter: float) -> tuple[Floats, DomeResponse]:
         """Compute the gain of each loading, with a prior of one, and the tile's response."""

@@ -6,7 +6,6 @@ They are made by the estimator's own forward model, unless another dome is given
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -49,7 +48,7 @@ def make_dome(**changes: Any) -> Press:
     """Make a dome with the parameters above, or others; return its pressures under a force."""
     part, creep_s, loop = (np.array(values) for values in (PART, CREEP_S, LOOP))
     model = DomeModel(CURVE, SCALE_KPA, BASE_KPA, WALL_PER_KPA, GAMMA, TAU_S, part, creep_s, loop)
-    changed = replace(model, **changes)
+    changed = model._replace(**changes)
     return lambda t_s, force_n: np.asarray(changed.compute_response(t_s, force_n).kpa)
 
 

@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.estimation.fitting.dome_model import DomeResponse, compute_dome_response
+from service.estimation.fitting.dome_model import DomeModel, DomeResponse
 from service.estimation.models import flow, gas, hysteresis, rubber
-from service.estimation.models.hysteresis import WIDTHS_N
 from tests.builders.readings import make_rubber, through
 
 CURVE = np.array([22.0, 5.0, 5.0])
@@ -28,21 +27,9 @@ def respond(
     loop: tuple[float, ...] = (),
     flow: tuple[float, float, float] = (0.0, 1.0, 4.0),
 ) -> DomeResponse:
-    return compute_dome_response(
-        t_ns * 1e-9,
-        force_n,
-        CURVE,
-        SCALE_KPA,
-        BASE_KPA,
-        gamma,
-        0.011,
-        WALL,
-        np.array(part),
-        np.array(CREEP_S[: len(part)]),
-        np.array(loop),
-        WIDTHS_N[: len(loop)].copy(),
-        *flow,
-    )
+    creep = np.array(part), np.array(CREEP_S[: len(part)])
+    model = DomeModel(CURVE, SCALE_KPA, BASE_KPA, WALL, gamma, 0.011, *creep, np.array(loop), *flow)
+    return model.compute_response(t_ns * 1e-9, force_n)
 
 
 def compute_apparent_n(kpa: np.ndarray) -> np.ndarray:
@@ -123,9 +110,9 @@ def test_a_dome_without_effects_inverts_its_curve() -> None:
 
 
 def test_a_trial_curve_that_falls_has_finite_pressures() -> None:
-    out = compute_dome_response(
-        np.linspace(0, 0.098, 50), np.linspace(0, 60, 50), np.array([20.0, -40.0, 5.0]), SCALE_KPA,
-        BASE_KPA, 1.3, 0.011, WALL, np.array(PART), np.array(CREEP_S), np.array(LOOP), WIDTHS_N,
-        0.08, 0.3, 4.0,
+    falling = DomeModel(
+        np.array([20.0, -40.0, 5.0]), SCALE_KPA, BASE_KPA, WALL, 1.3, 0.011, np.array(PART),
+        np.array(CREEP_S), np.array(LOOP), 0.08, 0.3, 4.0,
     )  # fmt: skip
+    out = falling.compute_response(np.linspace(0, 0.098, 50), np.linspace(0, 60, 50))
     assert np.isfinite(np.stack(out)).all()
