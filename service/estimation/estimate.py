@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from devices.arrays import Floats, Times
 from devices.flags import EstimateFlag
-from devices.frames import FrameBatch
+from devices.frames import FrameBatch, allocate_columns
 from devices.jit import jit_cached, jit_inlined
 from service.estimation.foot import CONTACT_UNKNOWN
 from service.estimation.foot.contact import is_debounced
@@ -147,18 +147,14 @@ class ModelEstimator:
             raise ValueError(f"frames of {frames.tile_count} tiles, a plan of {tiles}")
         if self._foot_state["end_row"][0] + n > len(self._buffer.rows):
             self._compact_buffer(n)
-        columns = [_to_compiled_layout(getattr(frames, name)) for name in _COLUMNS]
-        output = _step(
-            self.plan.params, self._foot_state, self._tile_states, self._buffer, *columns
-        )
-        return _make_estimates(output, self._unmeasured)
+        return self._step(frames, is_final=False)
 
     def finish(self) -> Estimates | None:
         """Return the estimates that still wait for their look-ahead; None if there are none."""
         if self._foot_state["release_row"][0] == self._foot_state["end_row"][0]:
             return None
-        output = _finish(self.plan.params, self._foot_state, self._tile_states, self._buffer)
-        return _make_estimates(output, self._unmeasured)
+        nothing = FrameBatch(**allocate_columns(0, len(self._tile_states)))
+        return self._step(nothing, is_final=True)
 
     def state_dict(self) -> Columns:
         """Return a copy of the state for `from_state`, records as bytes; compacts the buffer."""
@@ -192,6 +188,12 @@ class ModelEstimator:
         if not 0 <= due <= sample <= end == rows:
             raise ValueError(f"its rows are {due}, {sample}, {end} of {rows}")
         return new
+
+    def _step(self, frames: FrameBatch, *, is_final: bool) -> Estimates:
+        columns = [_to_compiled_layout(getattr(frames, name)) for name in _COLUMNS]
+        states = self._foot_state, self._tile_states
+        output = _step(self.plan.params, *states, self._buffer, is_final, *columns)
+        return _make_estimates(output, self._unmeasured)
 
     def _state_columns(self) -> Columns:
         end = int(self._foot_state["end_row"][0])
@@ -238,6 +240,7 @@ def _step(
     foot_states: RecordArray[FootState],
     tile_states: RecordArray[TileState],
     buffer: FrameBuffer,
+    is_final: bool,
     seq: npt.NDArray[np.uint64],
     t_mono_ns: Times,
     t_ns: Times,
@@ -255,31 +258,16 @@ def _step(
         temperature_raw, sample_offset_us, servo_counts, servo_age_us, tile_flags, frame_flags,
     )  # fmt: skip
     # With look-ahead and averages, a frame waits for the next one, for outlier replacement.
-    while foot_state.sample_row < foot_state.end_row - foot_params.waits_for_next:
+    end = foot_state.end_row if is_final else foot_state.end_row - foot_params.waits_for_next
+    while foot_state.sample_row < end:
         compute_apparent_forces_and_contact(
             params, foot_state, tile_states, buffer, foot_state.sample_row
         )
         foot_state.sample_row += 1
     until, due_ns = foot_state.release_row, foot_state.newest_ns - foot_params.lag_ns
-    while until < foot_state.sample_row and buffer.t_mono_ns[until] <= due_ns:
+    while until < foot_state.sample_row and (is_final or buffer.t_mono_ns[until] <= due_ns):
         until += 1
     return _estimate_due_rows(params, foot_state, tile_states, buffer, until)
-
-
-@jit_cached
-def _finish(
-    params: KernelParams,
-    foot_states: RecordArray[FootState],
-    tile_states: RecordArray[TileState],
-    buffer: FrameBuffer,
-) -> KernelOutput:
-    foot_state = foot_states[0]
-    while foot_state.sample_row < foot_state.end_row:
-        compute_apparent_forces_and_contact(
-            params, foot_state, tile_states, buffer, foot_state.sample_row
-        )
-        foot_state.sample_row += 1
-    return _estimate_due_rows(params, foot_state, tile_states, buffer, foot_state.end_row)
 
 
 @jit_inlined
