@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 import pytest
@@ -26,6 +26,23 @@ class Outer(KernelRecord):
     force_n: float
     weights: Annotated[Floats, (3,)]
     limits: Annotated[Ints, (2,)]
+
+
+class Begun(KernelRecord):
+    """Record with initial values, and a fact of the class that is no field."""
+
+    kind: ClassVar[str] = "begun"
+
+    force_n: float = np.nan
+    count: int
+    number: int = -1
+
+
+class Around(KernelRecord):
+    """Record around another with initial values."""
+
+    begun: Begun
+    is_set: int
 
 
 @jit_cached
@@ -57,6 +74,14 @@ def test_compiled_code_reads_and_writes_the_fields() -> None:
     records["inner"]["count"] = [10, 100]
     assert _add_up(records) == 2.0 * 10 + 1.0 + 3.0 * 100 + 5.0
     assert records["inner"]["count"].tolist() == [17, 107]
+
+
+def test_fields_begin_with_the_values_of_their_class_also_within_another() -> None:
+    records = Around.array(2, is_set=[0, 1])
+    assert records["begun"].dtype.names == ("force_n", "count", "number")
+    assert np.isnan(records["begun"]["force_n"]).all()
+    assert records["begun"][["count", "number"]].tolist() == [(0, -1)] * 2
+    assert Begun.array(1, number=3)["number"].tolist() == [3]
 
 
 def test_a_column_that_is_no_field_is_refused() -> None:
