@@ -71,7 +71,7 @@ class Looking:
 
 def tick(server: Server, is_slow: bool) -> None:
     """What `Server.run` does at every tick, and at every fifth, of what looks at sessions."""
-    server.sealer.advance_unsealed_sessions()
+    server.recorder.advance_unsealed_sessions()
     server.recorder.make_retention_request("left")
     server._notify_progress()  # noqa: SLF001  # the loop that calls it sleeps
     if is_slow:

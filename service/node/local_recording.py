@@ -9,29 +9,29 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from devices.errors import FootTileError, StorageError
 from service.estimation.calibration import Calibration
 from service.server_clock import server_utc_ns
-from service.sessions.parts import (
-    SessionStream,
-    close_at_stream_end_or_newest_frame,
-    close_unfinished,
+from service.sessions.lifecycle import (
+    NodeChange,
+    Resume,
+    Sealed,
+    Stop,
+    apply_event,
+    compute_present_ledger,
     create_session,
     split_number_in_parentheses,
-    stop_session_and_make_continuation,
 )
+from service.sessions.parts import NodeFacts, SessionStream
 from storage.durable_files import remove_dead_process_temporaries
 from storage.intervals import NO_END, Intervals
 from storage.journal.node.journal import NodeJournal
 from storage.journal.node.stream import NodeStream
 from storage.sessions.folder import Part, Session, SessionsFolder
-from storage.sessions.ledger import (
-    compute_ledger,
-    group_numbers_by_stream,
-    mark_damaged_and_abandoned_lost,
-)
+from storage.sessions.ledger import group_numbers_by_stream
 
 
 class LocalRecording:
@@ -89,32 +89,30 @@ class LocalRecording:
         """
         if self._name is None:
             return
-        session, part = self._session, Part(stream_id=stream.stream_id, seq_first=0)
-        if session is None and (session := self._find_interrupted_session()) is not None:
-            self._unsealed.remove(session)
-            self._report(f"session {session.id} ({session.name}) goes on")
-        scene, calibration = self._scene_content, self._calibration
+        session = self._session
+        if session is None and (interrupted := self._find_interrupted_session()) is not None:
+            self._unsealed.remove(interrupted)
+            self._report(f"session {interrupted.id} ({interrupted.name}) goes on")
+            session = apply_event(interrupted, Resume()).session
         if session is None:
             session = create_session(
-                stream.info, self._name, part, scene_content=scene, calibration=calibration
+                stream.info,
+                self._name,
+                Part(stream_id=stream.stream_id, seq_first=0),
+                scene_content=self._scene_content,
+                calibration=self._calibration,
             )
         else:
-            streams = self._collect_streams(session)
-            before = streams[session.parts[-1].stream_id].info
-            session = close_at_stream_end_or_newest_frame(session, streams)
-            if before is None or before.has_same_tiles_as(stream.info):
-                session = session.model_copy(update={"parts": (*session.parts, part)})
-            else:
-                ended, session = stop_session_and_make_continuation(
-                    session,
-                    stream.info,
-                    server_utc_ns(),
-                    scene_content=scene,
-                    calibration=calibration,
-                )
-                self._report(f"other tiles: session {ended.id} ends, and another one begins")
-                self._unsealed.append(ended)
-                self._save(ended)
+            ids = session.parts[-1].stream_id, stream.stream_id
+            facts = replace(self._make_facts(), stream_ids=ids, scene=stream.info.scene)
+            step = apply_event(session, NodeChange(), facts)
+            session = step.session
+            for continuation in step.continuations:
+                self._report(f"other tiles: session {session.id} ends, and another one begins")
+                self._unsealed.append(session)
+                self._save(continuation)
+                self._save(session)
+                session = continuation
         self._session = session
         self._update_retention()
         self._save(session)
@@ -128,7 +126,7 @@ class LocalRecording:
         session, self._session = self._session, None
         if session is None:
             return None, False
-        sealed = self._seal(session.model_copy(update={"stopped_t_ns": server_utc_ns()}))
+        sealed = self._seal(apply_event(session, Stop(), self._make_facts()).session)
         self._update_retention()
         self.seal_earlier_sessions()
         return sealed.id, sealed.ledger is None or not sealed.ledger.complete
@@ -171,23 +169,32 @@ class LocalRecording:
         from service.sessions.inputs import make_inputs
         from service.sessions.sealing import seal_session
 
-        streams = self._collect_streams(session)
-        session = close_unfinished(session, streams).model_copy(update={"state": "sealing"})
+        facts = replace(self._make_facts(), frames_to_come="none")
+        session = apply_event(session, NodeChange(), facts).session
         self._folder.save_session_json(session)
         folder = self._folder.get_path(session.id)
         remove_dead_process_temporaries(folder)
-        sources = make_inputs(session, streams, load_tares=None, emulated=self._emulated)
-        ledger = compute_ledger(
-            session.parts, mark_damaged_and_abandoned_lost(session, streams), has_all_parts=True
-        )
-        sealed = seal_session(sources, folder, ledger)
+        sources = make_inputs(session, facts, load_tares=None, emulated=self._emulated)
+        sealed = seal_session(sources, folder, compute_present_ledger(session, facts))
+        sealed = apply_event(session, Sealed(sealed)).session
         self._folder.save_session_json(sealed)
         return sealed
 
-    def _collect_streams(self, session: Session) -> dict[str, SessionStream]:
-        """Collect the stored state of a session's streams, by stream_id."""
-        known = {stream.stream_id: _make_session_stream(stream) for stream in self._journal.streams}
-        return {p.stream_id: known.get(p.stream_id, SessionStream()) for p in session.parts}
+    def _make_facts(self) -> NodeFacts:
+        """Return the facts of this node for its sessions; it needs no clock but its own."""
+        streams = {stream.stream_id: stream for stream in self._journal.streams}
+
+        def find_stream(stream_id: str) -> SessionStream | None:
+            stream = streams.get(stream_id)
+            return _make_session_stream(stream) if stream is not None else None
+
+        return NodeFacts(
+            now_t_ns=server_utc_ns(),
+            find_stream=find_stream,
+            has_reported=True,
+            scene_content=self._scene_content,
+            calibration=self._calibration,
+        )
 
     def _update_retention(self) -> None:
         """Make the journal retain all frames that are not sealed yet."""

@@ -25,6 +25,7 @@ from service.protocol.link import STREAM_ID_PATTERN, Hello, StreamNumbers
 from service.server.estimates.node_estimator import EstimatedBatch, NodeEstimator
 from service.server.streams import ServerStream
 from service.server_clock import server_utc_ns
+from service.sessions.parts import NodeFacts, NodeReport, SessionStream
 from service.sessions.tares import RecordedTare
 from storage.clock.log import ClockOffset
 from storage.documents import write_document
@@ -241,6 +242,33 @@ class ServerNode:
             stream.unacked = stream.stored & stream.obtainable
         self.estimator.restart_if_changed(hello)
         self.is_dirty = True
+
+    def make_session_facts(self) -> NodeFacts:
+        """Return the facts of the node for its sessions."""
+        hello, offset = self.hello, self.clock_offset
+        first_seq = hello.stored[0][0] if hello.stored else None
+        return NodeFacts(
+            now_t_ns=server_utc_ns(),
+            find_stream=self._find_session_stream,
+            stream_ids=self.announced_stream_order,
+            unreadable=self.unreadable_streams.keys(),
+            is_running=True,
+            has_reported=self.has_connected,
+            is_connected=self.is_connected,
+            newest_seq=self.last_seq,
+            offset_ns=offset.server_minus_node_ns if offset is not None else None,
+            report=NodeReport(self.hello_t_ns, hello.next_seq, first_seq, hello.t_ns_first)
+            if self.hello_t_ns is not None
+            else None,
+            scene=self.last_info.scene,
+            scene_content=hello.scene,
+            calibration=self.estimator.assigned_or_node_calibration,
+            calibration_source=self.estimator.calibration_source,
+        )
+
+    def _find_session_stream(self, stream_id: str) -> SessionStream | None:
+        stream = self.streams.get(stream_id)
+        return stream.make_session_stream() if stream is not None else None
 
     def needed_and_present_frames_to_request(
         self, needed_first: Mapping[str, Intervals]

@@ -28,7 +28,6 @@ from service.server.live_feed.buffer import FeedBuffers
 from service.server.node import ServerNode
 from service.server.nodes import NodeRegistry
 from service.server.recorder import Recorder
-from service.server.sealer import SessionSealer
 from service.server.session_store import SessionStore, Trash, delete_and_count_bytes
 from service.server.streams import ServerStream
 from service.server.takes import TakeRecorder
@@ -122,14 +121,13 @@ class Server:
                 Trash(data / "trash"),
                 self._notify_session_changed,
             )
-            self.sealer = SessionSealer(
+            self.recorder = Recorder(
                 self.sessions, self.nodes, self._request_resend, unquantized=unquantized
             )
-            self.recorder = Recorder(self.sessions, self.nodes, self.sealer)
             self.takes = TakeRecorder(self.recorder, self.sessions, self.nodes)
             self.calibration_jobs = CalibrationJobs(self.sessions, self.calibrations)
             self.weighings = Weighings(
-                self.sessions, self.recorder, self.sealer, self.calibration_jobs, self.calibrations
+                self.sessions, self.recorder, self.calibration_jobs, self.calibrations
             )
         except FootTileError:
             self.data_folder.release_lock()
@@ -161,7 +159,7 @@ class Server:
                 for node in self.nodes:
                     self.weighings.fail_if_stalled_or_interrupted(node, now_s)
             with self._isolate_errors("sessions"):
-                self.sealer.advance_unsealed_sessions()
+                self.recorder.advance_unsealed_sessions()
             for link in list(self.links.values()):
                 self._update_retention(link)
             with self._isolate_errors("counts"):
@@ -216,7 +214,7 @@ class Server:
             link.request_close(LinkCloseCode.RESTART, "the server is stopping; reconnect")
         await self.weighings.close()
         await self.calibration_jobs.cancel_running_job_and_wait()
-        await self.sealer.wait_for_running_sealing()
+        await self.recorder.wait_for_running_sealing()
         for node in self.nodes:
             keep = [node.save_hello] if node.is_dirty else []
             for write in (*keep, *(stream.close for stream in node.streams.values())):

@@ -19,6 +19,7 @@ from devices.errors import (
 )
 from service.server.data_folder import SessionIndex, StartKey
 from service.server_clock import server_utc_ns
+from service.sessions.lifecycle import Edit, apply_event
 from service.sessions.sealing import rebuild_damaged_session_json
 from storage.durable_files import translate_storage_errors
 from storage.sessions.folder import (
@@ -276,7 +277,14 @@ class SessionStore:
         """
         session = self.get_session(session_id)
         check_revision(if_revision, user_fields_revision(session), f"session {session_id}")
-        return self.save(session.model_copy(update=changes))
+        return self._edit(session_id, **changes)
+
+    def _edit(self, session_id: str, **changes: object) -> Session:
+        step = apply_event(self.get_session(session_id), Edit(changes))
+        self.save(step.session)
+        if step.action == "write_markers":
+            write_markers(step.session, self.folder.get_path(session_id))
+        return step.session
 
     def add_marker(
         self, session_id: str, label: str, t_ns: int | None, marker_id: str | None = None
@@ -287,17 +295,16 @@ class SessionStore:
             UnknownError: no session has this id.
             StorageError: it cannot be saved.
         """
-        session = self.get_session(session_id)
-        event = next((marker for marker in session.markers if marker.id == marker_id), None)
+        markers = self.get_session(session_id).markers
+        event = next((marker for marker in markers if marker.id == marker_id), None)
         if event is None:
             event = Marker(
                 id=marker_id or uuid.uuid4().hex[:12],
                 label=label,
                 t_ns=server_utc_ns() if t_ns is None else t_ns,
             )
-            session = self.save(session.model_copy(update={"markers": (*session.markers, event)}))
-        if session.state == "sealed":
-            write_markers(session, self.folder.get_path(session_id))
+            markers = (*markers, event)
+        self._edit(session_id, markers=markers)
         return event
 
     def edit_marker(
@@ -313,7 +320,7 @@ class SessionStore:
         event = self._find_marker(session_id, marker_id, if_revision)
         changed = event.model_copy(update=changes)
         events = self.get_session(session_id).markers
-        self._save_markers(session_id, tuple(changed if e.id == marker_id else e for e in events))
+        self._edit(session_id, markers=tuple(changed if e.id == marker_id else e for e in events))
         return changed
 
     def remove_marker(
@@ -322,7 +329,7 @@ class SessionStore:
         """Remove a marker; arguments and errors as for `edit_marker`."""
         self._find_marker(session_id, marker_id, if_revision)
         events = self.get_session(session_id).markers
-        self._save_markers(session_id, tuple(event for event in events if event.id != marker_id))
+        self._edit(session_id, markers=tuple(event for event in events if event.id != marker_id))
 
     def _find_marker(self, session_id: str, marker_id: str, if_revision: str | None) -> Marker:
         for event in self.get_session(session_id).markers:
@@ -337,11 +344,6 @@ class SessionStore:
             f"session {session_id} has no marker {marker_id[:40]!r}",
             remedy="It may have been removed",
         )
-
-    def _save_markers(self, session_id: str, markers: tuple[Marker, ...]) -> None:
-        session = self.save(self.get_session(session_id).model_copy(update={"markers": markers}))
-        if session.state == "sealed":
-            write_markers(session, self.folder.get_path(session_id))
 
     def move_to_trash(self, session: Session) -> None:
         """Move a session to the trash.

@@ -194,6 +194,20 @@ class ServerStream:
         """
         return self._clock_log.read_undamaged_rows()
 
+    def list_clock_offsets_since(self, seq_first: int) -> tuple[ClockOffset, ...]:
+        """Return the clock measurements since a frame, and the last one before."""
+        begin_t_ns = (
+            self.journal.find_batch_t_ns_near(seq_first, at_or_before=False)
+            if self.journal is not None
+            else None
+        )
+        rows = list(self.clock_offsets)
+        if begin_t_ns is None:
+            return tuple(rows[-1:])
+        begin_ns = begin_t_ns - self.info.utc_offset_ns
+        before = [number for number, row in enumerate(rows) if row.t_mono_ns <= begin_ns]
+        return tuple(rows[before[-1] if before else 0 :])
+
     def record_clock_offset(self, row: ClockSample) -> None:
         """Record a measurement of the node's clock.
 
@@ -225,12 +239,9 @@ class ServerStream:
                 lost.add_if_new(numbers - self.obtainable, reason)
         return lost
 
-    def make_session_stream(self, offset_ns: int | None) -> SessionStream:
-        """Return the stream's facts for the rules of sessions.
-
-        Args:
-            offset_ns: added to the stream's times to get server time.
-        """
+    def make_session_stream(self) -> SessionStream:
+        """Return the stream's facts for its sessions."""
+        offset = self.clock_offset
         return SessionStream(
             stored=self.stored,
             lost=Losses(self.notes.lost),
@@ -242,8 +253,10 @@ class ServerStream:
             info=self.info,
             journal=self.journal,
             find_seqs_around=self.find_seqs_around_once_passed,
-            offset_ns=offset_ns,
+            offset_ns=offset.server_minus_node_ns if offset is not None else None,
             last_seen_t_ns=self.last_seen_t_ns,
+            first_t_ns=self.first_t_ns,
+            unsynced=self.unsynced,
         )
 
     def find_seqs_around_once_passed(

@@ -28,7 +28,6 @@ from service.server.calibrations import (
 from service.server.estimates.node_estimator import EstimatedBatch
 from service.server.node import ServerNode
 from service.server.recorder import Recorder
-from service.server.sealer import SessionSealer
 from service.server.session_store import SessionStore, check_revision
 from service.server.weighing import Begin, End, MarkerChange, Method, Weighing, Withdraw
 from storage.sessions.folder import FRAMES_NAME, Session
@@ -103,8 +102,7 @@ class Weighings:
 
     Args:
         sessions: store of the recordings.
-        recorder: starts and stops recordings.
-        settling: seals recordings.
+        recorder: starts, stops and seals recordings.
         fits: jobs that fit recordings.
         calibrations: store of the fitted calibrations.
     """
@@ -113,13 +111,11 @@ class Weighings:
         self,
         sessions: SessionStore,
         recorder: Recorder,
-        settling: SessionSealer,
         fits: CalibrationJobs,
         calibrations: CalibrationStore,
     ) -> None:
         self._sessions = sessions
         self._recorder = recorder
-        self._settling = settling
         self._fits = fits
         self._calibrations = calibrations
         self._of: dict[str, NodeWeighing] = {}
@@ -313,7 +309,7 @@ class Weighings:
         """Seal the recording and fit it."""
         with self._failing(weighing):
             self._recorder.stop_session(weighing.session_id)
-            session = await self._settling.wait_until_sealed_or_timeout(
+            session = await self._recorder.wait_until_sealed_or_timeout(
                 weighing.session_id, _SEAL_S
             )
             if session.state != "sealed":

@@ -12,7 +12,7 @@ from devices.errors import FootTileError
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
 from service.estimation.tare.tare import Tare
-from service.sessions.parts import RATE_MAX_HZ, SessionStream
+from service.sessions.parts import RATE_MAX_HZ, NodeFacts, SessionStream, find_likely_end
 from service.sessions.tares import TareHistory
 from storage.clock.table import ClockTable, StreamClockFacts, group_rows_by_stream_in_given_order
 from storage.intervals import NO_END
@@ -97,23 +97,25 @@ class SessionInputs:
 
 def make_inputs(
     session: Session,
-    streams: Mapping[str, SessionStream],
+    node: NodeFacts,
     *,
     load_tares: Callable[[], TareHistory] | None,
     emulated: bool | None,
     default_array: ArrayInfo | None = None,
     unquantized: bool = False,
 ) -> SessionInputs:
-    """Collect the inputs of a session.
+    """Collect the present inputs of a session, up to its likely end.
 
     Args:
         session: the session.
-        streams: facts by stream id, for all of its parts.
+        node: facts of its node.
         load_tares: returns the tares of its node; None: there is no history.
         emulated: True: its frames are emulated; None: unknown.
         default_array: array if no stream describes one.
         unquantized: True: estimates are not rounded.
     """
+    session = find_likely_end(session, node)
+    streams = node.collect_streams(session)
     infos = [streams[part.stream_id].info for part in session.parts]
     info = next(
         (info for info in infos if info is not None), default_array or _empty_array(session)

@@ -1,126 +1,35 @@
-"""Parts of sessions: their creation and their ends.
+"""Parts of sessions: intervals of a node's streams, where each begins, goes on and ends.
 
 A session ends with the last frame before its stop, by the clock that gave the stop's time. A stream
-that ended before that ends its part. Where frames are missing, the end is placed by the rate; where
-a node has not reported how its stream ended, the number of unsent frames is bounded.
+that ended before that ends its part, and the session goes on in the node's next one. Where frames
+are missing, the end is placed by the rate; where a node has not reported how its stream ended, the
+number of unsent frames is bounded.
 
 A *node's stream* (`NodeStream`) is the node's own, a *server's stream* (`ServerStream`) the
 server's copy. Both, and a journal that is opened after a crash, give the facts of a
-`SessionStream`; ends, ledger and inputs of a session follow from these alone.
+`SessionStream`; `NodeFacts` are those of all of a node's streams. Parts, states, ledger and inputs
+of a session follow from these alone.
 """
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Mapping
-from dataclasses import dataclass
-from datetime import UTC, datetime
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple, Protocol
 
+from devices.errors import FootTileError
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration
-from service.server_clock import server_utc_ns
 from storage.intervals import NO_END, Intervals
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import compute_max_lost_tail_frames
-from storage.sessions.folder import Part, Session, make_session_id
+from storage.sessions.folder import Part, Session
 from storage.sessions.ledger import StreamState
 
-
-def create_session(
-    info: ArrayInfo,
-    name: str,
-    part: Part,
-    *,
-    scene_content: Mapping[str, Any],
-    calibration: Calibration | None,
-    **fields: Any,
-) -> Session:
-    """Create a session that begins now.
-
-    Args:
-        info: array of its first part.
-        name: user-given name.
-        part: first part.
-        scene_content: content of the node's scene file.
-        calibration: calibration in use at the beginning.
-        fields: further fields of a session, or other values of the above.
-    """
-    facts: dict[str, Any] = {
-        "id": make_session_id(datetime.now(UTC)),
-        "name": name,
-        "node": info.node,
-        "state": "recording",
-        "started_t_ns": server_utc_ns(),
-        "parts": (part,),
-        "scene": info.scene,
-        "scene_content": dict(scene_content),
-        "calibration": calibration.model_dump(mode="json") if calibration is not None else None,
-    }
-    return Session(**facts | fields)
-
-
-class ContinuedSession(NamedTuple):
-    """Session whose tiles have changed, in two."""
-
-    closed: Session
-    continuation: Session
-
-
-def stop_session_and_make_continuation(
-    session: Session,
-    info: ArrayInfo,
-    begin_t_ns: int,
-    *,
-    scene_content: Mapping[str, Any],
-    calibration: Calibration | None,
-    calibration_source: Literal["node", "server"] = "node",
-) -> ContinuedSession:
-    """Return a session whose tiles have changed, closed, and its continuation.
-
-    A file describes one array, so the recording goes on in another session.
-
-    Args:
-        session: session whose last part is closed.
-        info: present array of the node.
-        begin_t_ns: begin of its stream, by the clock that gives the times of stops.
-        scene_content: content of the node's scene file.
-        calibration: calibration of the present tiles.
-        calibration_source: origin of the calibration.
-    """
-    problem = "the node came back with other tiles: recording ended"
-    update: dict[str, object] = {"problem": problem}
-    if session.state == "recording":
-        update |= {"state": "pending", "stopped_t_ns": begin_t_ns}
-    name, number = split_number_in_parentheses(session.name)
-    continuation = create_session(
-        info,
-        f"{name} ({number + 1})",
-        Part(stream_id=info.stream_id, seq_first=0),
-        scene_content=scene_content,
-        calibration=calibration,
-        calibration_source=calibration_source,
-        state=session.state,
-        started_t_ns=begin_t_ns,
-        stopped_t_ns=session.stopped_t_ns,
-        continues=session.id,
-        **{field: getattr(session, field) for field in ("subject", "notes", "tags", "take")},
-    )
-    return ContinuedSession(session.model_copy(update=update), continuation)
-
-
-class NumberedName(NamedTuple):
-    """Name of a session as given, and its number: 2 for `mud (2)`, else 1."""
-
-    given: str
-    number: int
-
-
-def split_number_in_parentheses(name: str) -> NumberedName:
-    """Split a session's name into the given name and its number."""
-    match = re.fullmatch(r"(.*) \((\d+)\)", name)
-    return NumberedName(match[1], int(match[2])) if match else NumberedName(name, 1)
+_UNSENT_NS = 1_000_000_000
+"""Time after a hello within which frames may come that the hello did not count."""
 
 
 class SeqsAround(NamedTuple):
@@ -158,6 +67,8 @@ class SessionStream(StreamState):
         offset_ns: offset from its times to the clock that gives the stop's time; None: unknown, or
             no session is stopped by that clock.
         last_seen_t_ns: arrival time of its last frame, by that clock; None: unknown.
+        first_t_ns: time of the oldest frame that its node has of an ended stream; None: unknown.
+        unsynced: stored numbers that a power failure may take back.
     """
 
     info: ArrayInfo | None = None
@@ -165,6 +76,8 @@ class SessionStream(StreamState):
     find_seqs_around: SeqsAroundFinder | None = None
     offset_ns: int | None = None
     last_seen_t_ns: int | None = None
+    first_t_ns: int | None = None
+    unsynced: Intervals = field(default_factory=Intervals)
 
     def find_batch_t_ns_near(self, seq: int, *, at_or_before: bool) -> int | None:
         """Return the node's time of the newest frame up to `seq` or the oldest from it, or None."""
@@ -173,6 +86,85 @@ class SessionStream(StreamState):
             if self.journal is not None
             else None
         )
+
+
+class NodeReport(NamedTuple):
+    """Report of a node on its present stream, at its last connection."""
+
+    t_ns: int
+    """Arrival time, by the clock that gives the times of stops."""
+    next_seq: int
+    first_seq: int | None
+    """Number of the oldest frame that it had; None: it had none."""
+    first_t_ns: int
+    """Time of that frame by the node's clock; 0: unknown."""
+
+
+FramesToCome = Literal["possible", "none", "abandoned"]
+
+
+@dataclass(frozen=True)
+class NodeFacts:
+    """Facts of a node for its sessions: a server's, the node's own, or those of files alone.
+
+    Attributes:
+        now_t_ns: present time, by the clock that gives the times of stops.
+        find_stream: returns the facts of a stream by its id; None: it is unknown.
+        stream_ids: its streams, oldest first; the present one is last.
+        unreadable: ids of streams whose journals cannot be read now.
+        frames_to_come: none: all frames are here or lost; abandoned: further ones do not count.
+        is_running: True: facts of a running server; a stream without a known end may go on.
+        has_reported: True: it has reported its streams since then, so that an unknown one is gone.
+        is_connected: True: it is connected to the server.
+        newest_seq: number of its newest frame; None: unknown.
+        offset_ns: offset of its present clock to that of stops; None: unknown.
+        report: last report on the present stream; None: not since the server was started.
+        scene: name of its present scene.
+        scene_content: content of that scene's file.
+        calibration: calibration of its present tiles.
+        calibration_source: origin of the calibration.
+    """
+
+    now_t_ns: int = 0
+    find_stream: Callable[[str], SessionStream | None] = lambda _: None
+    stream_ids: Sequence[str] = ()
+    unreadable: Collection[str] = ()
+    frames_to_come: FramesToCome = "possible"
+    is_running: bool = False
+    has_reported: bool = False
+    is_connected: bool = False
+    newest_seq: int | None = None
+    offset_ns: int | None = None
+    report: NodeReport | None = None
+    scene: str = ""
+    scene_content: Mapping[str, Any] = field(default_factory=dict)
+    calibration: Calibration | None = None
+    calibration_source: Literal["node", "server"] = "node"
+
+    @property
+    def present_id(self) -> str | None:
+        """Id of the present stream; None: unknown."""
+        return self.stream_ids[-1] if self.stream_ids else None
+
+    def get_stream(self, session: Session, stream_id: str) -> SessionStream:
+        """Return a stream's facts, with its offset as well as a session has it.
+
+        The node may have all frames of an unknown stream until it has reported its streams.
+        """
+        stream = self.find_stream(stream_id)
+        if stream is None:
+            is_gone = self.has_reported or self.frames_to_come == "none"
+            return SessionStream(obtainable=Intervals(() if is_gone else [(0, NO_END)]))
+        if stream.offset_ns is not None:
+            return stream
+        rows = [row for row in session.clock if row.stream_id == stream_id]
+        # No link during that stream: most likely the node's clock was as wrong as now.
+        return replace(stream, offset_ns=rows[-1].server_minus_node_ns if rows else self.offset_ns)
+
+    def collect_streams(self, session: Session) -> dict[str, SessionStream]:
+        """Return the facts of a session's streams, by stream id."""
+        ids = dict.fromkeys(part.stream_id for part in session.parts)
+        return {stream_id: self.get_stream(session, stream_id) for stream_id in ids}
 
 
 def find_seqs_around_once_passed(journal: Journal, t_ns: int, *, min_seq: int) -> SeqsAround | None:
@@ -200,52 +192,48 @@ def find_seqs_around_once_passed(journal: Journal, t_ns: int, *, min_seq: int) -
 RATE_MAX_HZ = 1000.0
 """Assumed rate of a stream without a description: no bus is faster."""
 
-Streams = Mapping[str, SessionStream]
-
 
 def close_at_stop_if_passed(
-    session: Session, streams: Streams, *, leave_open_while_missing: bool = False
+    session: Session, node: NodeFacts, *, leave_open_while_missing: bool = False
 ) -> Session:
     """Return the session with those open parts closed whose stream has passed the stop.
 
     Args:
         session: the session.
-        streams: facts by stream id, for all of its parts.
+        node: facts of its node.
         leave_open_while_missing: keep a part open while frames closer to the stop may come.
 
     Raises:
         DamagedFramesError: the frames at the stop are damaged.
     """
+    if session.stopped_t_ns is None:
+        return session
     for part in session.parts:
         if part.seq_last is None:
-            last = _seq_at_stop(
-                session, part, streams[part.stream_id], waiting=leave_open_while_missing
-            )
+            stream = node.get_stream(session, part.stream_id)
+            last = _seq_at_stop(session, part, stream, waiting=leave_open_while_missing)
             if last is not None:
                 session = close_part(session, part, last)
     return session
 
 
-def close_at_stream_end_or_newest_frame(
-    session: Session, streams: Streams, now_t_ns: int | None = None
-) -> Session:
-    """Return the session with every open part closed at the end of its stream.
+def find_likely_end(session: Session, node: NodeFacts) -> Session:
+    """Return a session with its likely end, while frames close to it may still come."""
+    with suppress(FootTileError):  # the frames at the stop are damaged
+        return close_at_stop_if_passed(session, node)
+    return session
 
-    Args:
-        session: the session.
-        streams: facts by stream id, for all of its parts.
-        now_t_ns: a stream without a known end may have gone on until then; None: its session ends
-            with the newest stored frame.
-    """
+
+def close_at_stream_end_or_newest_frame(session: Session, node: NodeFacts) -> Session:
+    """Return the session with every open part closed at the end of its stream."""
     for part in session.parts:
         if part.seq_last is None:
-            stream = streams[part.stream_id]
+            stream = node.get_stream(session, part.stream_id)
             newest = stream.stored.last
             beyond = 0 if newest is None else newest + 1
             if stream.next_seq is None:
-                session = close_part(
-                    session, part, beyond - 1, _max_unsent_frames(session, stream, now_t_ns)
-                )
+                unsent = _max_unsent_frames(session, stream, node)
+                session = close_part(session, part, beyond - 1, unsent)
             else:
                 # Frames that a node lost in a power failure may be stored here.
                 tail = stream.max_lost_tail_frames - max(0, beyond - stream.next_seq)
@@ -253,27 +241,19 @@ def close_at_stream_end_or_newest_frame(
     return session
 
 
-def close_unfinished(session: Session, streams: Streams, now_t_ns: int | None = None) -> Session:
+def close_unfinished(session: Session, node: NodeFacts) -> Session:
     """Return the session with every part closed at its stored frames: no more will come.
 
     A session without a stop gets the time of its newest frame as stop.
 
-    Args:
-        session: the session.
-        streams: facts by stream id, for all of its parts.
-        now_t_ns: as for `close_at_stream_end_or_newest_frame`.
-
     Raises:
         DamagedFramesError: the frames at the stop are damaged.
     """
-    session = close_at_stream_end_or_newest_frame(
-        close_at_stop_if_passed(session, streams), streams, now_t_ns
-    )
+    session = close_at_stream_end_or_newest_frame(close_at_stop_if_passed(session, node), node)
     if session.stopped_t_ns is None:
-        stream = streams[session.parts[-1].stream_id]
-        newest_t_ns = stream.find_batch_t_ns_near(
-            session.parts[-1].seq_last or 0, at_or_before=True
-        )
+        last_part = session.parts[-1]
+        stream = node.get_stream(session, last_part.stream_id)
+        newest_t_ns = stream.find_batch_t_ns_near(last_part.seq_last or 0, at_or_before=True)
         stopped_t_ns = session.started_t_ns
         if newest_t_ns is not None:
             stopped_t_ns = newest_t_ns + (stream.offset_ns or 0)
@@ -292,6 +272,136 @@ def close_part(session: Session, part: Part, seq_last: int, max_lost_tail: int =
             part.stream_id: max_lost_tail,
         }
     return session.model_copy(update=update)
+
+
+def find_first_seq(
+    stream: SessionStream, newest: tuple[int, int], pre_roll_s: float, coming: Intervals
+) -> int:
+    """Return the first number of a session that starts now, or a pre-roll earlier if stored.
+
+    Args:
+        stream: present stream of the node.
+        newest: number and time of its newest frame.
+        pre_roll_s: length of the pre-roll.
+        coming: numbers that the node still has and will send; they count as stored.
+    """
+    newest_seq, newest_t_ns = newest
+    seq_first, journal = newest_seq + 1, stream.journal
+    if pre_roll_s <= 0 or journal is None or stream.info is None:
+        return seq_first
+    since_t_ns = newest_t_ns - round(pre_roll_s * 1e9)
+    reached = journal.find_first_batch_seq_since(since_t_ns)
+    seq_first = min(seq_first, reached if reached is not None else seq_first)
+    reached_t_ns = stream.find_batch_t_ns_near(seq_first, at_or_before=False)
+    if reached_t_ns is not None and reached_t_ns > since_t_ns:
+        back = round((reached_t_ns - since_t_ns) * 1e-9 * stream.info.nominal_rate_hz)
+        coming = coming.restricted_to(max(0, seq_first - back), seq_first - 1)
+        seq_first = min((first for first, _ in coming), default=seq_first)
+    return seq_first
+
+
+def reopen_earlier_part(session: Session, node: NodeFacts) -> Session:
+    """Return the session with its open end in an earlier stream that was resumed.
+
+    A part is closed when its node announces another stream. If that stream is gone and the earlier
+    one goes on, as when a copy of a node's card was in use for a while, the recording goes on in
+    the earlier one, with all frames that it has had meanwhile.
+    """
+    last_part = session.parts[-1]
+    if last_part.seq_last is not None or not node.has_reported:
+        return session
+    stream = node.find_stream(last_part.stream_id)
+    may_go_on = stream is not None and (
+        last_part.stream_id in node.stream_ids or bool(stream.obtainable)
+    )
+    if may_go_on or last_part.stream_id in node.unreadable:
+        return session
+    for stream_id in node.stream_ids:
+        own_parts = [part for part in session.parts if part.stream_id == stream_id]
+        if not own_parts:
+            continue
+        stream = node.get_stream(session, stream_id)
+        ends = [part.seq_last for part in own_parts if part.seq_last is not None]
+        seq_first = max(ends, default=-1) + 1
+        if (stream.stored | stream.obtainable).restricted_to(seq_first, NO_END):
+            session = _switch_stream(session, node, Part(stream_id=stream_id, seq_first=seq_first))
+    return session
+
+
+def _switch_stream(session: Session, node: NodeFacts, part: Part) -> Session:
+    """Return the session with its open part closed and another one open."""
+    *before, last_part = close_at_stream_end_or_newest_frame(session, node).parts
+    tails = {name: n for name, n in session.max_lost_tail_frames.items() if name != part.stream_id}
+    parts = (
+        before
+        if last_part.seq_last is None or last_part.seq_last < last_part.seq_first
+        else [*before, last_part]
+    )
+    if parts and parts[-1].stream_id == part.stream_id:
+        part = parts.pop().model_copy(update={"seq_last": None})
+    return session.model_copy(update={"parts": (*parts, part), "max_lost_tail_frames": tails})
+
+
+def find_later_streams(session: Session, node: NodeFacts) -> Sequence[str]:
+    """Return streams that began after the one of the session's open part, oldest first."""
+    stream_id, order = session.parts[-1].stream_id, node.stream_ids
+    if stream_id in order:
+        return order[order.index(stream_id) + 1 :]
+    # The node no longer lists it: streams that began after its last frame are later.
+    newest_t_ns = node.get_stream(session, stream_id).find_batch_t_ns_near(
+        NO_END, at_or_before=True
+    )
+    known_ids = {part.stream_id for part in session.parts}
+
+    def is_later(name: str) -> bool:
+        begin_t_ns = node.get_stream(session, name).first_t_ns
+        return newest_t_ns is not None and begin_t_ns is not None and begin_t_ns > newest_t_ns
+
+    return [n for n in order if n not in known_ids and (n == node.present_id or is_later(n))]
+
+
+def has_begun_before_stop(session: Session, node: NodeFacts, stream_id: str) -> bool | None:
+    """Return whether a stream began before the session was stopped; None: not known yet.
+
+    The node states the time of its oldest frame. That is the begin of the stream, unless older
+    frames are gone: then only the frames themselves show it.
+    """
+    stop_t_ns = session.stopped_t_ns
+    if stop_t_ns is None:
+        return True
+    stream = node.get_stream(session, stream_id)
+    offset_ns, report, oldest = stream.offset_ns, node.report, stream.stored.first
+    if stream_id != node.present_id:
+        is_known = offset_ns is not None and stream.first_t_ns is not None
+        return find_begin_t_ns(stream, node) <= stop_t_ns if is_known else None
+    if report is not None and not report.next_seq and oldest is None:
+        # The report may not count the newest frames; these come at once.
+        is_settled = stop_t_ns < report.t_ns < node.now_t_ns - _UNSENT_NS
+        return False if is_settled else None
+    if offset_ns is None:
+        return None
+    if report is not None and report.first_t_ns and report.first_seq is not None:
+        if report.first_t_ns + offset_ns <= stop_t_ns:
+            return True
+        if report.first_seq == 0:
+            return False
+    if oldest is None:
+        return None
+    taken_t_ns = stream.find_batch_t_ns_near(oldest, at_or_before=False)
+    if taken_t_ns is None:
+        return None
+    if taken_t_ns + offset_ns <= stop_t_ns:
+        return True
+    if stream.obtainable.restricted_to(0, oldest - 1):
+        return None
+    return taken_t_ns + offset_ns - round(oldest / _rate_hz(stream) * 1e9) <= stop_t_ns
+
+
+def find_begin_t_ns(stream: SessionStream, node: NodeFacts) -> int:
+    """Return the begin of a stream, by the clock of stops; the present time if unknown."""
+    if stream.first_t_ns is None or stream.offset_ns is None:
+        return node.now_t_ns
+    return stream.first_t_ns + stream.offset_ns
 
 
 def bound_lost_tail_frames(stream: SessionStream) -> int:
@@ -322,12 +432,14 @@ def _seq_at_stop(
     return min(after - 1, max(last, after - late))
 
 
-def _max_unsent_frames(session: Session, stream: SessionStream, now_t_ns: int | None) -> int:
+def _max_unsent_frames(session: Session, stream: SessionStream, node: NodeFacts) -> int:
     """Return the upper bound of frames after the last known one.
 
-    Until the earlier of stop and now; if neither is known, until the newest was synced.
+    Until the stop, on a running server the present time if that is earlier; if neither is known,
+    until the newest was synced.
     """
-    limits_ns = [t_ns for t_ns in (session.stopped_t_ns, now_t_ns) if t_ns is not None]
+    limits_ns = [session.stopped_t_ns] if session.stopped_t_ns is not None else []
+    limits_ns += [node.now_t_ns] if node.is_running else []
     if not limits_ns:
         return bound_lost_tail_frames(stream)
     # Arrival times of delayed frames are too late.

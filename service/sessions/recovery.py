@@ -26,13 +26,19 @@ from devices.errors import (
     escape_control_chars,
 )
 from service.sessions.inputs import make_inputs
+from service.sessions.lifecycle import (
+    NodeChange,
+    Sealed,
+    apply_event,
+    compute_present_ledger,
+    create_session,
+)
 from service.sessions.parts import (
+    FramesToCome,
+    NodeFacts,
     SeqsAround,
     SessionStream,
     bound_lost_tail_frames,
-    close_at_stop_if_passed,
-    close_unfinished,
-    create_session,
     find_seqs_around_once_passed,
 )
 from service.sessions.sealing import rebuild_damaged_session_json, seal_session
@@ -46,11 +52,7 @@ from storage.journal.node.journal import recover_node_journals
 from storage.journal.segment import SUFFIX, UNREAD_SUFFIX
 from storage.journal.stream_notes import NOTES_FILE, StreamNotes
 from storage.sessions.folder import Ledger, Part, Session, SessionsFolder, make_session_id
-from storage.sessions.ledger import (
-    compute_ledger,
-    group_numbers_by_stream,
-    mark_damaged_and_abandoned_lost,
-)
+from storage.sessions.ledger import group_numbers_by_stream
 from storage.sessions.metadata import MARKERS_NAME, read_existing_markers, write_markers
 from storage.verify.session import verify_session
 
@@ -80,11 +82,9 @@ class OpenedStream:
         lost.remove(self.journal.stored)
         return lost
 
-    def make_session_stream(self, session: Session) -> SessionStream:
-        """Return the stream's facts for a session."""
+    def make_session_stream(self) -> SessionStream:
+        """Return the stream's facts for its sessions."""
         notes, lost = self.notes or StreamNotes(array_info=self.journal.info), self.lost
-        rows = [row for row in session.clock if row.stream_id == self.journal.info.stream_id]
-        measured_ns = rows[-1].server_minus_node_ns if rows else None
         return SessionStream(
             stored=self.journal.stored,
             lost=lost,
@@ -96,7 +96,7 @@ class OpenedStream:
             info=self.journal.info,
             journal=self.journal,
             find_seqs_around=self._find_seqs_around,
-            offset_ns=0 if self.is_node_folder else measured_ns,  # a node stops by its own clock
+            offset_ns=0 if self.is_node_folder else None,  # a node stops by its own clock
         )
 
     def _find_seqs_around(
@@ -341,8 +341,18 @@ def _seal_if_possible(
                 session = session.with_newer_clock_rows(
                     ClockLog(stream.journal.folder).read_undamaged_rows()
                 )
-    is_local, abandon_missing = _is_node_folder(data), abandon_missing or session.is_abandoned
-    session = _close_parts(session, own_streams, is_local=is_local, abandon_missing=abandon_missing)
+    frames_to_come: FramesToCome = "possible"
+    if _is_node_folder(data):
+        frames_to_come = "none"
+    elif abandon_missing or session.is_abandoned:
+        frames_to_come = "abandoned"
+
+    def find_stream(stream_id: str) -> SessionStream | None:
+        stream = own_streams.get(stream_id)
+        return stream.make_session_stream() if stream is not None else None
+
+    facts = NodeFacts(find_stream=find_stream, frames_to_come=frames_to_come)
+    session = _settle(session, own_streams.values(), facts)
     if any(part.seq_last is None for part in session.parts):
         return RecoveredSession(session, "waiting", "its node may still be recording it")
     for part in session.parts:
@@ -350,24 +360,21 @@ def _seal_if_possible(
         if stream is not None and part.seq_last is not None:
             stream.read_and_invalidate_damaged(part.seq_first, part.seq_last)
             stream.save_damage()
-    streams = _find_streams(session, own_streams, is_local=is_local)
-    ledger = compute_ledger(
-        session.parts, mark_damaged_and_abandoned_lost(session, streams), has_all_parts=True
-    )
-    if pending := ledger.pending:
-        text = f"{pending} frames may still come from node {session.node}"
+    session = _settle(session, own_streams.values(), facts)
+    ledger = compute_present_ledger(session, facts)
+    if session.state != "sealing":
+        text = f"{ledger.pending} frames may still come from node {session.node}"
         return RecoveredSession(session, "waiting", text, ledger)
     folder = sessions.get_path(session.id)
     try:
-        session = session.model_copy(update={"state": "sealing"})
         sessions.save_session_json(session)
         sources = make_inputs(
             session,
-            streams,
+            facts,
             load_tares=lambda: TareHistory(data / "nodes" / session.node / "tares.json"),
             emulated=_read_hello_or_empty(data, session.node).get("emulated"),
         )
-        sealed = seal_session(sources, folder, ledger)
+        sealed = apply_event(session, Sealed(seal_session(sources, folder, ledger))).session
         problems = verify_session(folder, expected_session=sealed).problems
         if problems:
             return RecoveredSession(session, "failed", "; ".join(problems), ledger)
@@ -377,23 +384,13 @@ def _seal_if_possible(
     return RecoveredSession(sealed, "sealed", sealed.problem or "", ledger)
 
 
-def _close_parts(
-    session: Session,
-    own: Mapping[str, OpenedStream | None],
-    *,
-    is_local: bool,
-    abandon_missing: bool,
-) -> Session:
+def _settle(session: Session, streams: Iterable[OpenedStream | None], facts: NodeFacts) -> Session:
     """Return the session with its parts closed, as well as they are known."""
     while True:
-        streams = _find_streams(session, own, is_local=is_local)
         try:
-            if is_local or abandon_missing:
-                closed = close_unfinished(session, streams)
-                return closed.model_copy(update={"is_abandoned": not is_local})
-            return close_at_stop_if_passed(session, streams, leave_open_while_missing=True)
+            return apply_event(session, NodeChange(), facts).session
         except DamagedFramesError as error:  # at the stop: retry without these frames
-            _invalidate(own.values(), error)
+            _invalidate(streams, error)
 
 
 def _invalidate(streams: Iterable[OpenedStream | None], error: DamagedFramesError) -> None:
@@ -414,16 +411,6 @@ def _invalidate(streams: Iterable[OpenedStream | None], error: DamagedFramesErro
 def _is_node_folder(data: Path) -> bool:
     """Return whether this is a node's own folder: then no more frames will come."""
     return not (data / "nodes").is_dir()
-
-
-def _find_streams(
-    session: Session, streams: Mapping[str, OpenedStream | None], *, is_local: bool
-) -> dict[str, SessionStream]:
-    unknown = SessionStream(obtainable=Intervals(() if is_local else [(0, NO_END)]))
-    return {
-        stream_id: stream.make_session_stream(session) if stream is not None else unknown
-        for stream_id, stream in streams.items()
-    }
 
 
 def _make_sessions(
@@ -459,7 +446,7 @@ def _make_sessions(
             )
             session = session.model_copy(update={"calibration": hello.get("calibration")})
             if last == journal.stored.last and (
-                tail := bound_lost_tail_frames(stream.make_session_stream(session))
+                tail := bound_lost_tail_frames(stream.make_session_stream())
             ):
                 session = session.model_copy(update={"max_lost_tail_frames": {stream_id: tail}})
             found.append(session)

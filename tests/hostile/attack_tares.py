@@ -12,8 +12,8 @@ from devices.flags import EstimateFlag
 from service.protocol.link import Hello
 from service.server.node import ServerNode
 from service.server.nodes import NodeRegistry
-from service.server.session_parts import current_inputs
 from service.sessions.frames import SessionFrames
+from service.sessions.inputs import make_inputs
 from storage.sessions.folder import SessionsFolder
 from tests.hostile.attack import Outcome, Play, attack
 from tests.hostile.data_folders import data_folder
@@ -64,7 +64,14 @@ def _estimated(data: Path, hello: Hello) -> tuple[dict[str, Numbers], bool]:
         session = SessionsFolder(data / "sessions").load(path.name)
         if session.node == "left":
             session = session.model_copy(update={"state": "pending"})
-            pieces = [columns for _, columns in SessionFrames(current_inputs(session, node))]
+            inputs = make_inputs(
+                session,
+                node.make_session_facts(),
+                load_tares=lambda: node.estimator.tare_history,
+                emulated=node.hello.emulated,
+                default_array=node.last_info,
+            )
+            pieces = [columns for _, columns in SessionFrames(inputs)]
             found[path.name] = _joined(pieces)
     return found, bool(node.file_problems)
 

@@ -337,7 +337,7 @@ async def _start_node(url: str, token: str, arguments: list[str]) -> asyncio.sub
 async def _stop_recording(server: Server) -> None:
     for session in server.recorder.list_recording(NODE):
         server.recorder.stop_session(session.id)
-        sealed = await server.sealer.wait_until_sealed_or_timeout(session.id, _SEAL_TIMEOUT_S)
+        sealed = await server.recorder.wait_until_sealed_or_timeout(session.id, _SEAL_TIMEOUT_S)
         remark(f"session {sealed.id} ({sealed.name}) is {sealed.state}")
 
 

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-import service.server.sealer
+import service.server.recorder
 from devices.errors import StorageError
 from service.sessions.sealing import seal_session
 from tests.builders.arrays import COUNT_KPA
@@ -174,8 +174,8 @@ def test_a_session_is_sealed_when_the_disk_has_space(
     tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fail_once = failing_once(seal_session, StorageError, "No space left on device")
-    monkeypatch.setattr(service.server.sealer, "seal_session", fail_once)
-    monkeypatch.setattr(service.server.sealer, "_RETRY_S", 0.2)
+    monkeypatch.setattr(service.server.recorder, "seal_session", fail_once)
+    monkeypatch.setattr(service.server.recorder, "_RETRY_S", 0.2)
     session = tared.record()
     tared.deliver(20)
     session.stop()

@@ -9,11 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.server.session_parts import (
-    abandon_missing,
-    extend_session_or_continue_with_other_tiles,
-)
-from service.sessions.parts import create_session
+from service.sessions.lifecycle import Abandon, NodeChange, Stop, apply_event, create_session
 from storage.intervals import Intervals
 from storage.sessions.folder import Part, Session
 from storage.sessions.ledger import group_numbers_by_stream
@@ -57,7 +53,8 @@ class Recorded:
         self.follow()
 
     def follow(self) -> None:
-        self.session = extend_session_or_continue_with_other_tiles(self.session, self.told.node)[0]
+        facts = self.told.node.make_session_facts()
+        self.session = apply_event(self.session, NodeChange(), facts).session
 
 
 @settings(max_examples=60, deadline=None)
@@ -82,7 +79,9 @@ def test_a_session_has_all_frames_of_each_stream_that_it_was_in(happened: list[s
         assert recorded.session.parts[-1] == Part(
             stream_id=NEW, seq_first=recorded.session.parts[-1].seq_first
         )
-        sealed = abandon_missing(recorded.session, told.node)
+        facts = told.node.make_session_facts()
+        stopped = apply_event(recorded.session, Stop(), facts).session
+        sealed = apply_event(stopped, Abandon(), facts).session
         parts = group_numbers_by_stream(sealed.parts)
         for stream_id, stream in told.node.streams.items():
             if stream_id in parts:

@@ -298,12 +298,12 @@ def test_what_was_damaged_here_is_known_after_a_restart_until_it_comes_again(tol
     assert stream.lost.to_pairs() == {"corrupt": ((0, 4),)}
     told.synced()
     told.restart()
-    assert told.node.streams[NEW].make_session_stream(None).damaged == Intervals([(0, 4)])
+    assert told.node.streams[NEW].make_session_stream().damaged == Intervals([(0, 4)])
     told.connect(stored=((0, 9),), next_seq=10)
     told.take(0, 4)
     told.synced()
     told.restart()
-    assert not told.node.streams[NEW].make_session_stream(None).damaged
+    assert not told.node.streams[NEW].make_session_stream().damaged
 
 
 def test_slots_that_a_killed_node_has_forgotten_are_still_counted(told: Told) -> None:

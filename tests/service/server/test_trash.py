@@ -12,7 +12,7 @@ import pytest
 
 import service.api.routes.recordings.sessions
 import service.server
-import service.server.sealer
+import service.server.recorder
 from devices.errors import StorageError
 from service.sessions.sealing import seal_session
 from storage.intervals import Intervals
@@ -88,7 +88,7 @@ def test_a_session_is_not_deleted_during_its_seal(
         assert may_seal.wait(20.0)
         return seal_session(*arguments)
 
-    monkeypatch.setattr(service.server.sealer, "seal_session", wait_and_seal)
+    monkeypatch.setattr(service.server.recorder, "seal_session", wait_and_seal)
     try:
         session = tared.record()
         tared.deliver(20)
@@ -263,7 +263,7 @@ def test_a_restarted_server_seals_unsealed_sessions(
     running: Running, tared: FakeNode, state: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        service.server.sealer, "seal_session", refusing(StorageError, "No space left")
+        service.server.recorder, "seal_session", refusing(StorageError, "No space left")
     )
     session = tared.record()
     tared.deliver(20)
@@ -272,7 +272,7 @@ def test_a_restarted_server_seals_unsealed_sessions(
         tared.send(10, now=True)
         until(lambda: "No space" in (session.now()["problem"] or ""))
     assert session.now()["state"] == state
-    monkeypatch.setattr(service.server.sealer, "seal_session", seal_session)
+    monkeypatch.setattr(service.server.recorder, "seal_session", seal_session)
     running.restart()
     if state == "pending":
         tared.connect()

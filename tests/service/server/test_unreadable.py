@@ -15,7 +15,7 @@ import pytest
 from devices.errors import StorageError
 from service.api.address import load_or_create_token
 from service.offline.calibration_lookup import read_calibration
-from service.server import sealer
+from service.server import recorder
 from service.server.data_folder import DataFolder
 from service.server.nodes import NodeRegistry
 from service.server.server import Server
@@ -177,7 +177,7 @@ def test_a_node_whose_files_cannot_be_read_is_left_out_until_it_connects(
 def refused_journals(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The disk does not give what journals hold."""
 
-    monkeypatch.setattr(sealer, "_RETRY_S", 0.1)
+    monkeypatch.setattr(recorder, "_RETRY_S", 0.1)
     with monkeypatch.context() as disk:
         disk.setattr(journal_module, "recover_or_delete_segment", refusing(*IO_ERROR))
         yield
@@ -233,7 +233,7 @@ def test_who_gives_up_what_cannot_be_read_keeps_what_followed_it(
 def test_frames_of_a_stream_whose_notes_another_version_wrote_are_not_lost(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sealer, "_RETRY_S", 0.1)
+    monkeypatch.setattr(recorder, "_RETRY_S", 0.1)
     recording = tared.record()
     tared.deliver(100, 5.0)
     running.stop()

@@ -15,12 +15,11 @@ from hypothesis import strategies as st
 
 from service.node.local_recording import LocalRecording
 from service.protocol.link import PROTOCOL, Hello
-from service.server import session_parts
 from service.server.node import ServerNode
 from service.server.nodes import NodeRegistry
 from service.server.recorder import Recorder
-from service.server.sealer import SessionSealer
 from service.server.session_store import SessionStore, Trash
+from service.sessions.lifecycle import Abandon, apply_event, compute_present_ledger
 from service.sessions.recovery import recover_locked_folder
 from service.sessions.tares import TareHistory
 from storage.clock.log import ClockOffset
@@ -29,7 +28,6 @@ from storage.journal.journal import Journal
 from storage.journal.node.journal import NodeJournal
 from storage.journal.stream_notes import StreamNotes
 from storage.sessions.folder import Part, Session, SessionsFolder
-from storage.sessions.ledger import compute_ledger, mark_damaged_and_abandoned_lost
 from storage.verify.session import verify_session
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.calibrations import make_calibration, make_tare
@@ -215,19 +213,14 @@ def test_a_server_and_recovery_in_its_folder_come_to_the_same_session(
             (one,) = recover_locked_folder(data).sessions
             assert one.outcome == "sealed" or one.ledger == waiting
             keep(data, begun)
-        abandoned = session_parts.abandon_missing(begun, node)
+        facts = node.make_session_facts()
+        abandoned = apply_event(begun, Abandon(), facts).session
         (one,) = recover_locked_folder(data, abandon_missing=True).sessions
         done = one.session
         assert done.state == "sealed"
         assert (done.parts, done.is_abandoned) == (abandoned.parts, True)
         assert done.max_lost_tail_frames == abandoned.max_lost_tail_frames
-        streams_then = session_parts.collect_stream_facts(abandoned, node)
-        ledger = compute_ledger(
-            abandoned.parts,
-            mark_damaged_and_abandoned_lost(abandoned, streams_then),
-            has_all_parts=True,
-        )
-        assert done.ledger == ledger
+        assert done.ledger == compute_present_ledger(abandoned, facts)
         if done.frames and made.problem is not None:
             assert done.problem == f"no estimates: {made.problem}"
         assert (made.calibration is None) == (made.problem is not None)
@@ -253,6 +246,4 @@ def server_on(data: Path, begun: Session) -> tuple[Recorder, ServerNode]:
     book = SessionStore(
         SessionsFolder(data / "sessions"), Trash(data / "trash"), on_change=lambda _: None
     )
-    settling = SessionSealer(book, nodes, request_resend=lambda _: None)
-    recorder = Recorder(book, nodes, settling)
-    return recorder, node
+    return Recorder(book, nodes, request_resend=lambda _: None), node

@@ -179,7 +179,7 @@ async def stop_session(session_id: str, server: ServerState) -> SessionView:
     if node is not None:
         server.notify_node_changed(node)
     if node is not None and node.is_connected:
-        session = await server.sealer.wait_until_sealed_or_timeout(session_id, SEAL_TIMEOUT_S)
+        session = await server.recorder.wait_until_sealed_or_timeout(session_id, SEAL_TIMEOUT_S)
     return make_session_view(session, server.recorder)
 
 
@@ -195,7 +195,7 @@ async def abandon_missing(session_id: str, server: ServerState) -> SessionView:
     It is sealed as lossy: the missing frames are lost, reason `abandoned`.
     """
     server.recorder.abandon_missing(session_id)
-    session = await server.sealer.wait_until_sealed_or_timeout(session_id, SEAL_TIMEOUT_S)
+    session = await server.recorder.wait_until_sealed_or_timeout(session_id, SEAL_TIMEOUT_S)
     return make_session_view(session, server.recorder)
 
 

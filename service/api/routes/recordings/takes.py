@@ -127,7 +127,7 @@ async def stop_take(take_id: str, server: ServerState) -> TakeView:
     _notify_nodes_changed(server, take)
     connected = [node.name for node in server.nodes if node.is_connected]
     settled = [
-        server.sealer.wait_until_sealed_or_timeout(session.id, one.SEAL_TIMEOUT_S)
+        server.recorder.wait_until_sealed_or_timeout(session.id, one.SEAL_TIMEOUT_S)
         for session in take.sessions
         if session.node in connected
     ]

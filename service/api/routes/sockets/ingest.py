@@ -166,7 +166,7 @@ def _registered_node(server: Server, hello: Hello, claim: IdentityClaim) -> Iter
         node = server.nodes.check_hello_and_get_or_create(hello)
         node.apply_checked_hello(hello, server_utc_ns())
         server.recorder.cache_missing_clock_offsets(node)
-        server.sealer.extend_node_sessions(node)
+        server.recorder.extend_node_sessions(node)
     except Exception as error:
         if is_new:
             server.nodes.remove_from_memory(name)

@@ -81,7 +81,7 @@ class LiveFeedSession:
             self._policy,
             position,
             needed_frames=lambda: server.recorder.needed_frames(node.name),
-            invalidate_damaged=lambda error: server.sealer.invalidate_and_request_resend(
+            invalidate_damaged=lambda error: server.recorder.invalidate_and_request_resend(
                 node, error, "a live client"
             ),
         )
