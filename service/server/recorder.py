@@ -402,7 +402,7 @@ class Recorder:
         return node.make_session_facts()
 
     def _apply(self, session: Session, event: Event) -> Step:
-        """Apply an event to a session, and save what it changes.
+        """Apply an event to a session, and save the changed sessions.
 
         Raises:
             StateError: the session's state refuses the event.
