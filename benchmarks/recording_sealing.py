@@ -13,8 +13,7 @@ from side_by_side import in_turns, note, spread, table
 
 from service.estimation.calibration import Calibration, make_paper_shape_preset
 from service.offline.calibration_lookup import find_calibration
-from service.sessions.frames import SessionFrames
-from service.sessions.inputs import SessionInputs
+from service.sessions.inputs import SessionFrames, SessionInputs
 from service.sessions.stances import StancesWriter
 from storage.journal.journal import Journal
 from storage.parquet_hash import compute_sha256

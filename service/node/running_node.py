@@ -1,4 +1,8 @@
-"""Running node: acquisition process, journal on disk, local recording, and publisher."""
+"""Running node: acquisition process, journal on disk, local recording, hello, and publisher.
+
+The secrets shared with servers are in the node's folder, so a renamed node counts as another
+node. Each server has a separate secret.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +12,12 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import takewhile
+from pathlib import Path
 from typing import Any
 
-from devices.errors import FootTileError
+from devices.errors import FileFormatError, FootTileError, StorageError
+from service.estimation.calibration import Calibration
 from service.node.acquisition_process import (
     AcquiredBatch,
     AcquisitionEnded,
@@ -22,13 +29,47 @@ from service.node.acquisition_process import (
 )
 from service.node.frame_sender import NodeCallbacks
 from service.node.local_recording import LocalRecording
-from service.node.options import NodeOptions, ServerSecrets
 from service.node.publisher import Publisher
-from service.node.server_connection import make_hello
-from service.protocol.link import NodeStatus, RetentionMessage
+from service.node_identity import generate_secret
+from service.protocol.link import (
+    PROTOCOL,
+    EarlierStream,
+    Hello,
+    NodeStatus,
+    RetentionMessage,
+)
+from service.rig.emulated_foot import RigOptions
+from storage.durable_files import try_set_aside_and_describe
 from storage.journal.node.journal import NodeJournal
 from storage.journal.node.retention_requests import RetentionRequest
 from storage.journal.node.stream import NodeStream
+from storage.permissions import SECRETS_NAME, read_secrets_or_empty, write_secrets
+
+
+@dataclass(frozen=True)
+class NodeOptions:
+    """Options of a node.
+
+    Attributes:
+        rig_options: options of the rig.
+        node_folder: the node's folder.
+        server_url: address of the server; None: no server, local recording only.
+        session_name: name of a session to record on the node itself; None: no recording.
+        calibration: calibration of the tiles, for the server's estimates.
+        calibration_problem: reason why there is no calibration.
+        token: the server's token; None: the token of this user's server on this machine.
+        ca_path: file or folder of CA certificates, in addition to the system's.
+    """
+
+    rig_options: RigOptions
+    node_folder: Path
+    server_url: str | None
+    session_name: str | None = None
+    calibration: Calibration | None = None
+    calibration_problem: str | None = None
+    token: str | None = None
+    ca_path: Path | None = None
+
 
 _POLL_S = 0.02
 """Poll interval while waiting for delivery."""
@@ -347,3 +388,107 @@ def _enqueue_message(
         loop.call_soon_threadsafe(messages.put_nowait, message)
     except RuntimeError:  # the event loop has ended
         return
+
+
+_EARLIER_MAX = 64
+"""Most earlier streams that fit into a message."""
+
+
+def make_hello(options: NodeOptions, journal: NodeJournal, present_stream: NodeStream) -> Hello:
+    """Compose a node's hello; reads the journals of earlier streams.
+
+    Raises:
+        StorageError: a journal cannot be read.
+    """
+    next_seq = present_stream.next_seq  # before `held`, which may grow meanwhile
+    # Another stream may have begun meanwhile; it has not ended.
+    others = list(takewhile(lambda stream: stream is not present_stream, journal.streams))
+    # Streams that a session waits for come first, then the newest.
+    waited_for = [stream for stream in others if journal.available_undelivered_numbers(stream)]
+    rest = [stream for stream in others if stream not in waited_for]
+    chosen = (*waited_for[:_EARLIER_MAX], *rest[-_EARLIER_MAX:])[:_EARLIER_MAX]
+    earlier = [stream for stream in others if stream in chosen]
+    return Hello(
+        protocol=PROTOCOL,
+        array_info=present_stream.info,
+        stored=tuple(present_stream.available),
+        next_seq=next_seq,
+        t_mono_ns=time.monotonic_ns(),
+        lost=present_stream.lost.to_pairs(),
+        t_ns_first=_read_first_t_ns(present_stream),
+        scene=options.rig_options.scene.model_dump(mode="json"),
+        emulated=options.rig_options.is_emulated,
+        calibration=options.calibration,
+        calibration_problem=options.calibration_problem,
+        earlier=tuple(_make_earlier_stream(stream) for stream in earlier),
+        has_more=len(earlier) < len(others),
+    )
+
+
+def _read_first_t_ns(stream: NodeStream) -> int:
+    journal = stream.journal
+    return (
+        journal.find_batch_t_ns_near(0, at_or_before=False) if journal is not None else None
+    ) or 0
+
+
+def _make_earlier_stream(stream: NodeStream) -> EarlierStream:
+    return EarlierStream(
+        array_info=stream.info,
+        stored=tuple(stream.available),
+        next_seq=stream.next_seq,
+        lost=stream.lost.to_pairs(),
+        max_lost_tail_frames=stream.notes.max_lost_tail_frames,
+        missed_slots=stream.missed_slots,
+        t_ns_first=_read_first_t_ns(stream),
+    )
+
+
+_SERVERS_MAX = 256
+"""Most secrets; the oldest is dropped, as a server's address may answer with ever new ids."""
+
+
+class ServerSecrets:
+    """Secrets of one node.
+
+    Args:
+        folder: the node's folder.
+        report: called with errors of reading or writing, from another thread.
+    """
+
+    def __init__(self, folder: Path, report: Callable[[str], None]) -> None:
+        self._path = folder / SECRETS_NAME
+        self._report = report
+        self._reported = ""
+
+    def get_or_create_secret(self, server_id: str) -> str | None:
+        """Return the secret for a server; create it at first contact and store it on disk.
+
+        None: it cannot be stored. A secret lost with the process would lock the node out.
+        """
+        try:
+            secrets = self._read()
+            known = secrets.get(server_id)
+            if known is None:
+                known = generate_secret()
+                kept = list(secrets.items())[1 - _SERVERS_MAX :]
+                write_secrets(self._path, dict([*kept, (server_id, known)]))
+        except StorageError as error:
+            self._report_once(f"no secret is shared with the server: {error}")
+            return None
+        return known
+
+    def _read(self) -> dict[str, str]:
+        try:
+            return read_secrets_or_empty(self._path)
+        except FileFormatError as error:
+            self._report_once(
+                f"{try_set_aside_and_describe(self._path, error)}; servers that know this node "
+                "refuse it until a person accepts it"
+            )
+            return {}
+
+    def _report_once(self, what: str) -> None:
+        if what != self._reported:
+            self._report(what)
+        self._reported = what

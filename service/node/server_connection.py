@@ -17,7 +17,6 @@ import time
 from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from http import HTTPStatus
-from itertools import takewhile
 from typing import Any
 from urllib.parse import urlsplit, urlunsplit
 
@@ -28,7 +27,6 @@ from devices.errors import LinkError, UsageError
 from foottile.connection import UpgradeRejection, explain_foreign_response, explain_tls
 from foottile.environment import decode_zone
 from service.node.frame_sender import EstablishedLink, FrameSender
-from service.node.options import NodeOptions
 from service.protocol.codec import (
     SUBPROTOCOL,
     CloseConnection,
@@ -40,21 +38,16 @@ from service.protocol.link import (
     INGEST_PATH,
     LINK_TIMEOUT_S,
     PROBES_PER_MEASUREMENT,
-    PROTOCOL,
     SERVER_MESSAGES,
     Ack,
     Challenge,
     ClockProbe,
     ClockSample,
-    EarlierStream,
-    Hello,
     LossReport,
     RetentionMessage,
     ServerMessage,
     Welcome,
 )
-from storage.journal.node.journal import NodeJournal
-from storage.journal.node.stream import NodeStream
 
 STATUS_EVERY_S = 1.0
 """Interval of status messages."""
@@ -165,60 +158,6 @@ async def _run_until_first_ends(*work: Coroutine[Any, Any, object]) -> None:
         await asyncio.gather(*tasks, return_exceptions=True)
     for task in done:
         task.result()
-
-
-_EARLIER_MAX = 64
-"""Most earlier streams that fit into a message."""
-
-
-def make_hello(options: NodeOptions, journal: NodeJournal, present_stream: NodeStream) -> Hello:
-    """Compose a node's hello; reads the journals of earlier streams.
-
-    Raises:
-        StorageError: a journal cannot be read.
-    """
-    next_seq = present_stream.next_seq  # before `held`, which may grow meanwhile
-    # Another stream may have begun meanwhile; it has not ended.
-    others = list(takewhile(lambda stream: stream is not present_stream, journal.streams))
-    # Streams that a session waits for come first, then the newest.
-    waited_for = [stream for stream in others if journal.available_undelivered_numbers(stream)]
-    rest = [stream for stream in others if stream not in waited_for]
-    chosen = (*waited_for[:_EARLIER_MAX], *rest[-_EARLIER_MAX:])[:_EARLIER_MAX]
-    earlier = [stream for stream in others if stream in chosen]
-    return Hello(
-        protocol=PROTOCOL,
-        array_info=present_stream.info,
-        stored=tuple(present_stream.available),
-        next_seq=next_seq,
-        t_mono_ns=time.monotonic_ns(),
-        lost=present_stream.lost.to_pairs(),
-        t_ns_first=_read_first_t_ns(present_stream),
-        scene=options.rig_options.scene.model_dump(mode="json"),
-        emulated=options.rig_options.is_emulated,
-        calibration=options.calibration,
-        calibration_problem=options.calibration_problem,
-        earlier=tuple(_make_earlier_stream(stream) for stream in earlier),
-        has_more=len(earlier) < len(others),
-    )
-
-
-def _read_first_t_ns(stream: NodeStream) -> int:
-    journal = stream.journal
-    return (
-        journal.find_batch_t_ns_near(0, at_or_before=False) if journal is not None else None
-    ) or 0
-
-
-def _make_earlier_stream(stream: NodeStream) -> EarlierStream:
-    return EarlierStream(
-        array_info=stream.info,
-        stored=tuple(stream.available),
-        next_seq=stream.next_seq,
-        lost=stream.lost.to_pairs(),
-        max_lost_tail_frames=stream.notes.max_lost_tail_frames,
-        missed_slots=stream.missed_slots,
-        t_ns_first=_read_first_t_ns(stream),
-    )
 
 
 CLOCK_INTERVAL_S = 10.0

@@ -23,17 +23,16 @@ from service.server.broadcast.views import (
 )
 from service.server.calibrations import CalibrationJobs, CalibrationStore
 from service.server.data_folder import DataFolder
-from service.server.identities import NodeIdentities
 from service.server.live_feed.buffer import FeedBuffers
 from service.server.node import ServerNode
-from service.server.nodes import NodeRegistry
+from service.server.nodes import NodeIdentities, NodeRegistry
 from service.server.recorder import Recorder
 from service.server.session_store import SessionStore, Trash, delete_and_count_bytes
 from service.server.streams import ServerStream
 from service.server.takes import TakeRecorder
 from service.server.weighings import Weighings
 from service.server_clock import server_utc_ns
-from service.sessions.comparison_series import ComparisonSeriesCache
+from service.sessions.overview import ComparisonSeriesCache
 from service.sessions.preview import SessionPreviews
 from service.user_folders import register_private_folder
 from storage.durable_files import remove_dead_process_temporaries

@@ -22,7 +22,7 @@ from pathlib import Path
 from devices.errors import FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from service.protocol.link import ClockSample, EarlierStream, Hello, SeqIntervalsByReason
-from service.sessions.parts import SeqsAround, SessionStream, find_seqs_around_once_passed
+from service.sessions.parts import SeqsAround, SessionStream
 from storage.clock.bounds import DISCIPLINE_RATE_LIMIT
 from storage.clock.log import ClockLog, ClockOffset
 from storage.frame_rules import describe_first_broken_rule
@@ -101,7 +101,6 @@ log = logging.getLogger("foottile.streams")
 
 CLOCK_OFFSETS_MAX = 128
 """Clock measurements kept in memory for a pre-roll; the log has all."""
-_CACHED_INSTANTS_MAX = 32
 
 
 class ServerStream:
@@ -252,43 +251,12 @@ class ServerStream:
             missed_slots=self.missed_slots,
             info=self.info,
             journal=self.journal,
-            find_seqs_around=self.find_seqs_around_once_passed,
+            seqs_around_cache=self._seqs_around_cache,
             offset_ns=offset.server_minus_node_ns if offset is not None else None,
             last_seen_t_ns=self.last_seen_t_ns,
             first_t_ns=self.first_t_ns,
             unsynced=self.unsynced,
         )
-
-    def find_seqs_around_once_passed(
-        self, t_ns: int, *, min_seq: int, may_be_stale: bool = False
-    ) -> SeqsAround | None:
-        """Return the stored frames next to a time.
-
-        The result is cached: callers repeat the query while frames are missing. The journal's index
-        is read again only when frames between the two have come.
-
-        Args, result and errors as for the function `find_seqs_around_once_passed`; one that
-        `may_be_stale` is the cached one until all frames between have come or are lost.
-        """
-        if self.journal is None:
-            return None
-        found, stored = self._seqs_around_cache.get((t_ns, min_seq)), self.stored
-        if found is not None:
-            last, after = found
-            ends = stored.restricted_to(after, after) and (
-                last < min_seq or stored.restricted_to(last, last)
-            )
-            missing = stored.missing_in(last + 1, after - 1) if after > last + 1 else Intervals()
-            none_came = missing.number_count == after - last - 1
-            if ends and (none_came or (may_be_stale and missing & self.obtainable)):
-                return found
-        found = find_seqs_around_once_passed(self.journal, t_ns, min_seq=min_seq)
-        if found is None:
-            return None
-        if len(self._seqs_around_cache) >= _CACHED_INSTANTS_MAX:
-            self._seqs_around_cache.clear()
-        self._seqs_around_cache[t_ns, min_seq] = found
-        return found
 
     def lost_or_pending_up_to(self, newest_seq: int) -> Intervals:
         """Return the frames that are not stored, from the first known one to `newest_seq`."""

@@ -17,7 +17,7 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 from devices.errors import FootTileError
 from devices.frames import ArrayInfo
@@ -30,6 +30,7 @@ from storage.sessions.ledger import StreamState
 
 _UNSENT_NS = 1_000_000_000
 """Time after a hello within which frames may come that the hello did not count."""
+_CACHED_INSTANTS_MAX = 32
 
 
 class SeqsAround(NamedTuple):
@@ -43,19 +44,6 @@ class SeqsAround(NamedTuple):
     after: int
 
 
-class SeqsAroundFinder(Protocol):
-    """Lookup of the frames next to a time of a stream."""
-
-    def __call__(self, t_ns: int, *, min_seq: int, may_be_stale: bool = False) -> SeqsAround | None:
-        """Return the same as `find_seqs_around_once_passed`.
-
-        Args:
-            t_ns: the time, node's UTC.
-            min_seq: earlier numbers do not count.
-            may_be_stale: an earlier answer will do while frames between the two may still come.
-        """
-
-
 @dataclass(frozen=True)
 class SessionStream(StreamState):
     """Facts of one stream, for the sessions with a part in it.
@@ -63,7 +51,7 @@ class SessionStream(StreamState):
     Attributes:
         info: description of its array; None: unknown.
         journal: its frames; None: there are none.
-        find_seqs_around: lookup of the frames next to a time.
+        seqs_around_cache: earlier answers of `find_seqs_around`; None: nothing is cached.
         offset_ns: offset from its times to the clock that gives the stop's time; None: unknown, or
             no session is stopped by that clock.
         last_seen_t_ns: arrival time of its last frame, by that clock; None: unknown.
@@ -73,7 +61,7 @@ class SessionStream(StreamState):
 
     info: ArrayInfo | None = None
     journal: Journal | None = None
-    find_seqs_around: SeqsAroundFinder | None = None
+    seqs_around_cache: dict[tuple[int, int], SeqsAround] | None = None
     offset_ns: int | None = None
     last_seen_t_ns: int | None = None
     first_t_ns: int | None = None
@@ -86,6 +74,49 @@ class SessionStream(StreamState):
             if self.journal is not None
             else None
         )
+
+    def find_seqs_around(
+        self, t_ns: int, *, min_seq: int, may_be_stale: bool = False
+    ) -> SeqsAround | None:
+        """Return the stored frames next to a time.
+
+        A running server repeats the query while frames are missing: the journal's index is read
+        again only when frames between the two have come.
+
+        Args:
+            t_ns: the time, node's UTC.
+            min_seq: earlier numbers do not count; the last is `min_seq` - 1 if there is none.
+            may_be_stale: a cached answer will do until all frames between have come or are lost.
+
+        Returns:
+            Both numbers; None while the stream has not passed the time.
+
+        Raises:
+            DamagedFramesError: the frames at that time are damaged.
+        """
+        if self.journal is None:
+            return None
+        cache = {} if self.seqs_around_cache is None else self.seqs_around_cache
+        found = cache.get((t_ns, min_seq))
+        if found is not None:
+            last, after = found
+            ends = self.stored.restricted_to(after, after) and (
+                last < min_seq or self.stored.restricted_to(last, last)
+            )
+            missing = self.stored.missing_in(last + 1, after - 1)
+            none_came = missing.number_count == after - last - 1
+            if ends and (none_came or (may_be_stale and missing & self.obtainable)):
+                return found
+        last_seq = self.journal.find_part_last_seq_once_passed(t_ns, part_seq_first=min_seq)
+        if last_seq is None:
+            return None
+        # If the clock steps back, frames after that time may have lower numbers than earlier ones.
+        after_seq = self.stored.restricted_to(last_seq + 1, NO_END).first
+        found = SeqsAround(last_seq, last_seq + 1 if after_seq is None else after_seq)
+        if len(cache) >= _CACHED_INSTANTS_MAX:
+            cache.clear()
+        cache[t_ns, min_seq] = found
+        return found
 
 
 class NodeReport(NamedTuple):
@@ -165,28 +196,6 @@ class NodeFacts:
         """Return the facts of a session's streams, by stream id."""
         ids = dict.fromkeys(part.stream_id for part in session.parts)
         return {stream_id: self.get_stream(session, stream_id) for stream_id in ids}
-
-
-def find_seqs_around_once_passed(journal: Journal, t_ns: int, *, min_seq: int) -> SeqsAround | None:
-    """Return the stored frames next to a time.
-
-    Args:
-        journal: journal of the stream.
-        t_ns: the time, node's UTC.
-        min_seq: earlier numbers do not count; the last is `min_seq` - 1 if there is none.
-
-    Returns:
-        Both numbers; None while the stream has not passed the time.
-
-    Raises:
-        DamagedFramesError: the frames at that time are damaged.
-    """
-    last = journal.find_part_last_seq_once_passed(t_ns, part_seq_first=min_seq)
-    if last is None:
-        return None
-    # If the clock steps back, frames after that time may have lower numbers than earlier ones.
-    after = journal.stored.restricted_to(last + 1, NO_END).first
-    return SeqsAround(last, last + 1 if after is None else after)
 
 
 RATE_MAX_HZ = 1000.0
@@ -415,7 +424,7 @@ def _seq_at_stop(
     session: Session, part: Part, stream: SessionStream, *, waiting: bool
 ) -> int | None:
     """Return the last frame of a stream before the stop; None if the stream has not passed it."""
-    if session.stopped_t_ns is None or stream.find_seqs_around is None or stream.offset_ns is None:
+    if session.stopped_t_ns is None or stream.offset_ns is None:
         return None
     stop_t_ns = session.stopped_t_ns - stream.offset_ns
     found = stream.find_seqs_around(stop_t_ns, min_seq=part.seq_first, may_be_stale=waiting)

@@ -12,8 +12,7 @@ from typing import Any
 
 from devices.errors import UsageError
 from devices.frames import FrameBatch
-from service.sessions.frames import Columns, iterate_raw_frames_with_part
-from service.sessions.inputs import SessionInputs
+from service.sessions.inputs import Columns, SessionInputs, iterate_raw_frames_with_part
 from service.sessions.preview import SessionPreview
 from storage.formats.export import FrameSource, make_one_pass_frame_source
 from storage.formats.slice import Slice

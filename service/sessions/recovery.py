@@ -36,10 +36,8 @@ from service.sessions.lifecycle import (
 from service.sessions.parts import (
     FramesToCome,
     NodeFacts,
-    SeqsAround,
     SessionStream,
     bound_lost_tail_frames,
-    find_seqs_around_once_passed,
 )
 from service.sessions.sealing import rebuild_damaged_session_json, seal_session
 from service.sessions.tares import TareHistory
@@ -95,15 +93,8 @@ class OpenedStream:
             missed_slots=notes.missed_slots,
             info=self.journal.info,
             journal=self.journal,
-            find_seqs_around=self._find_seqs_around,
             offset_ns=0 if self.is_node_folder else None,  # a node stops by its own clock
         )
-
-    def _find_seqs_around(
-        self, t_ns: int, *, min_seq: int, may_be_stale: bool = False
-    ) -> SeqsAround | None:
-        del may_be_stale  # nothing is cached here
-        return find_seqs_around_once_passed(self.journal, t_ns, min_seq=min_seq)
 
     def save_damage(self) -> None:
         """Save the damage found: once cut off, no other record exists.

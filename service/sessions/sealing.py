@@ -14,8 +14,7 @@ from typing import TypeVar
 from pydantic import ValidationError
 
 from devices.errors import DamagedFileError, FileFormatError, StorageError
-from service.sessions.frames import SessionFrames
-from service.sessions.inputs import SessionInputs
+from service.sessions.inputs import SessionFrames, SessionInputs
 from service.sessions.overview import OverviewWriter
 from service.sessions.stances import StancesWriter
 from storage.clock.table import CLOCK_NAME, read_clock_file, write_clock_file

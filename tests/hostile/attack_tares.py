@@ -12,8 +12,7 @@ from devices.flags import EstimateFlag
 from service.protocol.link import Hello
 from service.server.node import ServerNode
 from service.server.nodes import NodeRegistry
-from service.sessions.frames import SessionFrames
-from service.sessions.inputs import make_inputs
+from service.sessions.inputs import SessionFrames, make_inputs
 from storage.sessions.folder import SessionsFolder
 from tests.hostile.attack import Outcome, Play, attack
 from tests.hostile.data_folders import data_folder

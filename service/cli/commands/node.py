@@ -26,8 +26,7 @@ from service.cli.options import (
 
 if TYPE_CHECKING:
     from service.estimation.calibration import Calibration
-    from service.node.options import NodeOptions
-    from service.node.running_node import NodeOutcome
+    from service.node.running_node import NodeOptions, NodeOutcome
     from service.rig.emulated_foot import RigOptions
 
 SERVER = "http://127.0.0.1:8000"
@@ -76,7 +75,7 @@ def node_command(
     """
     from foottile.connection import make_context
     from foottile.environment import read_token
-    from service.node.options import NodeOptions
+    from service.node.running_node import NodeOptions
     from service.node.server_connection import make_ingest_url
     from service.rig.emulated_foot import RigOptions
     from service.user_folders import resolve_user_folder

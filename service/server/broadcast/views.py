@@ -31,8 +31,8 @@ from service.protocol.live import (
     View,
 )
 from service.server.estimates.live_estimator import TileRanges
-from service.server.identities import RefusedMachine
 from service.server.node import ServerNode
+from service.server.nodes import RefusedMachine
 from service.server.recorder import Recorder
 from service.server.session_store import marker_revision, user_fields_revision
 from service.sessions.tares import RecordedTare

@@ -15,7 +15,7 @@ from typing import Protocol
 
 from devices.frames import FrameBatch
 from service.server.estimates.node_estimator import EstimatedBatch
-from service.server.live_feed.encoder import EncodeCache
+from service.server.live_feed.events import EncodeCache
 from service.server.node import ServerNode
 from service.server.streams import ServerStream
 from service.sessions.pipeline import Columns

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from devices.errors import CalibrationError
-from service.node.options import NodeOptions
-from service.node.server_connection import make_hello
+from service.node.running_node import NodeOptions, make_hello
 from service.protocol.link import NodeStatus
 from service.rig.emulated_foot import RigOptions
 from storage.journal.node.journal import NodeJournal

@@ -7,7 +7,7 @@ from typing import get_args
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.server.data_folder import SessionIndex, start_key
+from service.server.session_store import SessionIndex, start_key
 from storage.sessions.folder import Part, Session, SessionState
 
 NODES = ("left", "right")

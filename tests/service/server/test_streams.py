@@ -337,13 +337,15 @@ def test_what_is_held_next_to_an_instant_is_the_same_whether_it_was_asked_before
             told.take(n * PER_MESSAGE, (n + 1) * PER_MESSAGE - 1)
             sent.add(n * PER_MESSAGE, (n + 1) * PER_MESSAGE - 1)
             stream = told.node.present_stream
-            found = stream.find_seqs_around_once_passed(t_ns, min_seq=at_least)
+            found = stream.make_session_stream().find_seqs_around(t_ns, min_seq=at_least)
             held = [seq for a, b in sent for seq in range(a, b + 1) if seq >= at_least]
             until = max((seq for seq in held if seq <= at), default=at_least - 1)
             after = min((seq for seq in held if seq > at), default=None)
             assert found == (None if after is None else (until, after))
             # While frames in between may come, it may answer as before, but says that they lack.
-            lazy = stream.find_seqs_around_once_passed(t_ns, min_seq=at_least, may_be_stale=True)
+            lazy = stream.make_session_stream().find_seqs_around(
+                t_ns, min_seq=at_least, may_be_stale=True
+            )
             assert (lazy is None) == (found is None)
             if lazy is not None and lazy != found:
                 assert stream.obtainable.restricted_to(lazy[0] + 1, lazy[1] - 1)

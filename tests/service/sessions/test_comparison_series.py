@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import service.sessions.comparison_series
+import service.sessions.overview
 import storage.sessions.comparisons
-from service.sessions.comparison_series import ComparisonSeries, ComparisonSeriesCache
+from service.sessions.overview import ComparisonSeries, ComparisonSeriesCache
 from storage.formats.slice import Slice
 from storage.sessions.comparisons import SERIES_NAME, SERIES_SCHEMA, write_comparison_series
 from storage.sessions.pyramid import Bins
@@ -101,7 +101,7 @@ def test_a_zoom_costs_the_same_wherever_it_is_and_however_long_the_series(
         read.append(len(storage.sessions.comparisons._find_row_groups(footer, *bounds_ns)))
         return within(folder, footer, *bounds_ns)
 
-    monkeypatch.setattr(service.sessions.comparison_series, "read_comparison_series_range", counted)
+    monkeypatch.setattr(service.sessions.overview, "read_comparison_series_range", counted)
     for part in (Slice(), Slice(0.0, 550.0), Slice(100.0, 400.0)):
         bins, size = whole.get_bins(*part.compute_bounds_ns(BEGIN_NS), 500)
         assert 500 <= len(bins["frames"]) <= 2000 + 2
@@ -124,7 +124,7 @@ def test_a_series_is_read_again_only_when_it_has_changed(
         read.append(folder)
         return whole(folder)
 
-    monkeypatch.setattr(service.sessions.comparison_series, "read_comparison_series", counted)
+    monkeypatch.setattr(service.sessions.overview, "read_comparison_series", counted)
     series_kept = ComparisonSeriesCache()
     write_comparison_series(tmp_path / SERIES_NAME, series([0, 2], [1.0, 1.0], [2.0, 2.0]))
     first = series_kept.get_or_read(tmp_path)

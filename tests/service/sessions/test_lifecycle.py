@@ -146,6 +146,19 @@ class Frames(SessionStream):
         found = near.last if at_or_before else near.first
         return None if found is None else self.begin_t_ns + found * PERIOD_NS
 
+    def find_seqs_around(
+        self, t_ns: int, *, min_seq: int, may_be_stale: bool = False
+    ) -> SeqsAround | None:
+        del may_be_stale
+        passed = (t_ns - self.begin_t_ns) // PERIOD_NS
+        if self.stored.restricted_to(max(passed + 1, min_seq), NO_END).first is None:
+            return None
+        before = self.stored.restricted_to(min_seq, passed).last if passed >= 0 else None
+        last = min_seq - 1 if before is None else before
+        after = self.stored.restricted_to(last + 1, NO_END).first
+        assert after is not None
+        return SeqsAround(last, after)
+
 
 @dataclass
 class Sampled:
@@ -174,26 +187,12 @@ class Sampled:
             tile.model_copy(update={"serial": tile.serial + self.tiles}) for tile in tiles.tiles
         )
 
-        def find_seqs_around(
-            t_ns: int, *, min_seq: int, may_be_stale: bool = False
-        ) -> SeqsAround | None:
-            del may_be_stale
-            passed = (t_ns - self.begin_t_ns) // PERIOD_NS
-            if self.stored.restricted_to(max(passed + 1, min_seq), NO_END).first is None:
-                return None
-            before = self.stored.restricted_to(min_seq, passed).last if passed >= 0 else None
-            last = min_seq - 1 if before is None else before
-            after = self.stored.restricted_to(last + 1, NO_END).first
-            assert after is not None
-            return SeqsAround(last, after)
-
         return Frames(
             stored=Intervals(self.stored),
             lost=Losses({"disk_full": [*(lost - self.stored)]}),
             obtainable=obtainable - lost,
             next_seq=next_seq,
             info=tiles.model_copy(update={"tiles": named}),
-            find_seqs_around=find_seqs_around,
             offset_ns=0,
             first_t_ns=self.begin_t_ns if self.reported is not None and self.has_ended else None,
             begin_t_ns=self.begin_t_ns,

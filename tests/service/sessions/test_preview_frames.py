@@ -20,8 +20,7 @@ import storage.journal.time_index
 from devices.errors import StorageError, UsageError
 from devices.frames import FrameBatch
 from service.estimation.tare.tare import Tare
-from service.sessions.frames import iterate_raw_frames_with_part
-from service.sessions.inputs import SessionInputs
+from service.sessions.inputs import SessionInputs, iterate_raw_frames_with_part
 from service.sessions.preview import SessionPreview, SessionPreviews, make_preview_stream
 from service.sessions.preview_frames import PreviewFrames
 from storage.durable_files import ScratchFile

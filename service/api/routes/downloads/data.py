@@ -30,7 +30,7 @@ from service.api.routes.downloads.exports import (
     require_frames,
 )
 from service.server.server import Server
-from service.sessions.frames import SessionFrames
+from service.sessions.inputs import SessionFrames
 from service.sessions.preview import SessionPreview
 from service.sessions.preview_frames import PreviewFrames
 from storage.formats.export import Export, make_sealed_export

@@ -38,9 +38,8 @@ from service.protocol.link import (
     StreamSelect,
     Welcome,
 )
-from service.server.identities import IdentityClaim, ProvenOrFirstContact
 from service.server.node import ServerNode
-from service.server.nodes import is_valid_node_name
+from service.server.nodes import IdentityClaim, ProvenOrFirstContact, is_valid_node_name
 from service.server.server import NodeLink, Server
 from service.server.streams import ServerStream
 from service.server_clock import server_utc_ns

@@ -35,12 +35,18 @@ from service.protocol.live import (
 )
 from service.server.broadcast.broadcaster import TOO_SLOW_S, encode_websocket_messages
 from service.server.broadcast.views import make_session_view
-from service.server.data_folder import start_key
-from service.server.live_feed.encoder import ArrowEncoder, check_columns
-from service.server.live_feed.events import FeedEvent, Gap, Position, StreamStart
+from service.server.live_feed.events import (
+    ArrowEncoder,
+    FeedEvent,
+    Gap,
+    Position,
+    StreamStart,
+    check_columns,
+)
 from service.server.live_feed.reader import FeedReader, check_stream_and_get_requested_position
 from service.server.node import ServerNode
 from service.server.server import Server
+from service.server.session_store import start_key
 from service.server_clock import server_utc_ns
 from service.version import SOFTWARE_VERSION
 

@@ -11,8 +11,14 @@ import pytest
 from devices.errors import DamagedFramesError, FileFormatError, StorageError
 from service.protocol.codec import CloseConnection, LinkCloseCode
 from service.protocol.live import Policy
-from service.server.live_feed.encoder import EncodeCache
-from service.server.live_feed.events import FeedEvent, FrameRows, Gap, Position, StreamStart
+from service.server.live_feed.events import (
+    EncodeCache,
+    FeedEvent,
+    FrameRows,
+    Gap,
+    Position,
+    StreamStart,
+)
 from service.server.live_feed.reader import FeedReader, RecomputedFrames
 from storage.journal.journal import Journal
 from tests.builders.arrays import PERIOD_NS, UTC_NS
