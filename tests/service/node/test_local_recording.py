@@ -85,6 +85,20 @@ def test_other_tiles_begin_a_session_that_says_which_one_it_takes_up(
     assert sessions(tmp_path)["mud (2)"].state == "recording"
 
 
+def test_a_session_whose_sealing_was_interrupted_goes_on_without_its_earlier_stop(
+    tmp_path: Path, journal: NodeJournal, recording: Recording
+) -> None:
+    recording().add_stream(journal.switch_to_new_stream(stream(1)))
+    begun = sessions(tmp_path)["mud"]
+    closed = begun.parts[0].model_copy(update={"seq_last": -1})
+    stopped = {"state": "sealing", "stopped_t_ns": begun.started_t_ns, "parts": (closed,)}
+    SessionsFolder(tmp_path / "sessions").save_session_json(begun.model_copy(update=stopped))
+    recording().add_stream(journal.switch_to_new_stream(stream(2)))
+    now = sessions(tmp_path)["mud"]
+    # With that stop `foottile recover` would leave out all frames from here on.
+    assert (now.state, now.stopped_t_ns, streams_of(now)) == ("recording", None, [1, 2])
+
+
 def test_a_session_whose_calibration_cannot_be_read_is_sealed_and_says_so(
     tmp_path: Path, journal: NodeJournal, recording: Recording
 ) -> None:
