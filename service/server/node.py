@@ -10,6 +10,7 @@ import logging
 import re
 from collections import deque
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 
 from devices.errors import (
@@ -244,12 +245,12 @@ class ServerNode:
         self.is_dirty = True
 
     def make_session_facts(self) -> NodeFacts:
-        """Return the facts of the node for its sessions."""
+        """Return the present facts of the node for its sessions."""
         hello, offset = self.hello, self.clock_offset
         first_seq = hello.stored[0][0] if hello.stored else None
         return NodeFacts(
             now_t_ns=server_utc_ns(),
-            find_stream=self._find_session_stream,
+            find_stream=cache(self._find_session_stream),
             stream_ids=self.announced_stream_order,
             unreadable=self.unreadable_streams.keys(),
             is_running=True,

@@ -190,7 +190,8 @@ class NodeFacts:
             return stream
         rows = [row for row in session.clock if row.stream_id == stream_id]
         # No link during that stream: most likely the node's clock was as wrong as now.
-        return replace(stream, offset_ns=rows[-1].server_minus_node_ns if rows else self.offset_ns)
+        offset_ns = rows[-1].server_minus_node_ns if rows else self.offset_ns
+        return stream if offset_ns is None else replace(stream, offset_ns=offset_ns)
 
     def collect_streams(self, session: Session) -> dict[str, SessionStream]:
         """Return the facts of a session's streams, by stream id."""
