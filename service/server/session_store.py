@@ -366,8 +366,11 @@ class SessionStore:
             UnknownError: no session has this id.
             StorageError: it cannot be saved.
         """
-        markers = self.get_session(session_id).markers
-        event = next((marker for marker in markers if marker.id == marker_id), None)
+        session = self.get_session(session_id)
+        event = next((marker for marker in session.markers if marker.id == marker_id), None)
+        if event is not None and session.state != "sealed":
+            return event
+        markers = session.markers
         if event is None:
             event = Marker(
                 id=marker_id or uuid.uuid4().hex[:12],

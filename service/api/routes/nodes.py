@@ -12,8 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from devices.types import check_user_name
 from service.api.routes.common import ServerState, parse_if_match, problem_responses
 from service.protocol.live import NodeView, TareView, View
-from service.server.broadcast.history import SECONDS_MAX, TILE_QUANTITIES, ForceSpan
-from service.server.broadcast.summary import round_values
+from service.server.broadcast.summary import SECONDS_MAX, TILE_QUANTITIES, ForceSpan, round_values
 from service.server.broadcast.views import Page, TaresPage, make_drift_view, make_tare_view
 from service.server.node import ServerNode
 from service.server.server import Server

@@ -16,8 +16,13 @@ from websockets.frames import Frame, Opcode
 
 from service.protocol.codec import CloseConnection, LinkCloseCode, encode_message
 from service.protocol.live import PageMessage, SessionProgress
-from service.server.broadcast.history import StreamHistory, reduce_tiles, summarize_force
-from service.server.broadcast.summary import PendingUpdate, summarize_frames
+from service.server.broadcast.summary import (
+    PendingUpdate,
+    StreamHistory,
+    reduce_tiles,
+    summarize_force,
+    summarize_frames,
+)
 from service.server.estimates.node_estimator import EstimatedBatch
 from service.server.node import ServerNode
 from service.server_clock import server_utc_ns

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.server.broadcast.history import (
+from service.server.broadcast.summary import (
     FORCE_SPAN_PERIOD_NS,
     SECONDS_MAX,
     ForceSpan,

@@ -15,11 +15,12 @@ from hypothesis import strategies as st
 from devices.frames import FrameBatch
 from service.estimation.foot import CONTACT_UNKNOWN
 from service.protocol.live import SessionProgress
-from service.server.broadcast.history import reduce_tiles, summarize_force
 from service.server.broadcast.summary import (
     SUMMARY_NS,
     FrameSummary,
     PendingUpdate,
+    reduce_tiles,
+    summarize_force,
     summarize_frames,
 )
 from tests.builders.arrays import PERIOD_NS

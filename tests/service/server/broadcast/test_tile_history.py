@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.frames import FrameBatch
-from service.server.broadcast.history import (
+from service.server.broadcast.summary import (
     TILE_QUANTITIES,
     TILE_SPAN_PERIOD_NS,
     StreamHistory,
