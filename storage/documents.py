@@ -1,8 +1,8 @@
 """Documents: JSON files of a typed class, replaced whole, with a SHA-256 of their text as last key.
 
-Every JSON file of ours that can change a number, or what a node must retain, is written and read
-here. A file without a checksum is damaged. One with the right checksum whose content is not of the
-class is of another version, and is not damaged.
+Every JSON file of ours that can change a number, or the frames that a node retains, is written and
+read here. A file without a checksum is damaged. One with the right checksum whose content is not of
+the class is of another version, and is not damaged.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Estimators by name: that of the models, and a plain low-pass that shows what the models gain.
+"""Estimators by name: that of the models, and a plain low-pass to measure their gain by.
 
 The low-pass has no model but the static curve, whose force it smooths tile by tile, without
 look-ahead. A missing reading is NaN, and the low-pass starts again after it.

@@ -13,7 +13,7 @@ recording -- `Stop` --> pending -- all frames are here --> sealing -- `Sealed` -
 | `Delete` | refused | same | same | same |
 
 Frames that come or are lost, a restart of the node or of the server and a crash are no events of
-their own: what a session needs follows from its node's present facts (`NodeFacts`), so the next
+their own: the needs of a session follow from its node's present facts (`NodeFacts`), so the next
 `NodeChange` makes up for a missed one. The caller saves the sessions of a `Step`, then does its
 action. Server, node alone and recovery call the same function; it does nothing itself.
 
@@ -165,7 +165,7 @@ def create_session(
 
 
 def apply_event(session: Session, event: Event, node: NodeFacts = NO_FACTS) -> Step:
-    """Return what becomes of a session by an event; the table is above.
+    """Return the step of a session at an event; the table is above.
 
     Args:
         session: the session.

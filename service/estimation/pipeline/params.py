@@ -27,7 +27,7 @@ from service.estimation.records import KernelRecord, RecordArray
 
 
 class ModelRegistry(KernelRecord):
-    """Parameters of a tile's models; a model without parameters of its own has `ModelParams`."""
+    """Parameters of a tile's models; one without further parameters has `ModelParams`."""
 
     unwrap: ModelParams
     temperature: TemperatureParams

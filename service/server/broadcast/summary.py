@@ -1,4 +1,4 @@
-"""Summaries of frames for live pages: what a message has, and the last minute.
+"""Summaries of frames for live pages: content of a message, and the last minute.
 
 Frames between two ticks are merged into one summary per node, so a slow subscriber costs no more
 than a fast one. A batch is reduced once, for the live page and for both histories. No peak hides:
