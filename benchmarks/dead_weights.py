@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from devices.arrays import Floats
+from devices.chips.mpl115a2 import MPL115A2
 from devices.emulation.dome_physics import Domes
 from devices.emulation.parts import draw_family_dome
 from devices.emulation.surroundings import Surroundings
@@ -93,6 +94,7 @@ def measure(
     within, widths, errors, refused = [], [], [], 0
     for i in range(domes):
         recording = Indentation(
+            chip=MPL115A2,
             serial=serials[i],
             where="emulated",
             t_ns=np.round(t_s[calibrating] * 1e9).astype(np.int64),

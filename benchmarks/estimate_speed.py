@@ -42,9 +42,7 @@ def plan_of(models: tuple[str, ...], count: int = 4) -> EstimationPlan:
     """A plan for that many tiles, at most eight in a line."""
     info = make_array(
         [
-            make_tile(
-                i, coefficient_words=DATA_SHEET_CHIP, x_m=0.014 * (i % 8), y_m=0.014 * (i // 8)
-            )
+            make_tile(i, registers=DATA_SHEET_CHIP, x_m=0.014 * (i % 8), y_m=0.014 * (i // 8))
             for i in range(count)
         ],
         models=models,

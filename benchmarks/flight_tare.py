@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from devices.arrays import Bools, Floats
-from devices.chips.compensation import Compensation
+from devices.chips.pressure_chips import Compensation
 from devices.errors import TareError
 from devices.frames import ArrayInfo, FrameBatch
 from service.cli.main import main as foottile

@@ -29,8 +29,9 @@ from typing import Any
 import numpy as np
 
 from devices.arrays import Bools, Floats
-from devices.chips.compensation import Compensation
+from devices.chips.pressure_chips import Compensation, get_raw_type
 from devices.clock import VirtualClock
+from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2
 from devices.emulation.ground.load_trace import CopTransform, LoadTrace
 from devices.errors import FootTileError
 from devices.flags import EstimateFlag, FrameFlag
@@ -251,13 +252,17 @@ def converted(
     """Frames of what the chips convert, over and over again, without a bus, which takes longer."""
     world = foot.make_world(scene, VirtualClock(), foot.compute_tile_load(scene), is_repeated=True)
     world.begin_scene_time()
-    chips = world._front_ends  # noqa: SLF001  # a driver has the bus only; here is none
+    chips = [
+        chip._silicon.sample_counts  # noqa: SLF001  # a driver has the bus only; here is none
+        for chip in world.chips
+        if isinstance(chip, EmulatedMpl115a2)
+    ]
     step_ns = round(1e9 / info.nominal_rate_hz)
     late_ns = step_ns // len(chips) * np.arange(len(chips))
     end = round(hours * 3600 * info.nominal_rate_hz)
     for begin in range(0, end, CHUNK):
         n = min(CHUNK, end - begin)
-        columns = allocate_columns(n, len(chips))
+        columns = allocate_columns(n, len(chips), get_raw_type(info.tiles))
         t_ns = step_ns * np.arange(begin, begin + n, dtype=np.int64)
         columns["seq"][:] = np.arange(begin, begin + n)
         columns["t_mono_ns"][:] = world.epoch_ns + t_ns

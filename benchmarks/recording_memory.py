@@ -39,7 +39,7 @@ def array(tiles: int, rate_hz: float) -> Any:
     from tests.builders.arrays import DATA_SHEET_CHIP, make_array, make_tile
 
     return make_array(
-        [make_tile(i, coefficient_words=DATA_SHEET_CHIP) for i in range(tiles)],
+        [make_tile(i, registers=DATA_SHEET_CHIP) for i in range(tiles)],
         stream_id=STREAM_ID,
         schedule="pipelined",
         nominal_rate_hz=rate_hz,

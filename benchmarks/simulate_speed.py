@@ -15,9 +15,9 @@ from pathlib import Path
 
 from devices.buses.i2c import i2c_msg
 from devices.clock import VirtualClock
-from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart, PartFaults
+from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
-from devices.emulation.fault_timing import SceneFaults
+from devices.emulation.fault_timing import PartFaults, SceneFaults
 from devices.emulation.i2c_bus import EmulatedI2cAdapter
 from devices.scene.hardware_sections import ScheduleName
 from devices.scene.scene_file import load_scene
@@ -47,7 +47,7 @@ def bare_bus() -> float:
     clock = VirtualClock()
     silicon = EmulatedPart((1, 1, 1, 1), 1_600_000, lambda t_ns: (500, 500))
     chips = [EmulatedMpl115a2(silicon, faults=PartFaults(scene=SceneFaults(()))) for _ in range(4)]
-    mux = EmulatedTca9548a(0x70, dict(enumerate(chips)))
+    mux = EmulatedTca9548a(0x70, enumerate(chips))
     adapter = EmulatedI2cAdapter([mux], clock, 400_000.0)
     selects = [i2c_msg.write(0x70, [1 << i]) for i in range(4)]
     everyone = i2c_msg.write(0x70, [0x0F])

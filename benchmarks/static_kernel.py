@@ -32,7 +32,7 @@ class StaticKernel:
     def __init__(self, plan: EstimationPlan, rows: int) -> None:
         tiles = plan.info.tiles
         n = len(tiles)
-        chips = [Coefficients.from_words(tile.coefficient_words) for tile in tiles]
+        chips = [Coefficients.from_words(tile.registers) for tile in tiles]
         scale = (PRESSURE_MAX_KPA - PRESSURE_MIN_KPA) / COUNTS_MAX
         # The conversion to kPa and the baseline are in the coefficients already.
         self.a0, self.b1, self.b2, self.c12 = (

@@ -13,8 +13,7 @@ import numpy as np
 
 from devices.array.tile import Scan
 from devices.array.tile_array import TileArray
-from devices.chips.compensation import Compensation
-from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
+from devices.chips.pressure_chips import Compensation, get_raw_type
 from devices.clock import Clock, UtcAnchor
 from devices.flags import FrameFlag, TileFlag
 from devices.frames import (
@@ -22,10 +21,11 @@ from devices.frames import (
     NO_SERVO_COUNTS,
     NOT_READ,
     FrameBatch,
+    HeldTemperature,
     TileInfo,
     allocate_columns,
+    hold_temperature,
 )
-from devices.temperature_hold import HeldTemperature, hold_temperature
 
 BATCH_NS = 25_000_000
 """Duration of a batch. At 10 ms two fifths of a message would be header (performance.md)."""
@@ -130,6 +130,7 @@ class Acquisition:
         self._frame_sink = frame_sink
         self.lead_end_ns = lead_end_ns
         """End of the lead of an emulated load: earlier frames are flagged; None: no lead."""
+        self._raw_type = get_raw_type(tiles)
         self._range_detector = RangeDetector(tiles)
         self._next_seq = 0
         self._last_t_mono_ns = 0
@@ -146,7 +147,7 @@ class Acquisition:
         """
         slot_ns = self._clock.now_ns()
         while not should_stop():
-            columns = allocate_columns(_BATCH_FRAMES_MAX, len(self._array.tiles))
+            columns = allocate_columns(_BATCH_FRAMES_MAX, len(self._array.tiles), self._raw_type)
             row = 0
             batch_end_ns = self._clock.now_ns() + BATCH_NS
             while (
@@ -238,8 +239,8 @@ class Acquisition:
 class RangeDetector:
     """Detector of readings outside the chips' pressure range, for batches in order.
 
-    Raw counts stay as read. Beyond its range a part's count falls through zero and wraps to near
-    full count (hardware.md 1.3), so both ends are out of range.
+    Raw counts stay as read. Beyond its range an MPL115A2's count falls through zero and wraps to
+    near full count (hardware.md 1.3), so both ends are out of range.
     """
 
     def __init__(self, tiles: tuple[TileInfo, ...]) -> None:
@@ -249,6 +250,7 @@ class RangeDetector:
     def flag_out_of_range(self, batch: FrameBatch) -> None:
         """Set the flag `OVER_RANGE` in the batch, in place."""
         held, self._temperature = hold_temperature(batch, self._temperature)
-        kpa = self._compensation.compute_usable_kpa(held)
-        outside = (kpa > PRESSURE_MAX_KPA) | (kpa < PRESSURE_MIN_KPA) | (batch.pressure_raw <= 1)
+        chips = self._compensation
+        kpa = chips.compute_usable_kpa(held)
+        outside = (kpa > chips.max_kpa) | (kpa < chips.min_kpa) | (batch.pressure_raw <= 1)
         batch.tile_flags[outside & ~np.isnan(kpa)] |= np.uint8(TileFlag.OVER_RANGE)

@@ -11,7 +11,7 @@ FootTileError
      |    |    +-- BusLostError                the adapter went away: unplugged, driver unbound
      |    +-- BusMisuseError                   the adapter cannot do this transfer: our bug
      |    +-- BusSetupError                    no such bus, no permission
-     +-- TileSetupError                        a tile's coefficients are absent or implausible
+     +-- TileSetupError                        a tile's chip is absent or implausible
      +-- SpiError              (OSError)       a transfer over SPI failed
      |    +-- SpiSetupError                    no such SPI device, no permission
      |    +-- AdcSilentError                   no converter drives the line
@@ -208,7 +208,7 @@ class BusSetupError(I2cError):
 
 
 class TileSetupError(FootTileError):
-    """A tile does not answer at start-up, or its coefficients are no MPL115A2's."""
+    """A tile does not answer at start-up, or is no chip of its kind."""
 
 
 class SpiError(FootTileError, OSError):

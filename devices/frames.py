@@ -7,7 +7,7 @@ the last value.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -15,6 +15,7 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from devices.arrays import ArrayRecord, Times
+from devices.flags import TileFlag
 from devices.types import (
     MODELS_MAX,
     RATE_HZ_MIN,
@@ -27,8 +28,11 @@ from devices.types import (
 )
 
 NOT_READ = 65535
+"""Count of a reading that is missing. No kind of chip gives it in use."""
 NO_SERVO_COUNTS = -(2**31)
 NO_SERVO_AGE = -1
+RawCounts = np.uint16 | np.uint32
+"""Type of the counts of an array: the chips' widest."""
 SAME_PLACE_M = 1e-6
 """Tiles that differ by no more along an axis stand in one row."""
 
@@ -41,8 +45,9 @@ class FrameBatch(ArrayRecord):
         seq: uint64[n], number of the frame in its stream, from 0.
         t_mono_ns: int64[n], CLOCK_MONOTONIC at the sample instant of the frame's first tile.
         t_ns: int64[n], the same instant in UTC ns since 1970 (`t_mono_ns` + the stream's anchor).
-        pressure_raw: uint16[n, tiles], raw 10-bit pressure counts; `NOT_READ` where not read.
-        temperature_raw: uint16[n, tiles], raw 10-bit temperature counts; `NOT_READ` where not read.
+        pressure_raw: uint16 or uint32[n, tiles], raw pressure counts of the chips; `NOT_READ` where
+            not read.
+        temperature_raw: likewise, of temperature, in the same type.
         sample_offset_us: int32[n, tiles], each tile's sample instant minus `t_ns`.
         servo_counts: int32[n], newest position, continued over whole turns (see
             `devices.chips.dynamixel.position_sources`); `NO_SERVO_COUNTS` without servo.
@@ -55,8 +60,8 @@ class FrameBatch(ArrayRecord):
     seq: npt.NDArray[np.uint64]
     t_mono_ns: Times
     t_ns: Times
-    pressure_raw: npt.NDArray[np.uint16]
-    temperature_raw: npt.NDArray[np.uint16]
+    pressure_raw: npt.NDArray[RawCounts]
+    temperature_raw: npt.NDArray[RawCounts]
     sample_offset_us: npt.NDArray[np.int32]
     servo_counts: npt.NDArray[np.int32]
     servo_age_us: npt.NDArray[np.int32]
@@ -67,7 +72,7 @@ class FrameBatch(ArrayRecord):
     def __post_init__(self) -> None:
         by_tile = self.pressure_raw.shape
         by_frame = by_tile[:1]
-        for name, (dtype, per_tile) in FRAME_COLUMNS.items():
+        for name, (dtype, per_tile) in get_frame_columns(self.pressure_raw.dtype).items():
             column = getattr(self, name)
             shape = by_tile if per_tile else by_frame
             if column.shape != shape or column.dtype != dtype:
@@ -97,17 +102,98 @@ FRAME_COLUMNS: dict[str, tuple[np.dtype[Any], bool]] = {
     "frame_flags": (np.dtype(np.uint8), False),
     "reference_force_n": (np.dtype(np.float32), False),
 }
-"""Data type of every column, and whether it has one value per tile."""
+"""Data type of every column, and whether it has one value per tile; for chips of up to 16 bits."""
+
+RAW_COLUMNS = ("pressure_raw", "temperature_raw")
+"""Columns of counts, of an unsigned type that holds the counts of all chips of the array."""
+_WIDE = FRAME_COLUMNS | dict.fromkeys(RAW_COLUMNS, (np.dtype(np.uint32), True))
 
 
-def allocate_columns(frame_count: int, tile_count: int) -> dict[str, np.ndarray]:
-    """Allocate zeroed columns for n frames."""
+def get_frame_columns(raw_type: np.dtype[Any]) -> dict[str, tuple[np.dtype[Any], bool]]:
+    """Return `FRAME_COLUMNS` for counts of this type, uint16 or uint32."""
+    return _WIDE if raw_type == np.uint32 else FRAME_COLUMNS
+
+
+def allocate_columns(
+    frame_count: int, tile_count: int, raw_type: np.dtype[Any]
+) -> dict[str, np.ndarray]:
+    """Allocate zeroed columns for n frames with counts of this type."""
     return {
         name: np.zeros((frame_count, tile_count) if per_tile else frame_count, dtype)
-        for name, (dtype, per_tile) in FRAME_COLUMNS.items()
+        for name, (dtype, per_tile) in get_frame_columns(raw_type).items()
     }
 
 
+HOLD_MAX_NS = 1_000_000_000
+"""Longest hold of a temperature; an older one is not used. A pressure cannot be computed without,
+and an array may read it in every k-th frame only; but in a second it changes by less than matters
+(0.04 kPa per count of an MPL115A2)."""
+
+
+@dataclass(frozen=True)
+class HeldTemperature:
+    """Last temperature of each tile and its instant; `NOT_READ` for none.
+
+    Attributes:
+        temperature_raw: counts[tiles].
+        t_mono_ns: int64[tiles].
+    """
+
+    temperature_raw: npt.NDArray[RawCounts]
+    t_mono_ns: Times
+
+
+def hold_temperature(
+    frames: FrameBatch, held: HeldTemperature | None = None
+) -> tuple[FrameBatch, HeldTemperature]:
+    """Fill in missing temperatures with the last one of each tile, if it is not too old.
+
+    Stored frames keep `NOT_READ`, so the age of a temperature is always known. The result does not
+    depend on the split of a stream into batches, if `held` is passed on.
+
+    Args:
+        frames: n frames in order.
+        held: state returned for the previous frames.
+
+    Returns:
+        The filled frames, and the state for the next ones.
+    """
+    tiles = frames.tile_count
+    if held is None:
+        held = HeldTemperature(
+            np.full(tiles, NOT_READ, frames.temperature_raw.dtype), np.zeros(tiles, dtype=np.int64)
+        )
+    if not len(frames):
+        return frames, held
+    unusable = (frames.tile_flags & np.uint8(TileFlag.UNUSABLE)) != 0
+    missing = frames.temperature_raw == NOT_READ
+    known = ~(missing | unusable)
+    if known.all():  # the usual case
+        return frames, HeldTemperature(
+            frames.temperature_raw[-1].copy(), np.full(tiles, frames.t_mono_ns[-1])
+        )
+    # Row 0 is the held state; every row then looks up the last known one.
+    temperature_raw = np.concatenate([held.temperature_raw[None], frames.temperature_raw])
+    t_mono_ns = np.concatenate(
+        [
+            held.t_mono_ns[None],
+            np.broadcast_to(frames.t_mono_ns[:, None], frames.temperature_raw.shape),
+        ]
+    )
+    rows = np.where(known, np.arange(1, len(frames) + 1)[:, None], 0)
+    newest = np.maximum.accumulate(rows, axis=0)
+    columns = np.arange(tiles)
+    last = HeldTemperature(temperature_raw[newest[-1], columns], t_mono_ns[newest[-1], columns])
+    if not missing.any():
+        return frames, last
+    found = temperature_raw[newest, columns]
+    too_old = frames.t_mono_ns[:, None] - t_mono_ns[newest, columns] > HOLD_MAX_NS
+    filled = np.where(missing & ~too_old, found, frames.temperature_raw)
+    return replace(frames, temperature_raw=filled), last
+
+
+ChipRegisters = Annotated[tuple[UInt16, ...], Field(max_length=16)]
+"""Words that a chip is identified by (MPL115A2: a0, b1, b2, c12); opaque to all but its driver."""
 _Factor = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
@@ -117,15 +203,16 @@ class TileInfo(StrictModel):
     serial: Identifier
     mux: Annotated[int, Field(ge=0, le=0x7F)]
     channel: Annotated[int, Field(ge=0, le=7)]
-    coefficient_words: tuple[UInt16, UInt16, UInt16, UInt16]
-    """Registers a0, b1, b2, c12 as unsigned 16-bit words (data sheet table 4)."""
+    chip: Identifier
+    """Kind of its pressure chip (`devices.chips.pressure_chips`)."""
+    address: Annotated[int, Field(ge=0, le=0x7F)]
+    registers: ChipRegisters
     x_m: Metres
     y_m: Metres
     z_m: Metres
     reference: bool
     conversion_ms: Annotated[float, Field(gt=0, le=1000)]
-    """Conversion time as measured, else the data sheet's typical 1.6 ms. The sample instant is
-    taken to be a quarter into it."""
+    """Conversion time as measured, else the data sheet's typical one."""
 
 
 class ServoInfo(StrictModel):

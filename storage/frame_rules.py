@@ -7,17 +7,18 @@ as damaged.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Times
+from devices.chips.pressure_chip import Counts
+from devices.chips.pressure_chips import get_chip
 from devices.flags import FrameFlag, TileFlag
-from devices.frames import NO_SERVO_AGE, NOT_READ, ArrayInfo, FrameBatch
+from devices.frames import NO_SERVO_AGE, NOT_READ, RAW_COLUMNS, ArrayInfo, FrameBatch
 from devices.types import T_MONO_NS_END, T_NS_END
 
-MAX_RAW_COUNTS = 1023
-"""Largest raw count of a 10-bit chip."""
 _MAX_SAMPLE_OFFSET_US = 60_000_000
 """Upper limit of `sample_offset_us`: a tile is read within its frame, in less than a minute."""
 _FORCE_MAX_N = 1e6
@@ -75,9 +76,10 @@ def _rules(frames: FrameBatch, info: ArrayInfo) -> Iterator[tuple[str, Violation
     back = np.zeros(len(t_mono_ns), np.bool_)
     np.less(t_mono_ns[1:], t_mono_ns[:-1], out=back[1:])
     yield "t_mono_ns runs backwards", back
-    for name in ("pressure_raw", "temperature_raw"):
+    limits = _get_counts_max(tuple([tile.chip for tile in info.tiles]))
+    for name, most in zip(RAW_COLUMNS, limits, strict=True):
         counts = getattr(frames, name)
-        yield f"{name} has more than 10 bits", (counts > MAX_RAW_COUNTS) & (counts != NOT_READ)
+        yield f"{name} is more than the chip can give", (counts > most) & (counts != NOT_READ)
     offset_us = frames.sample_offset_us
     yield (
         "a tile was sampled more than a minute away",
@@ -88,3 +90,10 @@ def _rules(frames: FrameBatch, info: ArrayInfo) -> Iterator[tuple[str, Violation
     yield ("frame_flags has undefined bits", (frames.frame_flags & ~np.uint8(_FRAME_BITS)) != 0)
     force_n = frames.reference_force_n
     yield "reference_force_n is no force", ~np.isnan(force_n) & ~(np.abs(force_n) <= _FORCE_MAX_N)
+
+
+@lru_cache(maxsize=64)
+def _get_counts_max(chips: tuple[str, ...]) -> Counts | npt.NDArray[np.uint32]:
+    """Return the largest counts of pressure and of temperature: of all chips, or (2, tiles)."""
+    limits = [get_chip(name).counts_max for name in chips]
+    return limits[0] if len(set(limits)) == 1 else np.array(limits, np.uint32).T

@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from devices.chips.pressure_chips import check_chips, get_raw_type
 from devices.errors import DamagedFileError, FileFormatError
 from devices.flags import EstimateFlag, FrameFlag, TileFlag, list_bits
 from devices.frames import (
@@ -32,6 +33,7 @@ from devices.frames import (
     NO_SERVO_AGE,
     NO_SERVO_COUNTS,
     NOT_READ,
+    RAW_COLUMNS,
     ArrayInfo,
     FrameBatch,
 )
@@ -81,12 +83,18 @@ class Column:
     unit: str
     description: str
     per_tile: bool = False
+    wide_type: pa.DataType | None = None
+    """Type in an array with a chip of more than 16 bits, for counts."""
     missing_value: int | None = None
     """Stand-in for an unknown value in memory; null in files. Floats: NaN, null too."""
 
     def flat_names(self, tiles: int) -> list[str]:
         """Return the names of its columns in a flat file."""
         return [f"{self.name}_{i}" for i in range(tiles)] if self.per_tile else [self.name]
+
+    def type_for(self, dtype: np.dtype[Any]) -> pa.DataType:
+        """Return its type for values of a numpy type."""
+        return self.wide_type if self.wide_type is not None and dtype == np.uint32 else self.type
 
     def make_field(
         self, name: str, type_: pa.DataType, *, nullable: bool, rounding_step: float | None = None
@@ -100,7 +108,8 @@ class Column:
 
 def _frame_column(name: str, unit: str, description: str, missing: int | None = None) -> Column:
     dtype, per_tile = FRAME_COLUMNS[name]
-    return Column(name, pa.from_numpy_dtype(dtype), unit, description, per_tile, missing)
+    wide = pa.uint32() if name in RAW_COLUMNS else None
+    return Column(name, pa.from_numpy_dtype(dtype), unit, description, per_tile, wide, missing)
 
 
 MEASURED_COLUMNS = (
@@ -217,11 +226,12 @@ def numpy_dtype_of(number_type: pa.DataType) -> np.dtype[Any]:
 def wire_schema(info: ArrayInfo) -> pa.Schema:
     """Return the Arrow schema of a stream of frames of this array."""
     tiles, text = len(info.tiles), info.model_dump_json().encode()
+    raw_type = get_raw_type(info.tiles)
     return pa.schema(
         [
             column.make_field(
                 column.name,
-                pa.list_(pa.field("item", column.type, nullable=False), tiles)
+                pa.list_(pa.field("item", column.type_for(raw_type), nullable=False), tiles)
                 if column.per_tile
                 else column.type,
                 nullable=False,
@@ -292,7 +302,7 @@ def read_array_info(schema: pa.Schema, *, where: str) -> ArrayInfo:
             "its description of the tile array was changed: its checksum is wrong", where=where
         )
     try:
-        return ArrayInfo.model_validate_json(text)
+        return check_chips(ArrayInfo.model_validate_json(text))
     except ValueError as error:
         raise FileFormatError(
             f"its description of the tile array is not readable: {error}", where=where
@@ -339,7 +349,7 @@ def to_flat_column(
     step = steps.get(name) if isinstance(steps, dict) else None
     field = column.make_field(
         name,
-        column.type,
+        column.type_for(values.dtype),
         nullable=may_miss,
         rounding_step=step if isinstance(step, float) else None,
     )
@@ -350,8 +360,9 @@ def _to_arrow(values: Array, column: Column) -> pa.Array[Any]:
     mask = None
     if column.missing_value is not None:
         mask = values == column.missing_value
+    type_ = column.type_for(values.dtype)
     # from_pandas: NaN is null. Arrow refuses a cast that would lose an integer's value.
-    return pa.array(values, mask=mask, from_pandas=True).cast(column.type, safe=column.type != _F32)
+    return pa.array(values, mask=mask, from_pandas=True).cast(type_, safe=type_ != _F32)
 
 
 def read_quantity(column: Column, table: pa.Table, tiles: int) -> Array:
@@ -375,7 +386,7 @@ def read_flat_column_and_fill_nulls(column: Column, name: str, table: pa.Table) 
         ValueError: its type is not the column's.
     """
     array = table.column(name).combine_chunks()
-    if array.type != column.type:
+    if array.type not in (column.type, column.wide_type):
         raise ValueError(f"column {name} is {array.type}, not {column.type}")
     if column.missing_value is not None:
         array = array.fill_null(column.missing_value)

@@ -23,11 +23,11 @@ import pyarrow as pa
 
 from devices.arrays import Ints
 from devices.errors import FileFormatError
-from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
+from devices.frames import ArrayInfo, FrameBatch, get_frame_columns
 from devices.types import SEQ_END
 from storage.intervals import Intervals
 from storage.message_layout import MessageLayout, MessageLayoutCache
-from storage.schema import frames_to_record_batch, wire_schema
+from storage.schema import frames_to_record_batch, numpy_dtype_of, wire_schema
 
 _MAX_BATCH_FRAMES = 64
 """Largest batch of the acquisition."""
@@ -82,7 +82,8 @@ class Decoder:
 
     def __init__(self, schema: pa.Schema) -> None:
         self._layouts = MessageLayoutCache(schema)
-        self._columns = [(name, *FRAME_COLUMNS[name]) for name in schema.names]
+        frame_columns = get_frame_columns(_get_raw_type(schema))
+        self._columns = [(name, *frame_columns[name]) for name in schema.names]
         self._tiles = schema.field("pressure_raw").type.list_size
 
     def decode(self, payload: bytes | memoryview) -> FrameBatch:
@@ -117,6 +118,11 @@ class Decoder:
                 f"time runs backwards within frames {first} to {last}", expected="t_mono_ns rising"
             )
         return batch
+
+
+def _get_raw_type(schema: pa.Schema) -> np.dtype[Any]:
+    """Return the type of a stream's counts."""
+    return numpy_dtype_of(schema.field("pressure_raw").type.value_type)
 
 
 def decode_message(payload: bytes | memoryview, schema: pa.Schema) -> FrameBatch:
@@ -203,7 +209,7 @@ def _concatenate_frames(
     tiles = schema.field("pressure_raw").type.list_size
     columns = {
         name: np.empty((total, tiles) if per_tile else total, dtype)
-        for name, (dtype, per_tile) in FRAME_COLUMNS.items()
+        for name, (dtype, per_tile) in get_frame_columns(_get_raw_type(schema)).items()
     }
     alike: dict[int, list[int]] = {}
     for number, layout in enumerate(layouts):

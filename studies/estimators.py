@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from devices.arrays import Floats, Ints
-from devices.chips.compensation import Compensation
+from devices.chips.pressure_chips import Compensation
 from devices.errors import UsageError
 from devices.flags import EstimateFlag
 from devices.frames import FrameBatch

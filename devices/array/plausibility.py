@@ -13,8 +13,8 @@ from dataclasses import replace
 
 from devices.array.bus_monitor import BusMonitor
 from devices.array.schedules import BusTiming
-from devices.array.tile import Scan, TileHealth, TileIo, classify_impossible_counts
-from devices.chips.mpl115a2 import CONVERSION_MAX_NS
+from devices.array.tile import Scan, TileHealth, TileIo
+from devices.chips.pressure_chip import Counts
 from devices.clock import Clock
 from devices.errors import NoAcknowledgeError
 from devices.flags import TileFlag
@@ -48,7 +48,7 @@ class PlausibilityCheck:
         self,
         scan: Scan,
         tile: int,
-        counts: tuple[int, int],
+        counts: Counts,
         *,
         with_temperature: bool,
         may_retry: bool,
@@ -72,7 +72,7 @@ class PlausibilityCheck:
             # On a line with flipped bits an unconfirmed jump is not trusted.
             scan.add_flag(tile, TileFlag.IMPLAUSIBLE)
         scan.pressure_raw[tile], scan.temperature_raw[tile] = counts
-        if impossible := classify_impossible_counts(*counts):
+        if impossible := self._tile_io.classify_counts(tile, counts):
             scan.add_flag(tile, impossible)
             health.mark_lost(self._clock.now_ns())
             scan.zero_reading_count += impossible == TileFlag.NOT_CONVERTED
@@ -92,8 +92,8 @@ class PlausibilityCheck:
             health.accept_reading(*counts, self._clock.now_ns())
 
     def _read_majority(
-        self, scan: Scan, tile: int, words: tuple[int, int], with_temperature: bool
-    ) -> tuple[int, int]:
+        self, scan: Scan, tile: int, words: Counts, with_temperature: bool
+    ) -> Counts:
         """Read again and return the majority: if two readings differ, a third one decides."""
         again = self._reread(scan, tile, with_temperature)
         if again == words:
@@ -111,22 +111,22 @@ class PlausibilityCheck:
             return again
         return third
 
-    def _reread(self, scan: Scan, tile: int, with_temperature: bool) -> tuple[int, int] | None:
+    def _reread(self, scan: Scan, tile: int, with_temperature: bool) -> Counts | None:
         """Select the tile and read the same conversion again; None without an answer."""
         words = None
         self._tile_io.invalidate_muxes([tile])
         with scan.charge_retry(self._clock), suppress(NoAcknowledgeError):
             self._tile_io.connect_tile(tile)
-            words = self._tile_io.read_counts(with_temperature)
+            words = self._tile_io.read_counts(tile, with_temperature)
         return words
 
     def _verify_identity(self, scan: Scan, tile: int) -> None:
-        """Verify by the coefficients that only this tile is connected; else flag it."""
+        """Verify by the registers that only this tile is connected; else flag it."""
         health = self._health[tile]
-        found = b""
+        found = None
         with scan.charge_retry(self._clock), suppress(NoAcknowledgeError):
-            found = self._tile_io.read_coefficient_bytes()
-        if found != health.coefficient_bytes:
+            found = self._tile_io.read_registers(tile)
+        if found != health.registers:
             self._tile_io.router.invalidate_cache()
             scan.add_flag(tile, TileFlag.IMPLAUSIBLE)
             health.mark_lost(self._clock.now_ns())
@@ -173,13 +173,14 @@ class ConversionMonitor:
         self._tile_io = ports
         self._clock = clock
         self._health = health
-        whole = replace(timing, bytes_per_read=4.0)
+        whole = replace(timing, bytes_per_read=max(chip.counts_bytes for chip in ports.chips))
+        self._longest_ns = [chip.conversion_max_ns for chip in ports.chips]
         self._wires_ns = round((whole.convert_s + whole.read_s) * 1e9)
         self._suspects: list[int] = []
         self._slow_due_ns = 0
         self._tries = 0
 
-    def check_read_in_time(self, tile: int, last_counts: tuple[int, int]) -> None:
+    def check_read_in_time(self, tile: int, last_counts: Counts) -> None:
         """Re-read a tile that gave `words` and was not restarted; suspect it if they changed.
 
         Raises:
@@ -188,7 +189,7 @@ class ConversionMonitor:
         if self._health[tile].is_slow:
             return
         self._tile_io.connect_tile(tile)
-        pressure_raw, temperature_raw = self._tile_io.read_counts(with_temperature=True)
+        pressure_raw, temperature_raw = self._tile_io.read_counts(tile, with_temperature=True)
         if pressure_raw != last_counts[0] or last_counts[1] not in (temperature_raw, NOT_READ):
             self.queue_trial(tile)
 
@@ -221,7 +222,7 @@ class ConversionMonitor:
         health = self._health[tile]
         tries = _SLOW_TRIES if health.is_slow else _TRIES
         settled = [self._convert_fully(tile)]
-        early: list[tuple[int, int]] = []
+        early: list[Counts] = []
         for _ in range(tries):
             words, in_time = self._convert_and_read(tile, self._measured_ns[tile])
             if not in_time:
@@ -241,18 +242,18 @@ class ConversionMonitor:
         elif len(early) >= _SAME_MAX and len(set(settled)) > 1 and not health.is_slow:
             # Conversions finish late. (A longer wait would not help a part that never finishes.)
             health.is_slow = True
-            self.wait_ns[tile] = max(self._measured_ns[tile], CONVERSION_MAX_NS)
+            self.wait_ns[tile] = max(self._measured_ns[tile], self._longest_ns[tile])
         self._slow_due_ns = self._clock.now_ns() + SLOW_AUDIT_NS
 
     def _mark_fast(self, tile: int) -> None:
         self._health[tile].is_slow = False
         self.wait_ns[tile] = self._measured_ns[tile]
 
-    def _convert_fully(self, tile: int) -> tuple[int, int]:
+    def _convert_fully(self, tile: int) -> Counts:
         """Convert with the longest wait and return the counts."""
-        return self._convert_and_read(tile, CONVERSION_MAX_NS)[0]
+        return self._convert_and_read(tile, self._longest_ns[tile])[0]
 
-    def _convert_and_read(self, tile: int, delay_ns: int) -> tuple[tuple[int, int], bool]:
+    def _convert_and_read(self, tile: int, delay_ns: int) -> tuple[Counts, bool]:
         """Convert and read after `delay_ns`; return the counts and whether the read was on time.
 
         A busy machine may pause before either transfer, so all time off the wires counts as
@@ -262,7 +263,7 @@ class ConversionMonitor:
         self._tile_io.start_conversions([tile])
         stop_ns = self._clock.now_ns()
         self._clock.sleep_until_ns(stop_ns + delay_ns)
-        words = self._tile_io.read_counts(with_temperature=True)
+        words = self._tile_io.read_counts(tile, with_temperature=True)
         waited_ns = self._clock.now_ns() - begin_ns - self._wires_ns
-        self._clock.sleep_until_ns(stop_ns + CONVERSION_MAX_NS)
+        self._clock.sleep_until_ns(stop_ns + self._longest_ns[tile])
         return words, waited_ns <= delay_ns + _HESITATION_NS

@@ -113,7 +113,7 @@ class BusTiming:
         scl_hz: real bus clock.
         conversions_s: wait for each tile's conversion, in tile order.
         muxes: mux address of each tile.
-        bytes_per_read: bytes of a sample, 4 with temperature and 2 without; a mean if decimated.
+        bytes_per_read: bytes of a sample; a mean if temperature is decimated, or chips differ.
         transaction_overhead_s: overhead of one transaction beyond its bits.
         sleep_overshoot_s: overshoot of a sleep.
     """

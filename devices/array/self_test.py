@@ -1,39 +1,34 @@
 """Self-test of bus and parts before the first frame: identity, bus clock, conversion times.
 
-Conversion times differ from part to part (1.6 ms typical, 3 ms at most, MPL115A2 data sheet table
-10) and no bit signals the end. The effect of a read during a conversion is not documented: it may
-return the last result, abort the conversion, or return the new pressure with the old temperature
-(hardware.md 1.4). So this module reads once per CONVERT, never polls, and cycles no power; changed
-counts show that a conversion has finished.
+Conversion times differ from part to part, and no bit of an MPL115A2 signals the end. The effect of
+a read during a conversion is not documented: it may return the last result, abort the conversion,
+or return the new pressure with the old temperature (hardware.md 1.4). So this module reads once per
+CONVERT, never polls, and cycles no power; changed counts show that a conversion has finished.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 from devices.array.schedules import CONVERT_BITS, count_read_bits
 from devices.buses.i2c import I2cBus, i2c_msg
-from devices.chips.mpl115a2 import (
-    ADDRESS,
-    CONVERSION_MAX_NS,
-    CONVERSION_TYPICAL_NS,
-    REGISTER_COEFFICIENTS,
-    Mpl115a2,
-)
+from devices.chips.pressure_chip import Counts, PressureChip, Registers
+from devices.chips.pressure_chips import PRESSURE_CHIPS, get_chip
 from devices.chips.tca9548a import ADDRESSES, CHANNELS, MuxRouter, Tca9548a
 from devices.clock import Clock
 from devices.errors import BusFaultError, NoAcknowledgeError, TileSetupError
 from devices.frames import TileInfo
 from devices.scene.hardware_sections import TileSection
 
-_SETTLED_NS = 3_200_000  # the longest conversion and a little more
-_SHORTEST_NS = 800_000  # half the typical time: no part is that fast
-_RESOLUTION_NS = 8_000  # half a percent of the typical time
+_SPARE_NS = 200_000  # beyond the longest conversion
+_SHORTEST_DIVISOR = 2  # of the typical time: no part is that fast
+_RESOLUTION_DIVISOR = 200  # of the typical time
 _NEVER_NS = 1 << 62
 _SAME_MAX = 8
-"""Unchanged readings from which a conversion counts as unfinished. Two readings of a healthy part
-are equal by chance in one of nine cases, eight in one of 10^7."""
+"""Unchanged readings from which a conversion counts as unfinished. Two of a healthy MPL115A2 are
+equal by chance in one of nine cases, eight in one of 10^7."""
 _TEMPERATURE_SAME_MAX = 20
 """Limit like `_SAME_MAX`, for the temperature alone, which is equal by chance in every second
 reading. It is loaded last."""
@@ -50,26 +45,26 @@ _SCL_BYTES = (2, 12)  # far apart, within the part's registers
 
 
 def identify_tiles(bus: I2cBus, tiles: Sequence[TileSection]) -> tuple[TileInfo, ...]:
-    """Identify every tile of a scene, one channel at a time, by three equal coefficient reads.
+    """Identify every tile of a scene, one channel at a time, by equal readings of its registers.
 
     One at a time, because in a broadcast the acknowledge is a wired AND, which hides a missing tile
     (hardware.md 2).
 
     Raises:
-        TileSetupError: a tile or its mux does not answer, or its coefficients are implausible.
+        TileSetupError: a tile or its mux does not answer, or its registers are implausible.
         BusFaultError: the bus itself fails.
     """
     _close_muxes(bus)
     router = MuxRouter(bus, (tile.mux for tile in tiles))
-    chip = Mpl115a2(bus)
-    return tuple(_identify_tile(router, chip, tile) for tile in tiles)
+    return tuple(_identify_tile(bus, router, tile) for tile in tiles)
 
 
-def _identify_tile(router: MuxRouter, chip: Mpl115a2, tile: TileSection) -> TileInfo:
+def _identify_tile(bus: I2cBus, router: MuxRouter, tile: TileSection) -> TileInfo:
+    chip = get_chip(tile.chip)
     where = f"tile {tile.serial} (mux 0x{tile.mux:02x} channel {tile.channel})"
     try:
         router.connect_single_channel(tile.mux, tile.channel)
-        words = chip.read_coefficient_words(where=where)
+        registers = _start_up_and_identify(bus, chip, tile.chip_address, where)
     except NoAcknowledgeError as error:
         raise TileSetupError(
             f"does not answer: {error}",
@@ -80,34 +75,46 @@ def _identify_tile(router: MuxRouter, chip: Mpl115a2, tile: TileSection) -> Tile
         serial=tile.serial,
         mux=tile.mux,
         channel=tile.channel,
-        coefficient_words=words,
+        chip=chip.name,
+        address=tile.chip_address,
+        registers=registers,
         x_m=tile.x_m,
         y_m=tile.y_m,
         z_m=tile.z_m,
         reference=tile.reference,
-        conversion_ms=CONVERSION_TYPICAL_NS / 1e6,
+        conversion_ms=chip.conversion_typical_ns / 1e6,
     )
+
+
+def _start_up_and_identify(bus: I2cBus, chip: PressureChip, address: int, where: str) -> Registers:
+    driver = chip.make_driver(bus, address)
+    driver.start_up()
+    return driver.identify(where=where)
 
 
 @dataclass(frozen=True)
 class FoundTile:
-    """Device found at address 0x60 behind a channel of a mux.
+    """Device found at a pressure chip's address behind a channel of a mux.
 
     Attributes:
         mux: address of the mux.
         channel: 0 to 7.
-        coefficient_words: the part's coefficients; None if they are implausible.
+        chip: kind of chip that has this address.
+        address: of the part.
+        registers: the part's registers; None if they are implausible.
         problem: fault of the part; empty if it is sound.
     """
 
     mux: int
     channel: int
-    coefficient_words: tuple[int, int, int, int] | None
+    chip: str
+    address: int
+    registers: Registers | None
     problem: str = ""
 
 
 def find_tiles_on_all_channels(bus: I2cBus) -> tuple[FoundTile, ...]:
-    """Search all mux addresses and channels for tiles, one at a time, without a scene.
+    """Search all muxes, channels and chip addresses for tiles, one at a time, without a scene.
 
     Raises:
         BusFaultError: the bus itself fails, or acknowledges everything and returns only zeros.
@@ -120,18 +127,20 @@ def find_tiles_on_all_channels(bus: I2cBus) -> tuple[FoundTile, ...]:
             where=bus.name,
             remedy="SDA is stuck low: pull the tiles' plugs one by one, or cycle their supply",
         )
-    chip = Mpl115a2(bus)
+    kinds = [(chip, address) for chip in PRESSURE_CHIPS.values() for address in chip.addresses]
     plugs = []
-    for mux in muxes:
-        for channel in CHANNELS:
-            try:
-                router.connect_single_channel(mux, channel)
-                words = chip.read_coefficient_words(where=f"mux 0x{mux:02x} channel {channel}")
-                plugs.append(FoundTile(mux, channel, words))
-            except NoAcknowledgeError:
-                continue
-            except TileSetupError as error:
-                plugs.append(FoundTile(mux, channel, None, str(error)))
+    for mux, channel, (chip, address) in product(muxes, CHANNELS, kinds):
+        place = (mux, channel, chip.name, address)
+        try:
+            router.connect_single_channel(mux, channel)
+            registers = _start_up_and_identify(
+                bus, chip, address, f"mux 0x{mux:02x} channel {channel}"
+            )
+            plugs.append(FoundTile(*place, registers))
+        except NoAcknowledgeError:
+            continue
+        except TileSetupError as error:
+            plugs.append(FoundTile(*place, None, str(error)))
     return tuple(plugs)
 
 
@@ -170,9 +179,9 @@ def measure_wire_timing(bus: I2cBus, clock: Clock, tile: TileInfo) -> WireTiming
     """
     router = MuxRouter(bus, _close_muxes(bus))
     router.connect_single_channel(tile.mux, tile.channel)
-    point = i2c_msg.write(ADDRESS, [REGISTER_COEFFICIENTS])
+    point = i2c_msg.write(tile.address, [get_chip(tile.chip).readable_register])
     took_ns: dict[int, list[int]] = {n: [] for n in _SCL_BYTES}
-    reads = {n: i2c_msg.read(ADDRESS, n) for n in _SCL_BYTES}
+    reads = {n: i2c_msg.read(tile.address, n) for n in _SCL_BYTES}
     for _ in range(_SCL_READS):
         for n, read in reads.items():  # in turn, so that a drift of the load touches both
             begin_ns = clock.now_ns()
@@ -203,23 +212,25 @@ def measure_conversion_ns(
     """
     router = MuxRouter(bus, _close_muxes(bus))
     router.connect_single_channel(tile.mux, tile.channel)
-    chip = Mpl115a2(bus)
+    chip = get_chip(tile.chip)
+    driver = chip.make_driver(bus, tile.address)
+    settled_ns = chip.conversion_max_ns + _SPARE_NS
 
-    wires_ns = round(1e9 * (CONVERT_BITS + count_read_bits(4.0)) / wires.scl_hz)
+    wires_ns = round(1e9 * (CONVERT_BITS + count_read_bits(chip.counts_bytes)) / wires.scl_hz)
     wires_ns += round(2e9 * wires.transaction_overhead_s)
 
-    def convert_and_read(delay_ns: int) -> tuple[tuple[int, int], int]:
+    def convert_and_read(delay_ns: int) -> tuple[Counts, int]:
         """Return the counts, and the longest possible delay from CONVERT to their read.
 
         A busy machine may pause before either transaction, so all time off the wires counts.
         """
         begin_ns = clock.now_ns()
-        chip.start_conversion()
+        driver.start_conversion()
         stop_ns = clock.now_ns()
         clock.sleep_until_ns(stop_ns + delay_ns)
-        words = chip.read_counts()
+        words = driver.read_counts()
         waited_ns = max(delay_ns, clock.now_ns() - begin_ns - wires_ns)
-        clock.sleep_until_ns(stop_ns + _SETTLED_NS)
+        clock.sleep_until_ns(stop_ns + settled_ns)
         return words, waited_ns
 
     def finished_within(delay_ns: int, known_ns: int) -> int | None:
@@ -231,7 +242,7 @@ def measure_conversion_ns(
         in_time = 0
         pressure_changed = False
         for _ in range(_TEMPERATURE_SAME_MAX):
-            settled, _ = convert_and_read(_SETTLED_NS)
+            settled, _ = convert_and_read(settled_ns)
             words, waited_ns = convert_and_read(delay_ns)
             if waited_ns >= known_ns and words != settled:
                 continue
@@ -243,17 +254,21 @@ def measure_conversion_ns(
                 return None
         return None if in_time >= _SAME_MAX else known_ns
 
-    delay_ns = _bisect_conversion_ns(finished_within)
+    delay_ns = _bisect_conversion_ns(chip, finished_within)
     if delay_ns is None:
         return None
-    return min(CONVERSION_MAX_NS, round((delay_ns + _ADDRESS_BITS * 1e9 / wires.scl_hz) * _MARGIN))
+    waits_ns = round((delay_ns + _ADDRESS_BITS * 1e9 / wires.scl_hz) * _MARGIN)
+    return min(chip.conversion_max_ns, waits_ns)
 
 
-def _bisect_conversion_ns(finished_within: Callable[[int, int], int | None]) -> int | None:
-    if finished_within(CONVERSION_MAX_NS, _NEVER_NS) is None:
+def _bisect_conversion_ns(
+    chip: PressureChip, finished_within: Callable[[int, int], int | None]
+) -> int | None:
+    if finished_within(chip.conversion_max_ns, _NEVER_NS) is None:
         return None
-    unfinished_ns, finished_ns = _SHORTEST_NS, CONVERSION_MAX_NS
-    while finished_ns - unfinished_ns > _RESOLUTION_NS:
+    unfinished_ns = chip.conversion_typical_ns // _SHORTEST_DIVISOR
+    finished_ns = chip.conversion_max_ns
+    while finished_ns - unfinished_ns > chip.conversion_typical_ns // _RESOLUTION_DIVISOR:
         middle_ns = (unfinished_ns + finished_ns) // 2
         waited_ns = finished_within(middle_ns, finished_ns)
         if waited_ns is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from statistics import fmean
 
 from devices.array.bus_monitor import RecoveryResult, recover_bus
 from devices.array.schedules import BusTiming, ScheduleChoice, choose_schedule, compute_frame_s
@@ -15,7 +16,7 @@ from devices.array.self_test import (
 )
 from devices.array.tile_array import TileArray
 from devices.buses.i2c import I2cBus, RetryingBus
-from devices.chips.mpl115a2 import CONVERSION_MAX_NS
+from devices.chips.pressure_chips import get_chip
 from devices.chips.tca9548a import MuxRouter
 from devices.clock import Clock
 from devices.errors import BusFaultError, SceneError
@@ -32,7 +33,8 @@ class MeasuredTiles:
     Attributes:
         tiles: identified tiles, with measured conversion times.
         timing: timing of the bus and the parts.
-        unmeasured_serials: serials whose conversion time could not be measured; 3 ms is assumed.
+        unmeasured_serials: serials whose conversion time could not be measured; the longest is
+            assumed.
     """
 
     tiles: tuple[TileInfo, ...]
@@ -137,7 +139,7 @@ def reidentify_replaced_tiles(
     The other parts are not measured again, so that the interruption is short.
 
     Raises:
-        TileSetupError, I2cError: a new part is gone again, or is no MPL115A2.
+        TileSetupError, I2cError: a new part is gone again, or is of another kind.
     """
     replaced = ready_array.array.replaced_serials
     new = [tile for tile in scene.tile if tile.serial in replaced]
@@ -246,14 +248,14 @@ def identify_and_measure(bus: I2cBus, scene: Scene, clock: Clock) -> MeasuredTil
                 unmeasured.append(tile.serial)
             else:
                 tiles[index] = tile.model_copy(update={"conversion_ms": conversion_ns / 1e6})
-    timing = compute_bus_timing(scene.array, wires, [tile.mux for tile in tiles], conversions_ns)
+    timing = compute_bus_timing(scene.array, wires, tiles, conversions_ns)
     return MeasuredTiles(tuple(tiles), timing, tuple(unmeasured))
 
 
 def compute_bus_timing(
     array: ArraySection,
     wires: WireTiming,
-    muxes: Sequence[int],
+    tiles: Sequence[TileInfo],
     conversions_ns: Sequence[int | None],
 ) -> BusTiming:
     """Compute the bus timing, with the scene's waits, else the measured ones.
@@ -261,17 +263,23 @@ def compute_bus_timing(
     Args:
         array: section of the scene.
         wires: measured timing of the wires.
-        muxes: mux address of each tile.
+        tiles: identified tiles.
         conversions_ns: measured conversion time of each tile; None: unknown, so the data sheet's
             longest.
     """
     if array.wait_ms is not None:
-        conversions_ns = [round(array.wait_ms * 1e6)] * len(muxes)
-    waits_ns = [CONVERSION_MAX_NS if known is None else known for known in conversions_ns]
+        conversions_ns = [round(array.wait_ms * 1e6)] * len(tiles)
+    chips = [get_chip(tile.chip) for tile in tiles]
+    waits_ns = [
+        chip.conversion_max_ns if known is None else known
+        for chip, known in zip(chips, conversions_ns, strict=True)
+    ]
+    alone_bytes = fmean(chip.pressure_bytes for chip in chips)
+    whole_bytes = fmean(chip.counts_bytes for chip in chips)
     return BusTiming(
         scl_hz=wires.scl_hz,
         conversions_s=tuple(wait_ns * 1e-9 for wait_ns in waits_ns),
-        muxes=tuple(muxes),
-        bytes_per_read=2.0 + 2.0 / array.temperature_every,
+        muxes=tuple(tile.mux for tile in tiles),
+        bytes_per_read=alone_bytes + (whole_bytes - alone_bytes) / array.temperature_every,
         transaction_overhead_s=wires.transaction_overhead_s,
     )

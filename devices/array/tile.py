@@ -2,9 +2,9 @@
 
 A `Scan` collects the readings and flags of one frame, and its remaining retry budget.
 
-The protocol has no checksum and the part no status bit (hardware.md 1.1, 8). Evidence of a fault:
-counts that no working part gives, a jump that a second read does not confirm, readings that never
-change, and other factory coefficients than at start-up.
+The protocol has no checksum, and a part may have no status bit (MPL115A2: hardware.md 1.1, 8).
+Evidence of a fault: counts that no working part gives, a jump that a second read does not confirm,
+readings that never change, and other registers than at start-up.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from devices.buses.i2c import I2cBus
-from devices.chips.mpl115a2 import COUNTS_MAX, Coefficients, Mpl115a2, compute_kpa_per_padc
+from devices.chips.pressure_chip import Counts, Registers
+from devices.chips.pressure_chips import get_chip
 from devices.chips.tca9548a import MuxRouter
 from devices.clock import Clock
 from devices.errors import BusFaultError
@@ -29,7 +30,13 @@ class TileIo:
     def __init__(self, bus: I2cBus, tiles: Sequence[TileInfo]) -> None:
         self.tiles = tuple(tiles)
         self.router = MuxRouter(bus, [tile.mux for tile in tiles])
-        self._chip = Mpl115a2(bus)
+        self.chips = tuple(get_chip(tile.chip) for tile in tiles)
+        # A driver for each kind and address: it starts all connected parts of these at once.
+        drivers = {
+            (tile.chip, tile.address): chip.make_driver(bus, tile.address)
+            for tile, chip in zip(tiles, self.chips, strict=True)
+        }
+        self._drivers = [drivers[tile.chip, tile.address] for tile in tiles]
         self._masks: dict[tuple[int, ...], dict[int, int]] = {
             (i,): {tile.mux: 1 << tile.channel} for i, tile in enumerate(tiles)
         }
@@ -39,33 +46,37 @@ class TileIo:
         self.router.connect_channels(self._masks[(tile,)])
 
     def start_conversions(self, tiles: Sequence[int]) -> None:
-        """Start a conversion in all of `tiles` with one CONVERT."""
+        """Start a conversion in all of `tiles` at once."""
         self.router.connect_channels(self._masks_of(tuple(tiles)))
-        self._chip.start_conversion()
+        for driver in dict.fromkeys(self._drivers[i] for i in tiles):
+            driver.start_conversion()
 
-    def read_counts(self, with_temperature: bool) -> tuple[int, int]:
-        """Return `pressure_raw` and `temperature_raw` (or `NOT_READ`) of the connected tile.
+    def read_counts(self, tile: int, with_temperature: bool) -> Counts:
+        """Return `pressure_raw` and `temperature_raw` (or `NOT_READ`) of a connected tile."""
+        driver = self._drivers[tile]
+        if not with_temperature and (pressure_raw := driver.read_pressure()) is not None:
+            return pressure_raw, NOT_READ
+        return driver.read_counts()
 
-        At either end of the counts pressure alone cannot tell an overloaded part from a stuck line
-        (hardware.md 8), so the temperature is read as well.
-        """
-        if not with_temperature:
-            pressure_raw = self._chip.read_padc()
-            if pressure_raw not in (0, COUNTS_MAX):
-                return pressure_raw, NOT_READ
-        return self._chip.read_counts()
+    def classify_counts(self, tile: int, counts: Counts) -> int:
+        """Return the flag of counts just read that no working part gives; 0 for others."""
+        return self._drivers[tile].classify_counts(*counts)
 
-    def read_coefficient_bytes(self) -> bytes:
-        """Read the eight coefficient bytes of the connected tile, once."""
-        return self._chip.read_coefficient_bytes()
+    def start_up(self, tile: int) -> None:
+        """Prepare a connected tile after power-up."""
+        self._drivers[tile].start_up()
 
-    def read_coefficient_words(self, tile: int) -> tuple[int, int, int, int]:
-        """Read a tile's coefficients three times and check them.
+    def read_registers(self, tile: int) -> Registers:
+        """Read the registers of a connected tile, once."""
+        return self._drivers[tile].read_registers()
+
+    def identify(self, tile: int) -> Registers:
+        """Read the registers of a connected tile repeatedly and check them.
 
         Raises:
-            TileSetupError: the readings differ or are implausible.
+            TileSetupError: the readings differ, or are no such chip's.
         """
-        return self._chip.read_coefficient_words(where=f"tile {self.tiles[tile].serial}")
+        return self._drivers[tile].identify(where=f"tile {self.tiles[tile].serial}")
 
     def invalidate_muxes(self, tiles: Sequence[int]) -> None:
         """Discard the cached state of the muxes of these tiles."""
@@ -90,7 +101,7 @@ class Scan:
     """Readings and flags of one frame, one entry per tile.
 
     Attributes:
-        pressure_raw: 0 to 1023, `NOT_READ` where not read.
+        pressure_raw: counts, `NOT_READ` where not read.
         temperature_raw: likewise.
         convert_stop_ns: CLOCK_MONOTONIC at the STOP of the CONVERT of each sample.
         tile_flags: `TileFlag` bits.
@@ -147,35 +158,17 @@ class Scan:
         self.tile_flags[tile] |= status
 
 
-JUMP_KPA = 0.5
-"""Distance from the median of the last three above which a reading is read again. That affects
-1.7 % of a healthy part's readings (noise 0.165 kPa with outliers, hardware.md 1.3)."""
-FAR_JUMP_KPA = 1.5
-"""Distance beyond any outlier of a healthy part: if confirmed, the tile's identity is verified."""
-JUMP_TADC = 5
-"""Temperature does not change by a kelvin from one frame to the next (hardware.md 8)."""
-
 STALE_EVIDENCE = 20
 """Evidence from which a tile is stale. A reading equal to the previous one counts two, or one if
-only the pressure was read. One in nine readings of a healthy part equals its neighbour, so ten in a
-row occur once in 10^9; with noise that is correlated over 10 ms once in 10^6."""
+only the pressure was read. One in nine readings of a healthy MPL115A2, and fewer of a finer chip,
+equals its neighbour, so ten in a row occur once in 10^9; with noise that is correlated over 10 ms
+once in 10^6."""
 
 _TRIAL_EVERY = 2048  # every two seconds at 500 frames a second
-_TADC_MAX_NS = 500_000_000  # half the hold of `devices.temperature_hold`
-_IMPOSSIBLE_TADC = (0, COUNTS_MAX)
+_TEMPERATURE_MAX_NS = 500_000_000  # half the hold of `devices.frames`
 _FIRST_PROBE_NS = 2_000_000  # a loose plug is back within a few milliseconds
 _PROBES_NS = 1_000_000_000  # longest interval between probes
 _RECENT = 3  # a single outlier does not move the median of three
-
-
-def classify_impossible_counts(pressure_raw: int, temperature_raw: int) -> int:
-    """Return the tile flag of counts that no working part gives; 0 if they are possible."""
-    if pressure_raw == temperature_raw == 0:
-        return TileFlag.NOT_CONVERTED  # registers after power-up
-    # Both ends of the temperature are 100 K away from anything this foot survives.
-    if temperature_raw in _IMPOSSIBLE_TADC:
-        return TileFlag.IMPLAUSIBLE
-    return 0
 
 
 class TileHealth:
@@ -184,21 +177,22 @@ class TileHealth:
     def __init__(self, info: TileInfo) -> None:
         self.fault_counts: Counter[str] = Counter()
         """Fault counts, by the name of the flag."""
-        self.coefficient_words = info.coefficient_words
-        self.coefficient_bytes = b"".join(w.to_bytes(2, "big") for w in info.coefficient_words)
+        self.registers = info.registers
         self.is_present = True
-        """True if the tile answers and is verified. Else its coefficients are checked first."""
+        """True if the tile answers and is verified. Else its registers are checked first."""
         self.is_replaced = False
         """True if another part answers in its place."""
         self.is_slow = False
         """True if conversions take longer than measured at start-up."""
-        chip = Coefficients.from_words(info.coefficient_words)
-        count_kpa = abs(float(compute_kpa_per_padc(500, chip.b1, chip.c12)))
-        self._jump = JUMP_KPA / count_kpa
-        self._far_jump = FAR_JUMP_KPA / count_kpa
+        chip = get_chip(info.chip)
+        law = chip.make_law(info.registers)
+        count_kpa = abs(float(law.compute_kpa_per_count(chip.temperature_raw_usual)))
+        self._jump = chip.jump_kpa / count_kpa
+        self._far_jump = chip.far_jump_kpa / count_kpa
+        self._jump_temperature_counts = chip.jump_temperature_counts
         self._recent: deque[int] = deque(maxlen=_RECENT)
         self._temperature_raw: int | None = None
-        self._tadc_ns = 0
+        self._temperature_ns = 0
         self._last_words = (NOT_READ, NOT_READ)
         self._stale_evidence = 0
         self._probe_due_ns = 0
@@ -215,7 +209,7 @@ class TileHealth:
             self._probe_wait_ns = min(2 * self._probe_wait_ns, _PROBES_NS)
 
     def mark_unverified(self, now_ns: int) -> None:
-        """Mark the tile as unverified: another part may answer, so check its coefficients."""
+        """Mark the tile as unverified: another part may answer, so check its registers."""
         self.is_present = False
         self._probe_due_ns = now_ns
         self._probe_wait_ns = _FIRST_PROBE_NS
@@ -239,7 +233,7 @@ class TileHealth:
 
     def is_temperature_due(self, now_ns: int) -> bool:
         """Return whether the last temperature is missing or too old."""
-        return self._temperature_raw is None or now_ns - self._tadc_ns > _TADC_MAX_NS
+        return self._temperature_raw is None or now_ns - self._temperature_ns > _TEMPERATURE_MAX_NS
 
     def is_jump(self, pressure_raw: int, temperature_raw: int, *, is_strict: bool = False) -> bool:
         """Return whether a reading is far from the previous ones, or has too few to compare with.
@@ -262,7 +256,7 @@ class TileHealth:
         self._recent.append(pressure_raw)
         if temperature_raw != NOT_READ:
             self._temperature_raw = temperature_raw
-            self._tadc_ns = now_ns
+            self._temperature_ns = now_ns
 
     def update_staleness(self, pressure_raw: int, temperature_raw: int) -> bool:
         """Update the evidence with a frame's reading; return whether the tile is stale."""
@@ -298,5 +292,5 @@ class TileHealth:
         return (
             temperature_raw != NOT_READ
             and self._temperature_raw is not None
-            and abs(temperature_raw - self._temperature_raw) > JUMP_TADC
+            and abs(temperature_raw - self._temperature_raw) > self._jump_temperature_counts
         )

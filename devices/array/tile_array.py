@@ -3,10 +3,8 @@
 A schedule (`devices.array.schedules`) orders the transfers of a frame; this module runs them and
 handles their faults. A fault is a tile flag in its frame, never an exception. A bad tile must not
 slow down the others: retries share a time budget in each frame, and a silent tile is probed with a
-backoff. When it answers again its coefficients are checked first: it may be another part.
-
-The eight factory coefficients are the only identity of a part. A part that answers with other
-coefficients is another part.
+backoff. When it answers again its registers are checked first: they are the only identity of a
+part, and a part that answers with others is another part.
 """
 
 from __future__ import annotations
@@ -25,7 +23,6 @@ from devices.array.schedules import (
 )
 from devices.array.tile import Scan, TileHealth, TileIo
 from devices.buses.i2c import I2cBus
-from devices.chips.mpl115a2 import SAMPLE_DELAY_DIVISOR
 from devices.clock import Clock
 from devices.errors import BusFaultError, NoAcknowledgeError, TileSetupError
 from devices.flags import TileFlag
@@ -65,10 +62,11 @@ class TileReconnector:
             health.mark_lost(self._clock.now_ns())
 
     def _verify_identity(self, tile: int) -> bool:
-        """Return whether the coefficients are the tile's own; mark another part as replaced."""
+        """Return whether the registers are the tile's own; mark another part as replaced."""
         health = self._health[tile]
         self._tile_io.connect_tile(tile)
-        if self._tile_io.read_coefficient_bytes() == health.coefficient_bytes:
+        self._tile_io.start_up(tile)
+        if self._tile_io.read_registers(tile) == health.registers:
             health.is_replaced = False
             return True
         # A flipped bit, in the reading or the select before it, must not look like another part.
@@ -76,11 +74,11 @@ class TileReconnector:
         for _ in range(2):
             self._tile_io.router.invalidate_cache()
             self._tile_io.connect_tile(tile)
-            words.add(self._tile_io.read_coefficient_words(tile))
-        if words == {health.coefficient_words}:
+            words.add(self._tile_io.identify(tile))
+        if words == {health.registers}:
             health.is_replaced = False
             return True
-        # Three equal, plausible readings of other coefficients: another part.
+        # Equal, plausible readings of other registers: another part.
         health.is_replaced = len(words) == 1 and not self._tile_io.router.silent_addresses
         return False
 
@@ -139,13 +137,14 @@ class TileArray:
         self.tiles_by_mux = tuple(
             tuple(i for i in self.tile_indices if muxes[i] == mux) for mux in sorted(set(muxes))
         )
-        self.sample_delay_ns = tuple(
-            round(tile.conversion_ms * 1e6) // SAMPLE_DELAY_DIVISOR for tile in tiles
-        )
-        """Delay from the STOP of a tile's CONVERT to the assumed sample instant of its pressure."""
         self.health = tuple(TileHealth(tile) for tile in tiles)
         self._clock = clock
         self._tile_io = TileIo(bus, tiles)
+        self.sample_delay_ns = tuple(
+            round(tile.conversion_ms * 1e6) // chip.sample_delay_divisor
+            for tile, chip in zip(tiles, self._tile_io.chips, strict=True)
+        )
+        """Delay from the STOP of a tile's CONVERT to the assumed sample instant of its pressure."""
         self.bus_monitor = BusMonitor(self._tile_io.router, clock, recovery)
         self._plausibility = PlausibilityCheck(self._tile_io, clock, self.health, self.bus_monitor)
         self._reconnector = TileReconnector(self._tile_io, clock, self.health)
@@ -314,7 +313,7 @@ class TileArray:
             nonlocal words
             self._tile_io.connect_tile(tile)
             self._wait_for_conversion(scan, ready_ns)
-            words = self._tile_io.read_counts(with_temperature)
+            words = self._tile_io.read_counts(tile, with_temperature)
 
         answers = self._run_with_retry(scan, [tile], transfers)
         self._is_converting[tile] = False

@@ -37,7 +37,7 @@ TIMEOUT_10MS = 3
 
 READ_BUFFER_FILL = 0xFF
 """Content of a read buffer before the transfer, so that stale bytes cannot pass as a reading if an
-adapter leaves the buffer as it is. No working part returns it (see `classify_impossible_counts`),
+adapter leaves the buffer as it is. No working part returns it (see `ChipDriver.classify_counts`),
 and no mux has all channels open."""
 _READ = 0x0001  # I2C_M_RD, include/uapi/linux/i2c.h
 

@@ -1,6 +1,6 @@
 """Timing of faults of parts, multiplexers and wires, from scene files or injected by tests.
 
-Their effects are in the emulated devices: `mpl115a2` for tiles, `tca9548a` for multiplexers,
+Their effects are in the emulated devices: the chips for tiles, `tca9548a` for multiplexers,
 `FaultyWires` of `i2c_bus` for the two wires.
 """
 
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from devices.scene.emulation_sections import BUS_TARGET, DEFAULT_FAULT_RATE, FaultKind, FaultSection
@@ -144,3 +145,23 @@ class SceneFaults:
         self._epoch_ns = epoch_ns
         for fault in self._faults.values():
             fault.begin_scene_time(epoch_ns)
+
+
+@dataclass
+class PartFaults:
+    """Faults of one part.
+
+    `no_answer`: no acknowledge, as with RST low; registers and conversion go on. `unplugged`: no
+    supply; afterwards its registers are zero. `replaced`: unplugged, then another part in its
+    place. `stale`: conversions never end. `slow`: they take 2.9 ms, still within the data sheet.
+    `all_ones`: the part is lost between address and data, so that the line floats high.
+    """
+
+    no_answer: FaultTiming = field(default_factory=FaultTiming)
+    unplugged: FaultTiming = field(default_factory=FaultTiming)
+    replaced: FaultTiming = field(default_factory=FaultTiming)
+    stale: FaultTiming = field(default_factory=FaultTiming)
+    slow: FaultTiming = field(default_factory=FaultTiming)
+    all_ones: FaultTiming = field(default_factory=FaultTiming)
+    scene: SceneFaults | None = None
+    """All faults of the scene; while none is possible, the others are not evaluated."""

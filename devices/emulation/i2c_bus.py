@@ -13,13 +13,14 @@ import ctypes
 import errno
 import os
 import random
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial, reduce
 from operator import and_
 from typing import Protocol
 
 from devices.buses.i2c import i2c_msg
+from devices.chips.pressure_chip import Counts, Registers
 from devices.clock import Clock
 from devices.emulation.fault_timing import FaultTiming, SceneFaults
 
@@ -54,6 +55,21 @@ class I2cDevice(Protocol):
 
     def interrupt_supply(self) -> None:
         """Interrupt the supply for a moment."""
+
+
+OnConversion = Callable[[int, Counts, Registers], None]
+"""Callback for every conversion: instant of its CONVERT's STOP, its counts, and the part's
+registers. Only for judging drivers."""
+
+
+class EmulatedChip(I2cDevice, Protocol):
+    """Emulated pressure chip on the bus."""
+
+    on_conversion: OnConversion | None
+
+    @property
+    def sample_delay_ns(self) -> int:
+        """Delay of a sample after the instant that drivers assume."""
 
 
 class MuxDevice(I2cDevice, Protocol):

@@ -1,4 +1,4 @@
-"""Properties of emulated parts, drawn by serial and seed, and the families of parts.
+"""Properties of emulated domes, drawn by serial and seed, and the families of parts.
 
 A serial is the same part in every scene and session with the same `parts_seed`. Drivers and
 estimators must not read these properties: they use only the bus, and calibration recordings.
@@ -17,21 +17,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from devices.arrays import Floats
-from devices.chips.mpl115a2 import CONVERSION_MAX_NS, PRESSURE_MAX_KPA, Coefficients, compute_padc
 from devices.errors import SceneError
 from devices.scene.emulation_sections import PartFamily
 
-
-@dataclass(frozen=True)
-class ChipProperties:
-    """Properties of an MPL115A2 (hardware.md 1.3, 1.4, 1.6)."""
-
-    coefficients: Coefficients
-    conversion_ns: int
-    tadc_at_25_degc: float
-    sample_delay_ns: int = 0
-    """Delay of the sample instant after a quarter of the conversion: not documented (hardware.md
-    1.4)."""
+FULL_SCALE_KPA = 115.0
+"""Pressure at which the loads of domes are stated: the end of the paper's chip. A dome is the same
+over any chip."""
 
 
 @dataclass(frozen=True)
@@ -79,38 +70,18 @@ class DomeProperties:
         return np.asarray(self.knee_n * np.expm1(lost / self.stiffening))
 
 
-def draw_chip(serial: str, parts_seed: int) -> ChipProperties:
-    """Draw the chip of a serial. The ranges bracket the three published sets of coefficients."""
-    rng = _make_part_rng("chip", serial, parts_seed)
-    while True:
-        drawn = Coefficients(
-            a0=rng.uniform(1700, 2200),
-            b1=rng.uniform(-2.5, -1.9),
-            b2=rng.uniform(-1.0, -0.85),
-            c12=rng.uniform(0.00065, 0.00088),
-        )
-        coefficients = Coefficients.from_words(drawn.to_words())
-        if 250 <= float(compute_padc(100.0, 500, coefficients)) <= 500:
-            break
-    return ChipProperties(
-        coefficients=coefficients,
-        conversion_ns=min(CONVERSION_MAX_NS, round(rng.uniform(1.4e6, 2.0e6))),
-        tadc_at_25_degc=rng.uniform(472, 498),  # two published scales, 26 counts apart
-    )
-
-
 def draw_dome(serial: str, parts_seed: int) -> DomeProperties:
     """Draw the dome of a serial: an 11 mm Vytaflex 60 dome with casting tolerances.
 
-    It reaches the chip's full scale of 115 kPa at a slow force of 25 to 35 N (paper III-A).
+    It reaches 115 kPa at a slow force of 25 to 35 N (paper III-A).
     """
-    rng = _make_part_rng("dome", serial, parts_seed)
+    rng = make_part_rng("dome", serial, parts_seed)
     seal_kpa = rng.uniform(98.0, 102.5)
     knee_n = rng.uniform(8.0, 13.0)
     wall_per_kpa = rng.uniform(0.0010, 0.0015)
     full_scale_n = rng.uniform(25.0, 35.0)
-    stretched = 1.0 + wall_per_kpa * (PRESSURE_MAX_KPA - seal_kpa)
-    lost = 1.0 - seal_kpa / (PRESSURE_MAX_KPA * stretched)
+    stretched = 1.0 + wall_per_kpa * (FULL_SCALE_KPA - seal_kpa)
+    lost = 1.0 - seal_kpa / (FULL_SCALE_KPA * stretched)
     return DomeProperties(
         seal_kpa=seal_kpa,
         knee_n=knee_n,
@@ -125,7 +96,8 @@ def draw_dome(serial: str, parts_seed: int) -> DomeProperties:
     )
 
 
-def _make_part_rng(what: str, serial: str, parts_seed: int) -> np.random.Generator:
+def make_part_rng(what: str, serial: str, parts_seed: int) -> np.random.Generator:
+    """Create a random generator of a part's property."""
     return make_rng(f"{what}/{parts_seed}/{serial}")
 
 
@@ -135,22 +107,9 @@ def make_rng(label: str) -> np.random.Generator:
     return np.random.default_rng(int.from_bytes(digest[:16], "big"))
 
 
-_SAMPLE_DELAY_MAX_NS = 300_000
-"""Largest deviation of the sample instant from a quarter of the conversion."""
 _LACKING_PROBABILITY = 0.05
 """Probability that a dome lacks the gas effect, creep, or loop: an estimator must not invent one.
 """
-
-
-def draw_family_chip(family: PartFamily, serial: str, parts_seed: int) -> ChipProperties:
-    """Draw the chip of a serial in a family."""
-    chip = draw_chip(serial, parts_seed)
-    if family != "broad":
-        return chip
-    rng = make_rng(f"broad chip/{parts_seed}/{serial}")
-    return replace(
-        chip, sample_delay_ns=round(rng.uniform(-_SAMPLE_DELAY_MAX_NS, _SAMPLE_DELAY_MAX_NS))
-    )
 
 
 def draw_family_dome(family: PartFamily, serial: str, parts_seed: int) -> DomeProperties:
@@ -188,7 +147,7 @@ def _make_paper_dome(serial: str, usual: DomeProperties) -> DomeProperties:
     given = _compute_wall_compliance(modulus_mpa, diameter_mm) / _compute_wall_compliance(
         _MODULUS_MPA["60"], 11.0
     )
-    full_scale_n = float(usual.compute_static_force_n(np.array([PRESSURE_MAX_KPA]))[0])
+    full_scale_n = float(usual.compute_static_force_n(np.array([FULL_SCALE_KPA]))[0])
     part = replace(
         usual,
         knee_n=stiffer * usual.knee_n,
@@ -196,7 +155,7 @@ def _make_paper_dome(serial: str, usual: DomeProperties) -> DomeProperties:
         loop_n=stiffer * usual.loop_n,
     )
     # A more compliant wall alone must not shift the end of the range: only the rubber's forces.
-    shifted = float(part.compute_static_force_n(np.array([PRESSURE_MAX_KPA]))[0])
+    shifted = float(part.compute_static_force_n(np.array([FULL_SCALE_KPA]))[0])
     lost = part.stiffening * np.log1p(shifted / part.knee_n)
     return replace(part, stiffening=float(lost / np.log1p(stiffer * full_scale_n / part.knee_n)))
 
@@ -208,7 +167,7 @@ def _compute_wall_compliance(modulus_mpa: float, diameter_mm: float) -> float:
 
 
 def _draw_broad_dome(rng: np.random.Generator) -> DomeProperties:
-    """Draw a dome of varied rubber and gas that reaches the chip's full scale at 20 to 40 N.
+    """Draw a dome of varied rubber and gas that reaches 115 kPa at 20 to 40 N.
 
     Creep has one to four terms from 10 ms to 10 s, 2 to 15 % in sum. The loop of a slow stroke is
     1 to 5 % of full scale from branch to branch, with any viscous part: flow with the third to
@@ -218,9 +177,7 @@ def _draw_broad_dome(rng: np.random.Generator) -> DomeProperties:
     full_scale_n = 20.0 * 2.0 ** rng.uniform(0.0, 1.0)
     knee_n = full_scale_n * rng.uniform(0.25, 0.5)
     wall_per_kpa = rng.uniform(0.0010, 0.0015) * 30.0 / full_scale_n  # a softer wall gives way more
-    lost = 1.0 - seal_kpa / (
-        PRESSURE_MAX_KPA * (1.0 + wall_per_kpa * (PRESSURE_MAX_KPA - seal_kpa))
-    )
+    lost = 1.0 - seal_kpa / (FULL_SCALE_KPA * (1.0 + wall_per_kpa * (FULL_SCALE_KPA - seal_kpa)))
     gamma = rng.uniform(1.1, 1.4)
     conduction_s = float(np.exp(rng.uniform(np.log(0.005), np.log(0.060))))
     chip_lag_s = rng.uniform(0.8, 2.0)

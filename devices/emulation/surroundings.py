@@ -1,4 +1,4 @@
-"""Surroundings of the tiles: temperature, atmospheric pressure, water; and the leak of a dome.
+"""Surroundings of the tiles: temperature, atmospheric pressure, water; sites of chips, and leaks.
 
 The head of water affects a dome through the compliance of its wall only, and the weather not at
 all: it is sealed, and a session is short. Head and weather affect a bare reference tile directly.
@@ -12,6 +12,7 @@ surroundings until air has returned. A dome open for long follows the weather, a
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -137,3 +138,70 @@ class Puncture:
             self._remaining_gas = even + (self._remaining_gas - even) * kept
         self._last_s = t_s
         return self._remaining_gas * sealed_kpa
+
+
+_FAR_OVER_RANGE_KPA = 45.0
+
+
+class ChipSite:
+    """Site of one chip, in a dome or bare.
+
+    Before `begin_scene_time` it is at the scene's first instant. Fault `over_range`: pressure is
+    45 kPa higher, past the range of most chips.
+
+    Args:
+        pressure_kpa: pressure at a time of the scene.
+        lags_s: time constants of chip and gas behind the surroundings.
+        surroundings: temperature around the foot.
+        emulation: section of the scene.
+        noise_label: seed of the chip's noise.
+        over_range: timing of the fault.
+        frozen: likewise.
+        puncture: leak of the dome.
+    """
+
+    def __init__(
+        self,
+        pressure_kpa: Callable[[float], float],
+        lags_s: tuple[float, float],
+        surroundings: Surroundings,
+        emulation: EmulationSection,
+        noise_label: str,
+        *,
+        over_range: FaultTiming | None = None,
+        frozen: FaultTiming | None = None,
+        puncture: Puncture | None = None,
+    ) -> None:
+        self.emulation = emulation
+        self.noise_label = noise_label
+        self.is_frozen = frozen if frozen is not None else FaultTiming()
+        """Fault of a constant pressure, at an instant of the clock."""
+        self.is_temperature_constant = surroundings.is_temperature_constant
+        self._pressure_kpa = pressure_kpa
+        self._lags_s = lags_s
+        self._surroundings = surroundings
+        self._clip_kpa = emulation.clip_kpa or math.inf
+        self._over_range = over_range if over_range is not None else FaultTiming()
+        self._puncture = puncture
+        self._epoch_ns: int | None = None
+
+    def begin_scene_time(self, epoch_ns: int) -> None:
+        """Begin the scene's time at this instant of the clock."""
+        self._epoch_ns = epoch_ns
+
+    def to_scene_s(self, t_ns: int) -> float:
+        """Convert an instant of the clock to the scene's time."""
+        # A conversion begun before the scene samples its first instant.
+        return 0.0 if self._epoch_ns is None else max(0.0, (t_ns - self._epoch_ns) * 1e-9)
+
+    def compute_kpa(self, t_s: float, t_ns: int) -> float:
+        """Compute the pressure on the chip at a time of the scene and the same of the clock."""
+        kpa = self._pressure_kpa(t_s)
+        if self._puncture is not None:
+            kpa = self._puncture.apply_leak(kpa, t_s, t_ns)
+        kpa = min(kpa, self._clip_kpa)
+        return kpa + _FAR_OVER_RANGE_KPA if self._over_range(t_ns) else kpa
+
+    def compute_degc(self, t_s: float) -> float:
+        """Compute the chip's temperature at a time of the scene."""
+        return self._surroundings.compute_chip_degc(t_s, *self._lags_s)

@@ -7,30 +7,30 @@ pseudo-terminal of the servo. Ground truth is for judging estimates only.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, get_args
+from typing import Literal, Protocol, get_args
 
 import numpy as np
 
 from devices.arrays import Floats, Times
 from devices.chips.dynamixel.firmwares import COUNTS_PER_TURN
 from devices.clock import Clock
+from devices.emulation.chips import mpl115a2
 from devices.emulation.chips.dynamixel import EmulatedServo
-from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart, FrontEnd, PartFaults
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.dome_physics import Domes
-from devices.emulation.fault_timing import SceneFaults
+from devices.emulation.fault_timing import PartFaults, SceneFaults
 from devices.emulation.ground.grounds import get_tile_positions_m, make_ground
 from devices.emulation.ground.hopping import Hopping
 from devices.emulation.ground.indenter import IndentationProgramme, Indenter
 from devices.emulation.ground.load_trace import TileLoad
-from devices.emulation.i2c_bus import EmulatedI2cAdapter, FaultyWires
-from devices.emulation.parts import draw_family_chip, draw_family_dome, make_rng
+from devices.emulation.i2c_bus import EmulatedChip, EmulatedI2cAdapter, FaultyWires
+from devices.emulation.parts import draw_family_dome, make_rng
 from devices.emulation.plates import PlateLoad
-from devices.emulation.surroundings import Puncture, Surroundings
+from devices.emulation.surroundings import ChipSite, Puncture, Surroundings
 from devices.scene.emulation_sections import (
     BUS_TARGET,
     DEFAULT_LEAK_S,
@@ -38,8 +38,26 @@ from devices.scene.emulation_sections import (
     MudGround,
     PartFault,
 )
-from devices.scene.hardware_sections import ServoSection
+from devices.scene.hardware_sections import ServoSection, TileSection
 from devices.scene.scene_file import Scene
+
+
+class ChipMaker(Protocol):
+    """Function that makes the emulated chip of a scene's tile."""
+
+    def __call__(
+        self,
+        tile: TileSection,
+        scene: Scene,
+        parts_seed: int,
+        faults: PartFaults,
+        make_site: Callable[[str], ChipSite],
+    ) -> EmulatedChip:
+        """Make the chip; `make_site` makes the site of its serial, or of a spare part's."""
+
+
+CHIP_MAKERS: dict[str, ChipMaker] = {"mpl115a2": mpl115a2.make_chip}
+"""Emulation of every kind of pressure chip."""
 
 DomeEffect = Literal["gas", "rubber", "hysteresis", "surroundings"]
 """Effect on a dome's pressure beside the static curve; surroundings: temperature, head of water."""
@@ -127,49 +145,26 @@ class World:
         self.dome_parts = tuple(domes)
         """Properties of the domes, for judging estimates only."""
         self._faults = SceneFaults(scene.fault)
-        self._front_ends: list[FrontEnd] = []
-
-        def silicon(index: int, serial: str) -> EmulatedPart:
-            """Create the chip of a serial under a dome of this foot."""
-            chip = draw_family_chip(family, serial, parts_seed)
-            fixed_ms = scene.array.conversion_ms
-            sense = FrontEnd(
-                chip,
-                domes[index],
-                partial(self._domes.compute_pressure_kpa, index),
-                surroundings,
-                scene.emulation,
-                f"noise/{draw}/{serial}",
-                self._faults.get_fault("over_range", serials[index]),
-                self._faults.get_fault("frozen", serials[index]),
-                self._make_puncture(serials[index], surroundings),
-            )
-            if self._has_begun:
-                sense.begin_scene_time(self.epoch_ns)
-            self._front_ends.append(sense)
-            conversion_ns = chip.conversion_ns if fixed_ms is None else round(fixed_ms * 1e6)
-            return EmulatedPart(
-                chip.coefficients.to_words(), conversion_ns, sense, chip.sample_delay_ns
-            )
-
+        self._sites: list[ChipSite] = []
         self.chips = [
-            EmulatedMpl115a2(
-                silicon(index, serial),
-                scene.emulation.read_during_conversion,
-                self._collect_part_faults(serial),
-                make_replacement=partial(silicon, index, f"{serial}.spare"),
+            CHIP_MAKERS[tile.chip](
+                tile,
+                scene,
+                parts_seed,
+                self._collect_part_faults(tile.serial),
+                partial(self._make_site, index, draw),
             )
-            for index, serial in enumerate(serials)
+            for index, tile in enumerate(scene.tile)
         ]
         """Chips, for judging drivers only; a driver has only the bus."""
         muxes = [
             EmulatedTca9548a(
                 address,
-                {
-                    tile.channel: part
+                [
+                    (tile.channel, part)
                     for tile, part in zip(scene.tile, self.chips, strict=True)
                     if tile.mux == address
-                },
+                ],
                 self._faults.get_fault("brown_out", f"0x{address:02x}"),
                 self._faults.get_fault("mux_reset", f"0x{address:02x}"),
             )
@@ -189,8 +184,8 @@ class World:
         """Begin the scene's time now: ground, faults, temperature."""
         self.epoch_ns = self.clock.now_ns()
         self._has_begun = True
-        for front_end in self._front_ends:
-            front_end.begin_scene_time(self.epoch_ns)
+        for site in self._sites:
+            site.begin_scene_time(self.epoch_ns)
         self._faults.begin_scene_time(self.epoch_ns)
 
     def inject_fault(
@@ -267,6 +262,25 @@ class World:
         if isinstance(self.ground, IndentationProgramme):
             return Indenter(self.ground, self.to_scene_s, self._indenter_rng)
         return None
+
+    def _make_site(self, index: int, draw: str, serial: str) -> ChipSite:
+        """Make the site of a tile's chip, or of a part in its place."""
+        tile, dome = self.scene.tile[index].serial, self.dome_parts[index]
+        surroundings = self._scene_surroundings
+        site = ChipSite(
+            partial(self._domes.compute_pressure_kpa, index),
+            (dome.chip_lag_s, dome.gas_lag_s),
+            surroundings,
+            self.scene.emulation,
+            f"noise/{draw}/{serial}",
+            over_range=self._faults.get_fault("over_range", tile),
+            frozen=self._faults.get_fault("frozen", tile),
+            puncture=self._make_puncture(tile, surroundings),
+        )
+        if self._has_begun:
+            site.begin_scene_time(self.epoch_ns)
+        self._sites.append(site)
+        return site
 
     def _make_puncture(self, serial: str, surroundings: Surroundings) -> Puncture:
         leaks_s = (f.leak_s for f in self.scene.fault if (f.kind, f.tile) == ("puncture", serial))

@@ -7,6 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from devices.chips.dynamixel.firmwares import FIRMWARES
+from devices.chips.pressure_chips import PRESSURE_CHIPS
 from devices.chips.tca9548a import ADDRESSES, CHANNELS
 from devices.types import Identifier
 
@@ -67,6 +68,30 @@ class TileSection(SceneSection):
     z_m: Position
     reference: bool = False
     """True for a bare tile that measures the surroundings: no load, excluded from all sums."""
+    chip: str = "mpl115a2"
+    """Kind of pressure chip."""
+    address: int | None = None
+    """Its I2C address; absent: the usual one of its kind."""
+
+    @property
+    def chip_address(self) -> int:
+        """I2C address of its chip."""
+        return PRESSURE_CHIPS[self.chip].addresses[0] if self.address is None else self.address
+
+    @field_validator("chip")
+    @classmethod
+    def _chip_is_known(cls, chip: str) -> str:
+        if chip not in PRESSURE_CHIPS:
+            raise ValueError(f"is no kind of chip, which are {', '.join(PRESSURE_CHIPS)}")
+        return chip
+
+    @model_validator(mode="after")
+    def _address_is_the_chips(self) -> Self:
+        addresses = PRESSURE_CHIPS[self.chip].addresses
+        if self.chip_address not in addresses:
+            known = ", ".join(f"0x{address:02x}" for address in addresses)
+            raise ValueError(f"address 0x{self.chip_address:02x} is none of {self.chip}: {known}")
+        return self
 
     @field_validator("mux")
     @classmethod

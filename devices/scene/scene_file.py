@@ -76,7 +76,10 @@ class Scene(SceneSection):
         serials = [tile.serial for tile in self.tile]
         if twice := _find_duplicate(serials):
             raise ValueError(f"tile serial {twice!r} appears twice; every tile has its own")
-        plugs = [f"mux 0x{tile.mux:02x} channel {tile.channel}" for tile in self.tile]
+        plugs = [
+            f"address 0x{tile.chip_address:02x} on mux 0x{tile.mux:02x} channel {tile.channel}"
+            for tile in self.tile
+        ]
         if twice := _find_duplicate(plugs):
             raise ValueError(f"{twice} is used by two tiles; plug each into a channel of its own")
         if all(tile.reference for tile in self.tile):

@@ -24,7 +24,8 @@ from pydantic import (
 
 from devices.arrays import Floats
 from devices.errors import CalibrationError
-from devices.types import Count, Identifier, Text, UInt16
+from devices.frames import ChipRegisters
+from devices.types import Count, Identifier, Text
 from service.estimation.effects import CalibrationPart, Effects, NonNegative, Number, Parameter
 
 GAIN_RANGE = (0.05, 20.0)
@@ -120,7 +121,7 @@ class TileCalibration(CalibrationPart):
     """Absolute pressure unloaded, during the calibration."""
     noise_kpa: Number | None
     """Standard deviation of a single reading, unloaded."""
-    coefficient_words: tuple[UInt16, UInt16, UInt16, UInt16] | None = None
+    registers: ChipRegisters | None = None
     """Registers of the chip that was calibrated: a serial can be re-labelled, a chip can not.
     None: for any chip, as a preset is."""
     effects: Effects = Effects()
@@ -358,7 +359,7 @@ class RigFacts(CalibrationPart):
     end_absolute_kpa: Number
     """Absolute pressure where the range ends: baseline plus range."""
     spare_kpa: Number
-    """Distance from there to the chip's 115 kPa; negative: beyond its rating."""
+    """Distance from there to the chip's rated end; negative: beyond its rating."""
     ended_by: Literal["load", "chip"]
     """"load": the spindle turned back before the tile saturated; "chip": its reading wrapped or
     stood still."""

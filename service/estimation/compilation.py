@@ -37,7 +37,7 @@ from service.estimation.pipeline.params import MODEL_NAMES
 from service.estimation.pipeline.plan import make_plan
 from service.estimation.tare.tare import Tare
 
-_CHIP = (0x3ECE, 0xB3F9, 0xC517, 0x33C8)
+_REGISTERS = (0x3ECE, 0xB3F9, 0xC517, 0x33C8)
 _FRAMES = 8
 
 
@@ -101,7 +101,9 @@ def _tile(channel: int) -> TileInfo:
         serial=f"W{channel}",
         mux=0x70,
         channel=channel,
-        coefficient_words=_CHIP,
+        chip="mpl115a2",
+        address=0x60,
+        registers=_REGISTERS,
         x_m=0.0,
         y_m=0.0,
         z_m=-0.15,
@@ -137,7 +139,7 @@ def _calibration() -> Calibration:
 
 
 def _frames() -> FrameBatch:
-    columns = allocate_columns(_FRAMES, 3)
+    columns = allocate_columns(_FRAMES, 3, np.dtype(np.uint16))
     columns["seq"][:] = np.arange(_FRAMES)
     columns["t_mono_ns"][:] = columns["t_ns"][:] = 2_000_000 * np.arange(_FRAMES)
     columns["pressure_raw"][:], columns["temperature_raw"][:] = 400, 507

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from math import pi
 from typing import Literal
 
-from devices.chips.mpl115a2 import PRESSURE_MAX_KPA
+from devices.chips.mpl115a2 import MPL115A2
 
 SEAL_KPA = 100.0
 """Approximate pressure at which a bubble is sealed (PAPER II-A)."""
@@ -19,6 +19,8 @@ ISOTHERMAL = 1.0
 ADIABATIC = 1.4
 """Exponents of air; a real load has a polytropic exponent between the two, by its speed against a
 relaxation of 5 to 42 ms ([D])."""
+FULL_SCALE_KPA = MPL115A2.max_kpa
+"""End of the range of the paper's chip."""
 BUBBLE_RADIUS_MM = 3.0
 """PAPER Table I, for the 11 mm dome; assumed for the others."""
 
@@ -73,7 +75,7 @@ PAPER_RANGE_N = (25.0, 35.0)
 
 
 def compute_volume_ratio(
-    initial_kpa: float = SEAL_KPA, final_kpa: float = PRESSURE_MAX_KPA, exponent: float = ISOTHERMAL
+    initial_kpa: float = SEAL_KPA, final_kpa: float = FULL_SCALE_KPA, exponent: float = ISOTHERMAL
 ) -> float:
     """Return V2/V1 of a bubble that goes from p1 to p2: p1 V1^k = p2 V2^k.
 

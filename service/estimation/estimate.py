@@ -66,6 +66,8 @@ _COLUMNS = (
     "frame_flags",
 )
 """Columns of frames, in the order of the parameters of `_compute_step`."""
+_COUNTS = slice(_COLUMNS.index("pressure_raw"), _COLUMNS.index("temperature_raw") + 1)
+_WORD_BYTES = 2  # of the words in which compiled code takes counts
 _ROW_FIELDS = ("release_row", "sample_row", "end_row")
 """Rows of the buffer in `FootState`."""
 KernelOutput = tuple[
@@ -153,7 +155,7 @@ class ModelEstimator:
         """Return the estimates that still wait for their look-ahead; None if there are none."""
         if self._foot_state["release_row"][0] == self._foot_state["end_row"][0]:
             return None
-        nothing = FrameBatch(**allocate_columns(0, len(self._tile_states)))
+        nothing = FrameBatch(**allocate_columns(0, len(self._tile_states), np.dtype(np.uint16)))
         return self._step(nothing, is_final=True)
 
     def state_dict(self) -> Columns:
@@ -191,6 +193,8 @@ class ModelEstimator:
 
     def _step(self, frames: FrameBatch, *, is_final: bool) -> Estimates:
         columns = [_to_compiled_layout(getattr(frames, name)) for name in _COLUMNS]
+        if frames.pressure_raw.itemsize > _WORD_BYTES:
+            columns[_COUNTS] = [counts.view(np.uint16) for counts in columns[_COUNTS]]
         states = self._foot_state, self._tile_states
         output = _step(self.plan.params, *states, self._buffer, is_final, *columns)
         return _make_estimates(output, self._unmeasured)

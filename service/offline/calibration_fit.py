@@ -16,11 +16,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from devices.chips.compensation import Compensation
-from devices.chips.mpl115a2 import PRESSURE_MIN_KPA
+from devices.chips.pressure_chips import Compensation, get_chip
 from devices.errors import CalibrationError
-from devices.frames import NOT_READ, FrameBatch
-from devices.temperature_hold import hold_temperature
+from devices.frames import NOT_READ, ChipRegisters, FrameBatch, hold_temperature
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.dead_weights import parse_weight
 from service.estimation.effects import Parameter
@@ -121,7 +119,7 @@ class TileRecording:
     """Recording of one tile in one file, with its chip and stream."""
 
     indentation: Indentation
-    coefficient_words: tuple[int, int, int, int]
+    registers: ChipRegisters
     stream_id: str
     seq_range: tuple[int, int]
     """First and last frame."""
@@ -196,7 +194,7 @@ def read_indentations(paths: Sequence[Path]) -> dict[str, list[TileRecording]]:
     found: dict[str, list[TileRecording]] = {}
     for path in paths:
         with SealedFileReader(path) as session:
-            chips = {tile.serial: tile.coefficient_words for tile in session.info.tiles}
+            chips = {tile.serial: tile.registers for tile in session.info.tiles}
             indentations, seq = _split_by_tile(session)
             for indentation in indentations:
                 pressed = TileRecording(
@@ -226,10 +224,10 @@ def _reject_contradiction(first: TileRecording, second: TileRecording) -> None:
         first.indentation.serial,
         f"{first.indentation.where} and {second.indentation.where}",
     )
-    if first.coefficient_words != second.coefficient_words:
+    if first.registers != second.registers:
         raise CalibrationError(
-            f"tile {serial} has another chip in each of two recordings: coefficients "
-            f"{first.coefficient_words} and {second.coefficient_words}",
+            f"tile {serial} has another chip in each of two recordings: registers "
+            f"{first.registers} and {second.registers}",
             where=files,
             remedy="Give the replaced part a serial of its own, and calibrate each by itself",
         )
@@ -257,11 +255,11 @@ def _fit_tile(pressed: Sequence[TileRecording], delay: Parameter) -> TileCalibra
                 remedy="Calibrate from one kind of recording",
             )
         tile = fit_curve_to_dead_weights(select_loaded(recordings))
-        return tile.model_copy(update={"coefficient_words": pressed[0].coefficient_words})
+        return tile.model_copy(update={"registers": pressed[0].registers})
     tile = fit_static_curve(*select_loaded(recordings))
     return tile.model_copy(
         update={
-            "coefficient_words": pressed[0].coefficient_words,
+            "registers": pressed[0].registers,
             "effects": fit_determined_effects(recordings, tile, delay),
         }
     )
@@ -331,27 +329,29 @@ def _split_by_tile(session: SealedFileReader) -> tuple[list[Indentation], tuple[
     # A recording with only a soak counts for all tiles.
     only_soak = bool((phase == "soak").any()) and not np.isin(pressed, session.info.serials).any()
     held, _ = hold_temperature(frames)
-    readable_kpa = Compensation(session.info.tiles).compute_usable_kpa(held)
+    compensation = Compensation(session.info.tiles)
+    readable_kpa = compensation.compute_usable_kpa(held)
     # A count that wrapped around reads as almost no pressure (model `unwrap`): the tile was
     # loaded beyond its chip's range.
-    kpa = np.where(readable_kpa < PRESSURE_MIN_KPA, np.inf, readable_kpa)
+    kpa = np.where(readable_kpa < compensation.min_kpa, np.inf, readable_kpa)
     tiles = [
         Indentation(
-            serial=serial,
+            serial=tile.serial,
+            chip=get_chip(tile.chip),
             where=str(session.path),
             t_ns=frames.t_ns,
             kpa=kpa[:, i],
             reference_n=frames.reference_force_n.astype(np.float64),
             phase=phase,
-            is_under_indenter=pressed == serial,
+            is_under_indenter=pressed == tile.serial,
             temperature_raw=np.where(
                 held.temperature_raw[:, i] == NOT_READ,
                 np.nan,
                 held.temperature_raw[:, i].astype(np.float64),
             ),
         )
-        for i, serial in enumerate(session.info.serials)
-        if (pressed == serial).any() or only_soak
+        for i, tile in enumerate(session.info.tiles)
+        if (pressed == tile.serial).any() or only_soak
     ]
     if not tiles:
         raise CalibrationError(

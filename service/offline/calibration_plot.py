@@ -140,9 +140,14 @@ def _plot_curve(
     end = f"range to {end_kpa:.2f} kPa"
     if facts is not None:
         beyond = "left to" if facts.spare_kpa >= 0.0 else "beyond"
-        end += f" ({facts.end_n:.1f} N), {abs(facts.spare_kpa):.2f} kPa {beyond} the chip's 115"
+        chip_kpa = f"{facts.end_absolute_kpa + facts.spare_kpa:.0f}"
+        end += (
+            f" ({facts.end_n:.1f} N), {abs(facts.spare_kpa):.2f} kPa {beyond} the chip's {chip_kpa}"
+        )
         for axis in (curve, residual):
-            axis.axvline(end_kpa + facts.spare_kpa, color=GREEN, linestyle=":", label="115 kPa")
+            axis.axvline(
+                end_kpa + facts.spare_kpa, color=GREEN, linestyle=":", label=f"{chip_kpa} kPa"
+            )
     curve.set_title(
         f"{tile.serial}: R² {_format_number(tile.r2, 4)}, RMSE {_format_number(tile.rmse_n, 2)} N\n"
         f"left-out repeat {_format_number(tile.cv_rmse_n, 2)} N, "

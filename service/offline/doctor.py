@@ -26,7 +26,8 @@ from devices.buses.device_files import find_programs_using
 from devices.buses.i2c import I2cBus, RetryingBus
 from devices.buses.serial_line import check_latency_timer, find_stable_path, read_latency_timer_ms
 from devices.chips.dynamixel.servo_search import BAUDRATES, FoundServo, find_servos
-from devices.chips.mpl115a2 import CONVERSION_TYPICAL_NS
+from devices.chips.pressure_chip import Registers
+from devices.chips.pressure_chips import get_chip
 from devices.clock import Clock
 from devices.errors import I2cError, ServoSetupError
 from devices.frames import TileInfo
@@ -46,8 +47,9 @@ class TileFinding:
 
     Attributes:
         serial: serial in the scene; empty if the scene has no such tile.
-        mux, channel: its address.
-        coefficient_words: a0, b1, b2, c12; None if unreadable.
+        mux, channel, address: its place.
+        chip: kind of its chip.
+        registers: words that the chip is identified by; None if unreadable.
         conversion_ms: measured conversion time; None if unmeasurable.
         problem: description of the fault; empty without one.
     """
@@ -55,7 +57,9 @@ class TileFinding:
     serial: str
     mux: int
     channel: int
-    coefficient_words: tuple[int, int, int, int] | None
+    address: int
+    chip: str
+    registers: Registers | None
     conversion_ms: float | None
     problem: str
 
@@ -118,7 +122,7 @@ def diagnose_bus(
             verdict=_describe_no_tiles(findings),
         )
     wires = measure_wire_timing(bus, clock, well[0][1])
-    measured: dict[tuple[int, int], TileFinding] = {}
+    measured: dict[_Place, TileFinding] = {}
     conversions_ns: list[int | None] = []
     for finding, info in well:
         try:
@@ -129,12 +133,10 @@ def diagnose_bus(
             conversion_ns, problem = None, f"it stopped responding during the measurement: {error}"
         conversions_ns.append(conversion_ns)
         conversion_ms = None if conversion_ns is None else conversion_ns / 1e6
-        measured[finding.mux, finding.channel] = replace(
-            finding, conversion_ms=conversion_ms, problem=problem
-        )
-    findings = tuple(measured.get((f.mux, f.channel), f) for f in findings)
+        measured[_place(finding)] = replace(finding, conversion_ms=conversion_ms, problem=problem)
+    findings = tuple(measured.get(_place(f), f) for f in findings)
     requested = tuple(measured.values())
-    timing = compute_bus_timing(array, wires, [f.mux for f in requested], conversions_ns)
+    timing = compute_bus_timing(array, wires, [info for _, info in well], conversions_ns)
     rates: dict[ScheduleName, float | None] = {
         name: rate
         if count_broadcast_channels(name, timing.muxes) <= array.broadcast_channels
@@ -169,47 +171,60 @@ def diagnose_bus(
     )
 
 
+_Place = tuple[int, int, str, int]
+
+
+def _place(tile: FoundTile | TileFinding) -> _Place:
+    return tile.mux, tile.channel, tile.chip, tile.address
+
+
 def _match_tiles(
     plugs: tuple[FoundTile, ...], wanted: tuple[TileSection, ...]
 ) -> tuple[TileFinding, ...]:
-    serials = {(tile.mux, tile.channel): tile.serial for tile in wanted}
+    places: dict[_Place, str] = {
+        (tile.mux, tile.channel, tile.chip, tile.chip_address): tile.serial for tile in wanted
+    }
+    there = {_place(plug): plug for plug in plugs}
     found = [
         TileFinding(
-            serials.get((plug.mux, plug.channel), ""),
+            places.get(place, ""),
             plug.mux,
             plug.channel,
-            plug.coefficient_words,
+            plug.address,
+            plug.chip,
+            plug.registers,
             None,
             plug.problem,
         )
-        for plug in plugs
+        for place, plug in there.items()
     ]
-    there = {(plug.mux, plug.channel) for plug in plugs}
     absent = [
-        TileFinding(tile.serial, tile.mux, tile.channel, None, None, "it does not answer")
-        for tile in wanted
-        if (tile.mux, tile.channel) not in there
+        TileFinding(serial, mux, channel, address, chip, None, None, "it does not answer")
+        for (mux, channel, chip, address), serial in places.items()
+        if (mux, channel, chip, address) not in there
     ]
-    return tuple(sorted((*found, *absent), key=lambda f: (f.mux, f.channel)))
+    return tuple(sorted((*found, *absent), key=_place))
 
 
 def _make_tile_info(finding: TileFinding) -> TileInfo:
-    assert finding.coefficient_words is not None  # noqa: S101  # without a problem there are some
+    assert finding.registers is not None  # noqa: S101  # without a problem there are some
     return TileInfo(
         serial=finding.serial or f"0x{finding.mux:02x}.{finding.channel}",
         mux=finding.mux,
         channel=finding.channel,
-        coefficient_words=finding.coefficient_words,
+        chip=finding.chip,
+        address=finding.address,
+        registers=finding.registers,
         x_m=0.0,
         y_m=0.0,
         z_m=0.0,
         reference=False,
-        conversion_ms=CONVERSION_TYPICAL_NS / 1e6,
+        conversion_ms=get_chip(finding.chip).conversion_typical_ns / 1e6,
     )
 
 
 def _describe_no_tiles(findings: tuple[TileFinding, ...]) -> str:
-    if any(finding.coefficient_words or "answer" not in finding.problem for finding in findings):
+    if any(finding.registers or "answer" not in finding.problem for finding in findings):
         return "No tile works: look at the problems above."
     return (
         "Nothing answers at 0x70 to 0x77. Check the multiplexers' supply, that SDA and SCL are not "

@@ -76,7 +76,7 @@ class SimulationResult:
     replaced_serials: tuple[str, ...]
     """Serials of tiles whose chip was replaced."""
     unmeasured_serials: tuple[str, ...]
-    """Serials whose conversion time could not be measured; 3 ms are assumed."""
+    """Serials whose conversion time could not be measured; the longest is assumed."""
     flag_counts: Mapping[str, Mapping[str, int]]
     """Frames in which a tile was flagged, by serial and reason."""
     indentation_trace: TileLoad | None

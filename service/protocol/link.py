@@ -28,7 +28,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, TypeAdapter, model_validator
 
-from devices.frames import ArrayInfo
+from devices.chips.pressure_chips import KnownArray
 from devices.types import (
     Count,
     Identifier,
@@ -168,7 +168,7 @@ class Proof(StrictModel):
 class EarlierStream(StrictModel):
     """Ended stream of which the node still stores frames, or has lost some."""
 
-    array_info: ArrayInfo
+    array_info: KnownArray
     stored: SeqIntervals
     """Frames stored on the node."""
     next_seq: Seq
@@ -188,7 +188,7 @@ class Hello(StrictModel):
 
     type: Literal["hello"] = "hello"
     protocol: Count
-    array_info: ArrayInfo
+    array_info: KnownArray
     stored: SeqIntervals
     """Frames of the present stream stored on the node."""
     next_seq: Seq

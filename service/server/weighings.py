@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Literal
 
-from devices.chips.compensation import Compensation
+from devices.chips.pressure_chips import Compensation
 from devices.errors import CalibrationError, FootTileError, StateError, UnknownError, UsageError
 from devices.frames import FrameBatch
 from service.estimation.calibration import Calibration

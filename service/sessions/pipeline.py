@@ -17,7 +17,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from devices.chips.compensation import Compensation
+from devices.chips.pressure_chips import Compensation
 from devices.errors import TareError, UsageError
 from devices.flags import FrameFlag
 from devices.frames import ArrayInfo, FrameBatch

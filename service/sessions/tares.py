@@ -52,7 +52,7 @@ class RecordedTare:
     reason: str
     """Reason, as text."""
     chips: tuple[tuple[int, ...], ...]
-    """Coefficients of the tiles' chips."""
+    """Registers that the tiles' chips are identified by."""
     undone: bool = False
 
     def is_of_array(self, info: ArrayInfo) -> bool:
@@ -60,7 +60,7 @@ class RecordedTare:
 
         A swapped part has the same serial but another chip.
         """
-        return self.serials == info.serials and self.chips == _chip_coefficients(info)
+        return self.serials == info.serials and self.chips == _chip_registers(info)
 
     @property
     def is_taken_in_flight(self) -> bool:
@@ -92,9 +92,9 @@ class TareFileContent:
     is_damaged: bool = False
 
 
-def _chip_coefficients(info: ArrayInfo) -> tuple[tuple[int, ...], ...]:
-    """Return the coefficients of an array's chips."""
-    return tuple(tuple(tile.coefficient_words) for tile in info.tiles)
+def _chip_registers(info: ArrayInfo) -> tuple[tuple[int, ...], ...]:
+    """Return the registers of an array's chips."""
+    return tuple(tile.registers for tile in info.tiles)
 
 
 def read_tares_marking_lost(path: Path) -> TareFileContent:
@@ -374,7 +374,7 @@ class TareHistory:
         """
         reason = (reason or REASONS.get(tare.source, tare.source))[:REASON_LENGTH_MAX]
         recorded = RecordedTare(
-            uuid.uuid4().hex[:12], info.serials, tare, reason, _chip_coefficients(info)
+            uuid.uuid4().hex[:12], info.serials, tare, reason, _chip_registers(info)
         )
         self._store(_thin_out((*self._entries, recorded)))
         return recorded

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from devices.chips.pressure_chips import KnownArray
 from devices.errors import DamagedFileError
-from devices.frames import ArrayInfo
 from storage.documents import read_document, write_document
 from storage.durable_files import try_set_aside_and_describe
 from storage.intervals import LossPairs
@@ -35,7 +35,7 @@ class StreamNotes(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    array_info: ArrayInfo
+    array_info: KnownArray
     number: int = 0
     """Order in which a node's streams began; its clock may have been set in between."""
     kernel_boot_id: str | None = None

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from devices.chips.compensation import Compensation
+from devices.chips.pressure_chips import Compensation
 from devices.emulation.world import World
 from devices.errors import FootTileError
 from devices.frames import ArrayInfo, FrameBatch

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Floats
-from devices.chips.mpl115a2 import PRESSURE_MAX_KPA
-from devices.emulation.parts import DomeProperties, draw_family_chip, make_rng
+from devices.chips.pressure_chips import Compensation
+from devices.emulation.parts import DomeProperties, make_rng
 from devices.emulation.world import DomeEffect, World
 from devices.flags import EstimateFlag
 from devices.scene.scene_file import Scene, load_scene
@@ -130,12 +130,13 @@ def _count_alarms(status: npt.NDArray[np.uint16]) -> int:
 def find_unsaturated_tiles(recording: DrawRecording, world: World) -> npt.NDArray[np.bool_]:
     """Return which tiles are surely within calibration and chip range, (n, tiles)."""
     t_ns = recording.frames.t_mono_ns
+    chip_max_kpa = Compensation(recording.info.tiles).max_kpa
     doubt_kpa = UNSATURATED_MARGIN_SIGMAS * world.scene.emulation.noise_kpa
     unloaded_kpa = np.array([part.seal_kpa for part in world.dome_parts])
     settled_kpa = world.compute_dome_kpa(t_ns, ("gas", "surroundings")) - unloaded_kpa
     return np.asarray(
         (settled_kpa < _get_range_ends_kpa(recording) - doubt_kpa)
-        & (world.compute_dome_kpa(t_ns) < PRESSURE_MAX_KPA - doubt_kpa)
+        & (world.compute_dome_kpa(t_ns) < chip_max_kpa - doubt_kpa)
     )
 
 
@@ -156,7 +157,7 @@ def nan_to_none(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def describe_tiles(recording: DrawRecording, world: World, seed: int) -> tuple[TileResult, ...]:
+def describe_tiles(recording: DrawRecording, world: World) -> tuple[TileResult, ...]:
     """Describe every tile of an array, from a recording at constant temperature."""
     t_ns = recording.frames.t_mono_ns
     whole_kpa = world.compute_dome_kpa(t_ns)
@@ -171,7 +172,7 @@ def describe_tiles(recording: DrawRecording, world: World, seed: int) -> tuple[T
             for name, kpa in less_kpa.items()
         }
         entry = recording.calibration.get_tile_or_wildcard(serial)
-        late_ns = draw_family_chip("broad", serial, seed).sample_delay_ns
+        late_ns = world.chips[i].sample_delay_ns
         tiles.append(_describe_tile(entry, part, late_ns, effect_n))
     return tuple(tiles)
 
@@ -372,7 +373,7 @@ def _evaluate_case(
             columns, below_end, lag_ms
         )
     is_reference = scene.name == "poppy" and condition == CLEAN
-    return found, describe_tiles(recording, world, seed) if is_reference else ()
+    return found, describe_tiles(recording, world) if is_reference else ()
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ def test_frames_are_lost_a_tenth_of_a_second_at_a_time_and_never_of_the_lead(
     hard: ModuleType,
 ) -> None:
     n = 20_000
-    columns = allocate_columns(n, 1)
+    columns = allocate_columns(n, 1, np.dtype(np.uint16))
     columns["seq"][:] = np.arange(n)
     columns["frame_flags"][: n // 2] = FrameFlag.LEAD
     left = hard.without(FrameBatch(**columns), 0.1, np.random.default_rng(1))

@@ -30,7 +30,9 @@ def make_tile(number: int = 0, **facts: Any) -> TileInfo:
         "serial": f"T{number + 1:02}",
         "mux": 0x70 + number // 8,
         "channel": number % 8,
-        "coefficient_words": NEWTON_CHIP,
+        "chip": "mpl115a2",
+        "address": 0x60,
+        "registers": NEWTON_CHIP,
         "x_m": 0.014 * number,
         "y_m": 0.0,
         "z_m": -0.15,
@@ -88,7 +90,7 @@ def array_at(
             y_m=y_m,
             z_m=z_m,
             reference=i in references,
-            coefficient_words=chips[i] if chips else NEWTON_CHIP,
+            registers=chips[i] if chips else NEWTON_CHIP,
         )
         for i, (x_m, y_m, z_m) in enumerate(positions_m)
     ]

@@ -13,17 +13,16 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Bools, Floats
-from devices.chips.compensation import Compensation
-from devices.chips.mpl115a2 import SAMPLE_DELAY_DIVISOR, Coefficients, compensate_kpa
+from devices.chips.mpl115a2 import MPL115A2, Coefficients
+from devices.chips.pressure_chips import Compensation
 from devices.emulation.world import World
 from devices.flags import TileFlag
-from devices.frames import NOT_READ, FrameBatch, TileInfo
-from devices.temperature_hold import hold_temperature
+from devices.frames import NOT_READ, FrameBatch, RawCounts, TileInfo, hold_temperature
 
 _ROUNDING_NS = 2_000  # offsets are whole microseconds
 _NEIGHBOURS = 5
 
-Counts = npt.NDArray[np.uint16]
+Counts = npt.NDArray[RawCounts]
 
 
 @dataclass(frozen=True)
@@ -96,7 +95,7 @@ class Witness:
         pressure_raw, temperature_raw = np.zeros(shape), np.zeros(shape)
         own = np.zeros(shape, dtype=np.bool_)
         for i, tile in enumerate(tiles):
-            delay_ns = round(tile.conversion_ms * 1e6) // SAMPLE_DELAY_DIVISOR
+            delay_ns = round(tile.conversion_ms * 1e6) // MPL115A2.sample_delay_divisor
             asked_ns = frames.t_mono_ns + frames.sample_offset_us[:, i] * 1000 - delay_ns
             stops_ns, words, chips = self._stops_ns[i], self._words[i], self._chips[i]
             for row, stop_ns in enumerate(asked_ns.tolist()):
@@ -104,7 +103,7 @@ class Witness:
                 if at < len(stops_ns) and stops_ns[at] <= stop_ns + _ROUNDING_NS:
                     true_padc, true_tadc = words[at]
                     pressure_raw[row, i], temperature_raw[row, i] = words[at]
-                    own[row, i] = chips[at] == tile.coefficient_words
+                    own[row, i] = chips[at] == tile.registers
                     # Without a temperature of its own the held one is as good as it gets.
                     if frames.temperature_raw[row, i] == NOT_READ:
                         true_tadc = int(held_temperature_raw[row, i])
@@ -119,4 +118,4 @@ class Witness:
 
 
 def _kpa(pressure_raw: float, temperature_raw: float, chip: Coefficients) -> float:
-    return float(compensate_kpa(pressure_raw, temperature_raw, chip.a0, chip.b1, chip.b2, chip.c12))
+    return float(chip.make_law().compute_kpa(pressure_raw, temperature_raw))

@@ -18,11 +18,10 @@ from devices.clock import VirtualClock
 from devices.emulation.chips.mpl115a2 import (
     EmulatedMpl115a2,
     EmulatedPart,
-    PartFaults,
     SampleFunction,
 )
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
-from devices.emulation.fault_timing import SceneFaults
+from devices.emulation.fault_timing import PartFaults, SceneFaults
 from devices.emulation.i2c_bus import EmulatedI2cAdapter, FaultyWires
 from devices.emulation.parts import make_rng
 from devices.errors import BusSetupError
@@ -110,7 +109,7 @@ class Wires(Adapter):
         self.muxes = [
             EmulatedTca9548a(
                 address,
-                {c: tile for (m, c), tile in zip(plugs, self.tiles, strict=True) if m == address},
+                [(c, tile) for (m, c), tile in zip(plugs, self.tiles, strict=True) if m == address],
                 self._faults.get_fault("brown_out", f"0x{address:02x}"),
                 self._faults.get_fault("mux_reset", f"0x{address:02x}"),
             )
@@ -142,7 +141,7 @@ class Wires(Adapter):
                 i,
                 mux=mux,
                 channel=channel,
-                coefficient_words=self.words[i],
+                registers=self.words[i],
                 conversion_ms=self.tc_ns[i] / 1e6,
             )
             for i, (mux, channel) in enumerate(self.plugs)

@@ -329,7 +329,7 @@ def test_every_reading_outside_50_to_115_kpa_is_over_range() -> None:
     batch = make_frames(
         pressure_raw.size, 1, pressure_raw=pressure_raw, temperature_raw=temperature_raw
     )
-    RangeDetector((make_tile(coefficient_words=DATA_SHEET_CHIP),)).flag_out_of_range(batch)
+    RangeDetector((make_tile(registers=DATA_SHEET_CHIP),)).flag_out_of_range(batch)
     # data sheet eq. 1 and 2, in plain floats; a count of 0 or 1 fell through zero
     pcomp = (
         2009.75
@@ -348,7 +348,7 @@ def test_every_reading_outside_50_to_115_kpa_is_over_range() -> None:
 @pytest.mark.parametrize("flag", list(TileFlag))
 def test_an_unusable_reading_is_not_also_over_range(flag: TileFlag) -> None:
     batch = make_frames(1, 1, pressure_raw=0, temperature_raw=507, tile_flags=flag)
-    RangeDetector((make_tile(coefficient_words=DATA_SHEET_CHIP),)).flag_out_of_range(batch)
+    RangeDetector((make_tile(registers=DATA_SHEET_CHIP),)).flag_out_of_range(batch)
     added = 0 if flag & TileFlag.UNUSABLE else TileFlag.OVER_RANGE
     assert batch.tile_flags[0, 0] == flag | added
 

@@ -121,7 +121,7 @@ def test_array_info_travels_as_json_without_loss() -> None:
     assert ArrayInfo.model_validate_json(info.model_dump_json()) == info
     plain = json.loads(info.model_dump_json())
     assert plain["utc_offset_ns"] == UTC_NS
-    assert plain["tiles"][0]["coefficient_words"] == list(NEWTON_CHIP)
+    assert plain["tiles"][0]["registers"] == list(NEWTON_CHIP)
     assert plain["servo"]["ankle_travel_m_per_rad"] is None
     assert info.serials == ("T01", "T02")
 

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.flags import TileFlag
-from devices.frames import NOT_READ, FrameBatch
-from devices.temperature_hold import hold_temperature
+from devices.frames import NOT_READ, FrameBatch, hold_temperature
 from tests.builders.frames import make_frames
 
 MS = 1_000_000

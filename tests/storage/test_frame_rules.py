@@ -44,8 +44,8 @@ def test_ordinary_frames_and_the_ends_of_every_range_keep_to_the_rules() -> None
 @pytest.mark.parametrize(
     ("column", "wrong", "said"),
     [
-        ("pressure_raw", 1024, "10 bits"),
-        ("temperature_raw", 65534, "10 bits"),
+        ("pressure_raw", 1024, "more than the chip can give"),
+        ("temperature_raw", 65534, "more than the chip can give"),
         ("tile_flags", 64, "tile_flags has undefined bits"),
         ("frame_flags", 64, "frame_flags has undefined bits"),
         ("sample_offset_us", 60_000_001, "a minute"),

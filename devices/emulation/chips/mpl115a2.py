@@ -12,15 +12,26 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
-from devices.emulation.fault_timing import FaultTiming, SceneFaults
-from devices.emulation.parts import ChipProperties, DomeProperties, make_rng
-from devices.emulation.surroundings import Puncture, Surroundings
-from devices.scene.emulation_sections import EmulationSection, ReadDuringConversion
+from devices.chips.mpl115a2 import (
+    ADDRESS,
+    MPL115A2,
+    PRESSURE_MAX_KPA,
+    PRESSURE_MIN_KPA,
+    Coefficients,
+    compute_padc,
+)
+from devices.chips.pressure_chip import Registers
+from devices.emulation.fault_timing import PartFaults
+from devices.emulation.i2c_bus import OnConversion
+from devices.emulation.parts import make_part_rng, make_rng
+from devices.emulation.surroundings import ChipSite
+from devices.scene.emulation_sections import EmulationSection, PartFamily, ReadDuringConversion
+from devices.scene.hardware_sections import TileSection
+from devices.scene.scene_file import Scene
 
 _CONVERT = 0x12
 _REGISTERS = 0x80
@@ -30,36 +41,24 @@ _SLOW_NS = 2_900_000  # slower than any healthy part, within the data sheet's 3 
 SampleFunction = Callable[[int], tuple[int, int]]
 """Function of a conversion's sample instant in ns that returns the 10-bit words `padc`, `tadc`."""
 
-OnConversion = Callable[[int, tuple[int, int], tuple[int, int, int, int]], None]
-"""Callback for every conversion: instant of its CONVERT's STOP, its words, and the part's
-coefficients. Only for judging drivers."""
 
+@dataclass(frozen=True)
+class ChipProperties:
+    """Properties of an MPL115A2 (hardware.md 1.3, 1.4, 1.6)."""
 
-@dataclass
-class PartFaults:
-    """Faults of one part.
-
-    `no_answer`: no acknowledge, as with RST low; registers and conversion go on. `unplugged`: no
-    supply; afterwards its registers are zero. `replaced`: unplugged, then another part in its
-    place. `stale`: conversions never end. `slow`: they take 2.9 ms, still within the data sheet.
-    `all_ones`: the part is lost between address and data, so that the line floats high.
-    """
-
-    no_answer: FaultTiming = field(default_factory=FaultTiming)
-    unplugged: FaultTiming = field(default_factory=FaultTiming)
-    replaced: FaultTiming = field(default_factory=FaultTiming)
-    stale: FaultTiming = field(default_factory=FaultTiming)
-    slow: FaultTiming = field(default_factory=FaultTiming)
-    all_ones: FaultTiming = field(default_factory=FaultTiming)
-    scene: SceneFaults | None = None
-    """All faults of the scene; while none is possible, the others are not evaluated."""
+    coefficients: Coefficients
+    conversion_ns: int
+    tadc_at_25_degc: float
+    sample_delay_ns: int = 0
+    """Delay of the sample instant after a quarter of the conversion: not documented (hardware.md
+    1.4)."""
 
 
 @dataclass(frozen=True)
 class EmulatedPart:
     """Fixed properties of one part."""
 
-    coefficient_words: tuple[int, int, int, int]
+    registers: Registers
     conversion_ns: int
     sample_counts: SampleFunction
     sample_delay_ns: int = 0
@@ -80,7 +79,7 @@ class EmulatedMpl115a2:
     of a CONVERT starts a conversion; a CONVERT during a conversion restarts it.
     """
 
-    address = 0x60
+    address = ADDRESS
     """I2C address of every part; the general call is not acknowledged (DS 2)."""
 
     def __init__(
@@ -100,10 +99,15 @@ class EmulatedMpl115a2:
         self._t_ns = 0
         self.interrupt_supply()
 
+    @property
+    def sample_delay_ns(self) -> int:
+        """Delay of a sample after the instant that drivers assume."""
+        return self._silicon.sample_delay_ns
+
     def interrupt_supply(self) -> None:
         """Reset: all registers but the coefficients are zero, no conversion runs."""
         self._registers = bytearray(_REGISTERS)
-        self._registers[0x04:0x0C] = struct.pack(">4H", *self._silicon.coefficient_words)
+        self._registers[0x04:0x0C] = struct.pack(">4H", *self._silicon.registers)
         self._pointer = 0
         self._expects_register = False
         self._convert_at_stop = False
@@ -165,7 +169,7 @@ class EmulatedMpl115a2:
             after_ns = silicon.conversion_ns // _SAMPLE_QUARTER + silicon.sample_delay_ns
             words = silicon.sample_counts(t_ns + after_ns)
             if self.on_conversion is not None:
-                self.on_conversion(t_ns, words, self._silicon.coefficient_words)
+                self.on_conversion(t_ns, words, self._silicon.registers)
             if not self._faults.stale(t_ns):
                 slow = self._faults.slow(t_ns)
                 tc = _SLOW_NS if slow else self._silicon.conversion_ns
@@ -202,75 +206,43 @@ _OUTLIER_RATE = 0.012
 _OUTLIER_KPA = (0.5, 1.2)  # range of their size, at the measured noise
 _OUTLIERS_LOW = 0.85  # most are low (hardware.md 1.3)
 _DRAWN_AT_ONCE = 1024  # a call of numpy for each reading would be slow
-_FAR_OVER_RANGE_KPA = 45.0
 
 
 class FrontEnd:
-    """Sampler of one dome, or of the surroundings of a bare chip: called by the emulated chip.
+    """Sampler of a chip at its site: called by the emulated chip.
 
-    Before `begin` the dome is at the scene's first instant. Fault `over_range`: pressure is 45 kPa
-    higher, past the range; most parts wrap. `frozen`: the pressure word stays constant, the
-    temperature word does not.
+    Fault `frozen`: the pressure word stays constant, the temperature word does not.
     """
 
-    def __init__(
-        self,
-        chip: ChipProperties,
-        dome: DomeProperties,
-        pressure_kpa: Callable[[float], float],
-        surroundings: Surroundings,
-        scene: EmulationSection,
-        label: str,
-        over_range: FaultTiming | None = None,
-        frozen: FaultTiming | None = None,
-        puncture: Puncture | None = None,
-    ) -> None:
+    def __init__(self, chip: ChipProperties, site: ChipSite) -> None:
         self._c = chip.coefficients
         self._tadc_at_25 = chip.tadc_at_25_degc
-        self._lags_s = dome.chip_lag_s, dome.gas_lag_s
-        self._pressure_kpa = pressure_kpa
-        self._surroundings = surroundings
-        self._clip_kpa = scene.clip_kpa or math.inf
-        self._epoch_ns: int | None = None
-        self._over_range = over_range if over_range is not None else FaultTiming()
-        self._frozen = frozen if frozen is not None else FaultTiming()
-        self._puncture = puncture
+        self._site = site
         self._padc = -1  # none so far
-        self._noise = _generate_noise(scene, self._lsb_kpa(), make_rng(label))
-        self._correlated_s = scene.correlated_ms * 1e-3
+        self._noise = _generate_noise(site.emulation, self._lsb_kpa(), make_rng(site.noise_label))
+        self._correlated_s = site.emulation.correlated_ms * 1e-3
         self._core_kpa = 0.0
         self._last_s = -math.inf
-        self._is_temperature_constant = surroundings.is_temperature_constant
         self._constant_tadc = self._true_tadc(0.0)
-
-    def begin_scene_time(self, epoch_ns: int) -> None:
-        """Begin the scene's time at this instant of the clock."""
-        self._epoch_ns = epoch_ns
 
     def __call__(self, t_ns: int) -> tuple[int, int]:
         """Compute the words `padc`, `tadc` of a conversion that samples at `t_ns`."""
-        # A conversion begun before the scene samples its first instant.
-        t_s = 0.0 if self._epoch_ns is None else max(0.0, (t_ns - self._epoch_ns) * 1e-9)
+        t_s = self._site.to_scene_s(t_ns)
         core_kpa, outlier_kpa, tadc_noise = next(self._noise)
-        kpa = self._pressure_kpa(t_s)
-        if self._puncture is not None:
-            kpa = self._puncture.apply_leak(kpa, t_s, t_ns)
-        kpa = min(kpa, self._clip_kpa)
-        if self._over_range(t_ns):
-            kpa += _FAR_OVER_RANGE_KPA
+        kpa = self._site.compute_kpa(t_s, t_ns)
         kpa += self._correlate(core_kpa, t_ns * 1e-9) + outlier_kpa
         # The true temperature affects the pressure word; the temperature word itself is noisy.
-        tadc = self._constant_tadc if self._is_temperature_constant else self._true_tadc(t_s)
+        is_constant = self._site.is_temperature_constant
+        tadc = self._constant_tadc if is_constant else self._true_tadc(t_s)
         c = self._c
         pcomp = (kpa - PRESSURE_MIN_KPA) / _KPA_PER_PCOMP
         padc = (pcomp - c.a0 - c.b2 * tadc) / (c.b1 + c.c12 * tadc)
-        if self._padc < 0 or not self._frozen(t_ns):
+        if self._padc < 0 or not self._site.is_frozen(t_ns):
             self._padc = round(padc) % 1024
         return self._padc, min(max(round(tadc + tadc_noise), 0), 1023)
 
     def _true_tadc(self, t_s: float) -> float:
-        degc = self._surroundings.compute_chip_degc(t_s, *self._lags_s)
-        return self._tadc_at_25 + (degc - 25.0) * _TADC_PER_KELVIN
+        return self._tadc_at_25 + (self._site.compute_degc(t_s) - 25.0) * _TADC_PER_KELVIN
 
     def _lsb_kpa(self) -> float:
         return abs(self._c.b1 + self._c.c12 * self._tadc_at_25) * _KPA_PER_PCOMP
@@ -301,3 +273,65 @@ def _generate_noise(
         outlier = np.where(rng.random(n) < _OUTLIER_RATE, size, 0.0)
         temperature = _TADC_NOISE * rng.standard_normal(n)
         yield from zip(core.tolist(), outlier.tolist(), temperature.tolist(), strict=True)
+
+
+def draw_chip(serial: str, parts_seed: int) -> ChipProperties:
+    """Draw the chip of a serial. The ranges bracket the three published sets of coefficients."""
+    rng = make_part_rng("chip", serial, parts_seed)
+    while True:
+        drawn = Coefficients(
+            a0=rng.uniform(1700, 2200),
+            b1=rng.uniform(-2.5, -1.9),
+            b2=rng.uniform(-1.0, -0.85),
+            c12=rng.uniform(0.00065, 0.00088),
+        )
+        coefficients = Coefficients.from_words(drawn.to_words())
+        if 250 <= float(compute_padc(100.0, 500, coefficients)) <= 500:
+            break
+    return ChipProperties(
+        coefficients=coefficients,
+        conversion_ns=min(MPL115A2.conversion_max_ns, round(rng.uniform(1.4e6, 2.0e6))),
+        tadc_at_25_degc=rng.uniform(472, 498),  # two published scales, 26 counts apart
+    )
+
+
+_SAMPLE_DELAY_MAX_NS = 300_000
+"""Largest deviation of the sample instant from a quarter of the conversion."""
+
+
+def draw_family_chip(family: PartFamily, serial: str, parts_seed: int) -> ChipProperties:
+    """Draw the chip of a serial in a family."""
+    chip = draw_chip(serial, parts_seed)
+    if family != "broad":
+        return chip
+    rng = make_rng(f"broad chip/{parts_seed}/{serial}")
+    return replace(
+        chip, sample_delay_ns=round(rng.uniform(-_SAMPLE_DELAY_MAX_NS, _SAMPLE_DELAY_MAX_NS))
+    )
+
+
+def make_chip(
+    tile: TileSection,
+    scene: Scene,
+    parts_seed: int,
+    faults: PartFaults,
+    make_site: Callable[[str], ChipSite],
+) -> EmulatedMpl115a2:
+    """Make the chip of a scene's tile; `make_site` makes the site of a serial."""
+
+    def make_part(serial: str) -> EmulatedPart:
+        chip = draw_family_chip(scene.emulation.family, serial, parts_seed)
+        fixed_ms = scene.array.conversion_ms
+        return EmulatedPart(
+            chip.coefficients.to_words(),
+            chip.conversion_ns if fixed_ms is None else round(fixed_ms * 1e6),
+            FrontEnd(chip, make_site(serial)),
+            chip.sample_delay_ns,
+        )
+
+    return EmulatedMpl115a2(
+        make_part(tile.serial),
+        scene.emulation.read_during_conversion,
+        faults,
+        make_replacement=lambda: make_part(f"{tile.serial}.spare"),
+    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 from devices.emulation.fault_timing import FaultTiming
 from devices.emulation.i2c_bus import I2cDevice
@@ -14,6 +14,8 @@ class EmulatedTca9548a:
     A written value is latched with its acknowledge and takes effect at STOP (8.5.4). Of several
     data bytes the last one counts. Power-up value 0: no channel is connected.
 
+    A channel may have several devices, at addresses of their own.
+
     Faults: `brown_out`: no supply, so it is silent and connects no channel; `mux_reset`: its RESET
     line or a dip of the supply deselects all channels.
     """
@@ -21,12 +23,12 @@ class EmulatedTca9548a:
     def __init__(
         self,
         address: int,
-        channels: Mapping[int, I2cDevice],
+        devices: Iterable[tuple[int, I2cDevice]],
         brown_out: FaultTiming | None = None,
         mux_reset: FaultTiming | None = None,
     ) -> None:
         self.address = address
-        self._channels = dict(channels)
+        self._devices = tuple(devices)
         self._brown_out = brown_out if brown_out is not None else FaultTiming()
         self._mux_reset = mux_reset if mux_reset is not None else FaultTiming()
         self._seen_ns = 0
@@ -49,7 +51,7 @@ class EmulatedTca9548a:
     def interrupt_supply(self) -> None:
         """Interrupt the supply of the mux and of all chips behind it for a moment."""
         self.reset()
-        for device in self._channels.values():
+        for _, device in self._devices:
             device.interrupt_supply()
 
     def on_address(self, reading: bool, t_ns: int) -> bool:
@@ -71,8 +73,4 @@ class EmulatedTca9548a:
 
     def get_connected_devices(self) -> Iterable[I2cDevice]:
         """Return the devices on the connected channels."""
-        return [
-            device
-            for channel, device in self._channels.items()
-            if self.connected_mask >> channel & 1
-        ]
+        return [device for channel, device in self._devices if self.connected_mask >> channel & 1]

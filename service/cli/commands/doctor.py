@@ -43,7 +43,7 @@ def doctor_command(
 ) -> None:
     """Find the tiles of a bus, measure it, and predict its frame rate.
 
-    It scans every multiplexer, reads each tile's coefficients three times, measures the bus clock
+    It scans every multiplexer, reads each tile's registers three times, measures the bus clock
     and every part's conversion time, and predicts the frame rate of every schedule. It searches a
     servo with both protocols at the usual baud rates. An emulated bus is examined in virtual time.
     Exit codes: 0 ready, 1 no working bus, 2 wrong usage, 3 something has to be changed.
@@ -130,13 +130,14 @@ def _print_diagnosis(name: str, diagnosis: BusDiagnosis, scene: Scene | None) ->
     if name == EMULATED:
         where += ", in virtual time"
     echo(f"Bus {where}")
-    tiles = Table("tile", "mux", "channel", "a0 b1 b2 c12", "conversion", "problem")
+    tiles = Table("tile", "mux", "channel", "chip", "registers", "conversion", "problem")
     for tile in diagnosis.tiles:
-        words = tile.coefficient_words
+        words = tile.registers
         tiles.add_row(
             tile.serial or "not in the scene" if scene is not None else "-",
             f"0x{tile.mux:02x}",
             str(tile.channel),
+            tile.chip,
             " ".join(f"{word:04x}" for word in words) if words is not None else "-",
             f"{tile.conversion_ms:.3f} ms" if tile.conversion_ms is not None else "-",
             tile.problem or "none",

@@ -9,8 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from devices.arrays import Bools, Floats
-from devices.chips.compensation import Compensation
-from devices.chips.mpl115a2 import TADC_PER_KELVIN
+from devices.chips.pressure_chips import Compensation
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration
 from service.estimation.fault_detection import baseline_loss
@@ -34,6 +33,7 @@ class FaultParams(KernelRecord):
 
 def make_fault_params(
     info: ArrayInfo,
+    compensation: Compensation,
     calibration: Calibration,
     tare: Tare,
     chip_max_kpa: Floats,
@@ -44,6 +44,7 @@ def make_fault_params(
 
     Args:
         info: the array.
+        compensation: of its chips.
         calibration: of its tiles.
         tare: in force.
         chip_max_kpa: (bearing tiles,), absolute pressure above which a chip saturates.
@@ -53,19 +54,24 @@ def make_fault_params(
     bearing = np.flatnonzero([not tile.reference for tile in tiles])
     end_kpa = np.full(len(tiles), np.inf)
     end_kpa[bearing] = chip_max_kpa
-    counts = np.where(np.isfinite(tare.temperature_raw_counts), tare.temperature_raw_counts, 500.0)
-    count_kpa = np.abs(Compensation(tiles).compute_kpa_per_count(counts))
+    counts = np.where(
+        np.isfinite(tare.temperature_raw_counts),
+        tare.temperature_raw_counts,
+        compensation.temperature_raw_usual,
+    )
+    count_kpa = np.abs(compensation.law.compute_kpa_per_count(counts))
     # A lost tare has no noise; no tile is checked then, since no pressure is above its baseline.
     noise = np.zeros(len(tiles))
     np.divide(
         tare.noise_kpa, count_kpa, out=noise, where=(count_kpa > 0.0) & np.isfinite(tare.noise_kpa)
     )
     unloaded_kpa = UNLOADED_BAND_SIGMAS * np.hypot(tare.noise_kpa, tare.baseline_sigma_kpa)
-    per_count = compute_sealed_gas_shift_kpa(tare, np.ones(len(tiles)) / TADC_PER_KELVIN)[bearing]
+    counts_per_kelvin = compensation.counts_per_kelvin
+    per_count = compute_sealed_gas_shift_kpa(tare, 1.0 / counts_per_kelvin)[bearing]
     for at, column in enumerate(bearing):
         entry = calibration.find_tile_or_wildcard(tiles[column].serial)
         if entry is not None and entry.effects.temperature is not None:
-            per_count[at] = entry.effects.temperature.kpa_per_k.value / TADC_PER_KELVIN
+            per_count[at] = entry.effects.temperature.kpa_per_k.value / counts_per_kelvin[column]
     stuck, limits = make_stuck_params(noise, info.nominal_rate_hz)
     made = FaultParams.array(
         len(tiles), stuck_check_max_kpa=end_kpa, unloaded_band_kpa=unloaded_kpa, stuck=stuck

@@ -12,7 +12,6 @@ import numpy as np
 from scipy.optimize import nnls
 
 from devices.arrays import Floats
-from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, estimate_degc
 from devices.errors import CalibrationError
 from service.estimation.calibration import (
     LOOP_HALF_WIDTH_FORCE_N,
@@ -133,16 +132,15 @@ def fit_static_curve(*recordings: Indentation) -> TileCalibration:
         zero.temperature_counts for zero in zeros if zero.temperature_counts is not None
     ]
     temperature_raw_counts = float(np.mean(temperature_raw)) if temperature_raw else None
+    chip = recordings[0].chip
     facts = RigFacts(
         recordings=sum(bool(find_slow_stroke_rows(recording)) for recording in recordings),
         end_n=float(np.mean(_repeat_maxima(blocks, blocks.force_n))),
         end_absolute_kpa=baseline_kpa + high_kpa,
-        spare_kpa=PRESSURE_MAX_KPA - baseline_kpa - high_kpa,
+        spare_kpa=chip.max_kpa - baseline_kpa - high_kpa,
         ended_by="chip" if by_chip else "load",
         temperature_raw_counts=temperature_raw_counts,
-        degc=None
-        if temperature_raw_counts is None
-        else float(estimate_degc(temperature_raw_counts)),
+        degc=None if temperature_raw_counts is None else chip.estimate_degc(temperature_raw_counts),
         r2_of_mean=_compute_r2_of_mean(cubic, residual_n, blocks),
         repeat_gains=tuple(gains.tolist()),
         baseline_drift_kpa=drift_kpa,

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from devices.arrays import Bools, Floats, Ints
-from devices.chips.mpl115a2 import TADC_PER_KELVIN, estimate_degc
 from service.estimation.effects import Parameter, TemperatureEffect
 from service.estimation.fitting.least_squares import (
     compute_fit_covariance,
@@ -48,7 +47,8 @@ def fit_temperature_effect(soak: ThermalSoak) -> TemperatureEffect | str:
         bins.sigma(soak),
     )
     still_counts = chip_counts[: round(1.0 / _BIN_S)].mean()
-    if (change_k := float(np.ptp(chip_counts)) / -TADC_PER_KELVIN) < STEP_MIN_K:
+    counts_per_kelvin = soak.chip.counts_per_kelvin
+    if (change_k := float(np.ptp(chip_counts)) / abs(counts_per_kelvin)) < STEP_MIN_K:
         return f"temperature changes by {change_k:.1f} K only, {STEP_MIN_K} K are needed"
     t_ns = np.rint(1e9 * soak.t_s).astype(np.int64)[:, None]
 
@@ -58,8 +58,8 @@ def fit_temperature_effect(soak: ThermalSoak) -> TemperatureEffect | str:
             soak.temperature_raw[:, None], t_ns, np.array([lag_s])
         )
         return (
-            (bins.mean(counts[:, 0]) - still_counts) / TADC_PER_KELVIN,
-            bins.mean(rise[:, 0]) / TADC_PER_KELVIN,
+            (bins.mean(counts[:, 0]) - still_counts) / counts_per_kelvin,
+            bins.mean(rise[:, 0]) / counts_per_kelvin,
         )
 
     def residual(x: Floats) -> Floats:
@@ -91,7 +91,7 @@ def fit_temperature_effect(soak: ThermalSoak) -> TemperatureEffect | str:
     left = (base_kpa + kpa_per_k * expected_k - kpa) ** 2 - sigma_kpa**2
     wrong_s = np.sqrt(max(0.0, float(left.sum())) / float(((kpa_per_k * rise_k) ** 2).sum()))
     # A rigid bubble would follow p/T; the wall's compliance c lowers it: dp/dT = p/T/(1 + c p).
-    rigid = base_kpa / (estimate_degc(float(chip_counts[0])) + _KELVIN)
+    rigid = base_kpa / (soak.chip.estimate_degc(float(chip_counts[0])) + _KELVIN)
     wall = (rigid / kpa_per_k - 1.0) / base_kpa
     wall_sigma = rigid / kpa_per_k / base_kpa * float(np.hypot(sigma[1] / kpa_per_k, _T_SIGMA))
     return TemperatureEffect(

@@ -27,6 +27,8 @@ class BearingTiles:
         models: names of the models in use.
         baseline_kpa: absolute pressure at the tare.
         tare_counts: mean raw temperature at the tare.
+        counts_per_kelvin: temperature counts of the chips per kelvin.
+        rated_max_kpa: end of the chips' rated range.
         step_s: nominal time between two readings.
         has_bare_tile: whether the array has a bare reference tile, too.
     """
@@ -36,6 +38,8 @@ class BearingTiles:
     models: Sequence[str]
     baseline_kpa: Floats
     tare_counts: Floats
+    counts_per_kelvin: Floats
+    rated_max_kpa: Floats
     step_s: float
     has_bare_tile: bool
 

@@ -19,7 +19,6 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from devices.arrays import Floats, Times
-from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from devices.jit import jit_cached
 from service.estimation.effects import parameter_values
 from service.estimation.models import BearingTiles, ModelParams
@@ -59,7 +58,7 @@ class TemperatureParams(ModelParams):
         lag_s = parameter_values(e.lag_s for e in found)
         return cls.array(
             len(found),
-            kpa_per_count=parameter_values(e.kpa_per_k for e in found) / TADC_PER_KELVIN,
+            kpa_per_count=parameter_values(e.kpa_per_k for e in found) / tiles.counts_per_kelvin,
             relative_sigma=[e.kpa_per_k.sigma / e.kpa_per_k.value for e in found],
             lag_s=lag_s,
             lag_sigma_s=[e.lag_s.sigma for e in found],

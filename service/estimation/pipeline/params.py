@@ -136,10 +136,16 @@ class TileParams(ModelRegistry):
     """Parameters of a tile and of its models; those of models that are not named are not read."""
 
     is_load_bearing: int
-    a0: float  # coefficients of the chip
+    a0: float  # law of the chip's counts
     b1: float
     b2: float
     c12: float
+    unit_kpa: float
+    offset_kpa: float
+    rated_min_kpa: float
+    rated_max_kpa: float
+    wrap_counts: float
+    temperature_change_max_counts: float
     baseline_kpa: float
     noise_kpa: float
     tare_counts: float

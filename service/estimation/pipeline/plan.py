@@ -13,8 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Floats
-from devices.chips.compensation import Compensation
-from devices.chips.mpl115a2 import PRESSURE_MAX_KPA
+from devices.chips.pressure_chips import Compensation
 from devices.errors import CalibrationError, UsageError
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration, TileCalibration
@@ -37,7 +36,7 @@ from service.estimation.pipeline.params import (
 )
 from service.estimation.pipeline.saturation import make_saturation_params
 from service.estimation.records import RecordArray
-from service.estimation.tare.tare import Tare
+from service.estimation.tare.tare import Tare, compute_temperature_change_max_counts
 from service.estimation.tare.unloaded_windows import compute_variance_inflation
 
 CONTACT_ON_SIGMA = 5.0  # of the GRF unloaded: noise alone does not get there
@@ -125,23 +124,26 @@ def make_plan(
     if not len(bearing):
         raise UsageError("every tile of the array is a reference tile: nothing bears load")
     entries = calibration.get_tiles_or_wildcard([info.tiles[i].serial for i in bearing])
+    compensation = Compensation(info.tiles)
     seen = BearingTiles(
         calibrations=entries,
         calibration_label=f"calibration {calibration.name} ({calibration.id})",
         models=models,
         baseline_kpa=tare.baseline_kpa[bearing],
         tare_counts=tare.temperature_raw_counts[bearing],
+        counts_per_kelvin=compensation.counts_per_kelvin[bearing],
+        rated_max_kpa=compensation.max_kpa[bearing],
         step_s=1.0 / info.nominal_rate_hz,
         has_bare_tile=len(bearing) < len(info.tiles),
     )
     by_model = make_model_params(seen)
     for i, entry in zip(bearing, entries, strict=True):
         tile = info.tiles[i]
-        if entry.coefficient_words not in (None, tile.coefficient_words):
+        if entry.registers not in (None, tile.registers):
             raise CalibrationError(
                 f"tile {tile.serial} is not the part that was calibrated: its chip has the "
-                f"coefficients {tile.coefficient_words}, the calibrated one "
-                f"{entry.coefficient_words}",
+                f"registers {tile.registers}, the calibrated one "
+                f"{entry.registers}",
                 where=seen.calibration_label,
                 remedy="Press this tile on the test rig and calibrate it, or correct the serial",
             )
@@ -149,13 +151,20 @@ def make_plan(
     tiles[bearing] = _make_bearing_params(info, calibration, tare, bearing, seen, by_model)
     faults, run_limits = make_fault_params(
         info,
+        compensation,
         calibration,
         tare,
         tiles["chip_max_kpa"][bearing],
         is_gas_corrected=tiles["gas"]["is_known"][bearing] == 1,
     )
     of_all = {
-        **vars(Compensation(info.tiles)),
+        **vars(compensation.law),
+        "rated_min_kpa": compensation.min_kpa,
+        "rated_max_kpa": compensation.max_kpa,
+        "wrap_counts": compensation.wrap_counts,
+        "temperature_change_max_counts": compute_temperature_change_max_counts(
+            compensation.counts_per_kelvin
+        ),
         "baseline_kpa": tare.baseline_kpa,
         "noise_kpa": tare.noise_kpa,
         "tare_counts": tare.temperature_raw_counts,
@@ -245,7 +254,12 @@ def _make_bearing_params(
     """Make the parameters of the load-bearing tiles, but for those of all tiles."""
     entries, curves = seen.calibrations, by_model["static"]
     chip_max_kpa = np.array(
-        [_compute_chip_max_kpa(*e) for e in zip(entries, seen.baseline_kpa.tolist(), strict=True)]
+        [
+            _compute_chip_max_kpa(*each)
+            for each in zip(
+                entries, seen.rated_max_kpa.tolist(), seen.baseline_kpa.tolist(), strict=True
+            )
+        ]
     )
     positions_m = np.array([(t.x_m, t.y_m, t.z_m) for t in info.tiles])[bearing]
     grid = compute_grid_indices_from_1(positions_m[:, :2])
@@ -295,13 +309,15 @@ def _compute_variance_inflation(
     return compute_variance_inflation(part, lasts_s * rate_hz, np.maximum(readings, 1))
 
 
-def _compute_chip_max_kpa(entry: TileCalibration, baseline_kpa: float) -> float:
+def _compute_chip_max_kpa(
+    entry: TileCalibration, rated_max_kpa: float, baseline_kpa: float
+) -> float:
     facts = entry.rig
     if facts is None:
-        return max(PRESSURE_MAX_KPA, baseline_kpa + entry.range_kpa[1])
+        return max(rated_max_kpa, baseline_kpa + entry.range_kpa[1])
     if facts.ended_by == "chip":
         return facts.end_absolute_kpa
-    return max(PRESSURE_MAX_KPA, facts.end_absolute_kpa)
+    return max(rated_max_kpa, facts.end_absolute_kpa)
 
 
 def compute_settling_time_s(plan: EstimationPlan) -> float:

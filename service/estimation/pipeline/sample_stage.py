@@ -3,10 +3,10 @@
 Apparent force: by the static curve, before hysteresis and creep of the rubber are removed. Order of
 the models: outliers, temperature, ambient, gas, static, skew.
 
-Real parts do this beyond some 25 N (hardware.md 1.3), and at face value full load reads as about
-23 kPa. Recognised without memory: no sealed bubble can be below 50 kPa, the end of the chip's
-range, so a lower reading is a count that wrapped once. A bus that reads all ones is no such case:
-the driver flags it, and it never becomes a pressure.
+Counts of an MPL115A2 wrap beyond some 25 N (hardware.md 1.3), and at face value full load reads as
+about 23 kPa. Recognised without memory: no sealed bubble can be below 50 kPa, the begin of the
+chip's range, so a lower reading is a count that wrapped once. A bus that reads all ones is no such
+case: the driver flags it, and it never becomes a pressure.
 """
 
 from __future__ import annotations
@@ -17,12 +17,10 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Times
-from devices.chips import mpl115a2
-from devices.chips.mpl115a2 import COUNTS_MAX, PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
+from devices.chips import pressure_chip
 from devices.flags import EstimateFlag, TileFlag
-from devices.frames import NOT_READ
+from devices.frames import HOLD_MAX_NS, NOT_READ
 from devices.jit import jit_cached, jit_inlined
-from devices.temperature_hold import HOLD_MAX_NS
 from service.estimation.fault_detection.baseline_loss import (
     ERROR_MIN_KPA,
     update_baseline_error_bound_kpa,
@@ -54,7 +52,6 @@ from service.estimation.pipeline.state import (
     TileState,
 )
 from service.estimation.records import RecordArray
-from service.estimation.tare.tare import TEMPERATURE_CHANGE_MAX_COUNTS
 
 _SATURATED = int(EstimateFlag.SATURATED)
 _EXTRAPOLATED = int(EstimateFlag.EXTRAPOLATED)
@@ -166,7 +163,7 @@ def _has_temperature_changed(tile_params: TileParams, sample: TileSample) -> boo
     is_checked = tile_params.is_load_bearing == 1 and tile_params.temperature.is_named == 0
     return (
         is_checked
-        and moved_counts > TEMPERATURE_CHANGE_MAX_COUNTS
+        and moved_counts > tile_params.temperature_change_max_counts
         and not math.isnan(sample.pressure_kpa)
     )
 
@@ -287,7 +284,7 @@ def _compute_apparent_force(
         sample.extrapolated_n = extrapolate_capped_force_n(
             tile_params.saturation, curve_n, gauge_kpa
         )
-    elif sample.pressure_kpa > PRESSURE_MAX_KPA:
+    elif sample.pressure_kpa > tile_params.rated_max_kpa:
         flags |= _OVER_RATED
     if static_kpa < tile_params.range_low_kpa:
         flags |= _EXTRAPOLATED
@@ -339,23 +336,36 @@ def _isothermal_pressure(
 
 
 @jit_cached
-def unwrap_pressure(kpa: float, kpa_per_count: float) -> float:
+def unwrap_pressure(
+    kpa: float, kpa_per_count: float, rated_min_kpa: float, wrap_counts: float
+) -> float:
     """Return the absolute pressure with a wrapped count corrected to below zero.
 
     Args:
         kpa: compensated pressure.
         kpa_per_count: pressure step of one raw pressure count (negative).
+        rated_min_kpa: begin of the chip's range.
+        wrap_counts: counts after which they wrap; 0: never.
 
     Returns:
         Pressure in kPa; beyond every calibrated range if the count had wrapped.
     """
-    return kpa - (COUNTS_MAX + 1) * kpa_per_count if kpa < PRESSURE_MIN_KPA else kpa
+    return kpa - wrap_counts * kpa_per_count if kpa < rated_min_kpa else kpa
 
 
 _UNUSABLE = int(TileFlag.UNUSABLE)
 _OVER_RANGE = int(TileFlag.OVER_RANGE)
-_kpa_of = jit_cached(mpl115a2.compensate_kpa_jit)
-_kpa_per_count_of = jit_cached(mpl115a2.compute_kpa_per_padc_jit)
+_kpa_of = jit_cached(pressure_chip.compute_kpa)
+_kpa_per_count_of = jit_cached(pressure_chip.compute_kpa_per_count)
+
+
+@jit_cached
+def _read_count(counts: npt.NDArray[np.uint16], row: int, tile: int, words: int) -> int:
+    """Return the count of a tile in words of 16 bits, the lower one first."""
+    count = np.int64(counts[row, tile * words])
+    if words == 2:
+        count += np.int64(counts[row, tile * words + 1]) << 16
+    return int(count)
 
 
 @jit_inlined
@@ -375,8 +385,12 @@ def append_frames_to_buffer(
     tile_flags: npt.NDArray[np.uint8],
     frame_flags: npt.NDArray[np.uint8],
 ) -> None:
-    """Convert n frames to pressures and append them to the buffer; columns as in `FrameBatch`."""
+    """Convert n frames to pressures and append them to the buffer; columns as in `FrameBatch`.
+
+    Counts are as words of 16 bits, one or two a tile: one compilation does for any chip.
+    """
     foot_params = params.foot[0]
+    words = pressure_raw.shape[1] // len(tile_states)
     for k in range(len(seq)):
         i = foot_state.end_row
         row, now_ns = buffer.rows[i], t_mono_ns[k]
@@ -401,7 +415,8 @@ def append_frames_to_buffer(
             sample = buffer.samples[i, j]
             flags = np.int64(tile_flags[k, j])
             sample.is_over_range = 1 if flags & _OVER_RANGE != 0 else 0
-            sample.pressure_raw, sample.temperature_raw = pressure_raw[k, j], temperature_raw[k, j]
+            sample.pressure_raw = _read_count(pressure_raw, k, j, words)
+            sample.temperature_raw = _read_count(temperature_raw, k, j, words)
             if sample.temperature_raw == NOT_READ:  # a chip's temperature holds for a second
                 if now_ns - tile_state.temperature_ns <= HOLD_MAX_NS:
                     sample.temperature_raw = tile_state.temperature_raw
@@ -415,10 +430,13 @@ def append_frames_to_buffer(
             if flags & _UNUSABLE == 0 and is_read:
                 p, t = float(sample.pressure_raw), float(sample.temperature_raw)
                 chip = tile_params
-                kpa = _kpa_of(p, t, chip.a0, chip.b1, chip.b2, chip.c12)
+                kpa = _kpa_of(
+                    p, t, chip.a0, chip.b1, chip.b2, chip.c12, chip.unit_kpa, chip.offset_kpa
+                )
                 if tile_params.unwrap.is_named == 1:
-                    kpa = unwrap_pressure(kpa, _kpa_per_count_of(t, chip.b1, chip.c12))
-                if kpa >= PRESSURE_MIN_KPA:
+                    count_kpa = _kpa_per_count_of(t, chip.b1, chip.c12, chip.unit_kpa)
+                    kpa = unwrap_pressure(kpa, count_kpa, chip.rated_min_kpa, chip.wrap_counts)
+                if kpa >= chip.rated_min_kpa:
                     sample.pressure_kpa = kpa
         foot_state.newest_ns = now_ns
         foot_state.end_row += 1

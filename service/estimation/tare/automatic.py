@@ -17,7 +17,12 @@ import numpy as np
 from devices.arrays import Bools, Times
 from devices.errors import TareError
 from devices.frames import NOT_READ, FrameBatch
-from service.estimation.tare.tare import Tare, compute_sealed_gas_shift_kpa, compute_warming_k
+from service.estimation.tare.tare import (
+    TEMPERATURE_CHANGE_MAX_K,
+    Tare,
+    compute_sealed_gas_shift_kpa,
+    compute_warming_k,
+)
 from service.estimation.tare.unloaded_windows import (
     FRAMES_MIN,
     LOADED_KPA,
@@ -29,8 +34,6 @@ from service.estimation.tare.unloaded_windows import (
 
 HISTORY_NS = 10_000_000_000  # a foot that walks is in the air within that time
 WINDOW_NS = 250_000_000  # fits into the flight of a hop, and holds enough readings
-TEMPERATURE_CHANGE_MAX_COUNTS = 4.0
-"""Largest change of a chip's temperature for a tare, 0.75 K: 0.25 kPa or half a newton."""
 WINDOW_MAX_NS = 1_000_000_000
 """Longest window, for slow arrays, whose shorter windows have too few frames."""
 
@@ -92,7 +95,7 @@ def compute_newest_unloaded_tare(
     tare = recent.compute_tare(low[0].rows, "unloaded")
     if present is not None:
         _reject_above(tare, present, recent.serials, is_load_bearing)
-    _reject_warming(frames, tare, recent.serials)
+    _reject_warming(recent, frames, tare)
     recent.reject_above_rig_baseline(tare)
     recent.reject_stuck_for_half_of_rows(tare, low[0].rows)
     return tare
@@ -103,7 +106,7 @@ def _compute_window_ns(since_ns: Times) -> int:
     return int(min(max(WINDOW_NS, enough_ns), WINDOW_MAX_NS))
 
 
-def _reject_warming(frames: FrameBatch, tare: Tare, serials: tuple[str, ...]) -> None:
+def _reject_warming(recent: TareFrames, frames: FrameBatch, tare: Tare) -> None:
     """Reject a tare while a chip's temperature changes: its gas lags by seconds."""
     temperature_raw = np.where(
         frames.temperature_raw == NOT_READ, np.nan, frames.temperature_raw.astype(np.float64)
@@ -111,14 +114,15 @@ def _reject_warming(frames: FrameBatch, tare: Tare, serials: tuple[str, ...]) ->
     since_ns = frames.t_ns - frames.t_ns[0]
     begin = temperature_raw[since_ns <= WINDOW_NS]
     known = np.isfinite(begin).any(axis=0)
-    moved = np.zeros(len(serials))
-    moved[known] = np.abs(np.nanmean(begin[:, known], axis=0) - tare.temperature_raw_counts[known])
-    worst = int(np.argmax(moved))
-    if moved[worst] > TEMPERATURE_CHANGE_MAX_COUNTS:
+    begin_counts = np.full(len(recent.serials), np.nan)
+    begin_counts[known] = np.nanmean(begin[:, known], axis=0)
+    moved_k = np.nan_to_num(np.abs(compute_warming_k(tare, begin_counts, recent.counts_per_kelvin)))
+    worst = int(np.argmax(moved_k))
+    if moved_k[worst] > TEMPERATURE_CHANGE_MAX_K:
         raise TareError(
-            f"the temperature of tile {serials[worst]} has moved by {moved[worst]:.0f} counts in "
-            "the last seconds, and the gas in its dome is still behind",
-            expected=f"at most {TEMPERATURE_CHANGE_MAX_COUNTS:g} counts in {HISTORY_NS / 1e9:g} s",
+            f"the temperature of tile {recent.serials[worst]} has moved by {moved_k[worst]:.1f} K "
+            "in the last seconds, and the gas in its dome is still behind",
+            expected=f"at most {TEMPERATURE_CHANGE_MAX_K:.2f} K in {HISTORY_NS / 1e9:g} s",
             remedy="Wait for half a minute and tare again",
         )
 
@@ -221,14 +225,14 @@ def propose_flight_tare(
     tare = recent.remove_recovery(tare)
     shift_kpa = np.where(is_load_bearing, tare.baseline_kpa - present.baseline_kpa, 0.0)
     doubt = _explain_excess_shift(
-        tare, present, SHIFT_MAX_KPA, serials, is_load_bearing, "the last tare"
+        recent, tare, present, SHIFT_MAX_KPA, is_load_bearing, "the last tare"
     )
     if doubt is None and last_manual is not None:
         doubt = _explain_excess_shift(
+            recent,
             tare,
             last_manual,
             TOTAL_SHIFT_MAX_KPA,
-            serials,
             is_load_bearing,
             "the last tare by hand",
         )
@@ -286,15 +290,15 @@ def propose_first_tare_between_steps(recent: TareFrames) -> FlightTareResult:
 
 
 def _explain_excess_shift(
+    recent: TareFrames,
     tare: Tare,
     other: Tare,
     bound_kpa: float,
-    serials: tuple[str, ...],
     is_load_bearing: Bools,
     which: str,
 ) -> str | None:
     """Return the reason why a baseline is too far from another one; None if it is near."""
-    warming_k = compute_warming_k(other, tare.temperature_raw_counts)
+    warming_k = compute_warming_k(other, tare.temperature_raw_counts, recent.counts_per_kelvin)
     explained_kpa = compute_sealed_gas_shift_kpa(other, warming_k)
     shift_kpa = tare.baseline_kpa - other.baseline_kpa
     excess_kpa = np.abs(shift_kpa - explained_kpa) - THERMAL_SHIFT_UNCERTAINTY * np.abs(
@@ -305,7 +309,7 @@ def _explain_excess_shift(
     if excess_kpa[worst] <= bound_kpa:
         return None
     return (
-        f"tile {serials[worst]} reads {shift_kpa[worst]:+.2f} kPa against {which}, of which "
+        f"tile {recent.serials[worst]} reads {shift_kpa[worst]:+.2f} kPa against {which}, of which "
         f"{abs(warming_k[worst]):.1f} K explain {abs(explained_kpa[worst]):.2f} kPa: a light load, "
         "or a baseline that has moved. If the foot is in the air, tare by hand"
     )

@@ -13,18 +13,17 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Bools, Floats
-from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from devices.errors import TareError
 
 IntervalSource = Literal["interval", "lead", "recognised", "unloaded", "flight"]
 TareSource = IntervalSource | Literal["lost"]
 _KPA_MAX = 1000.0
-"""Largest valid pressure: nine times a chip's range, and no square overflows."""
+"""Largest valid pressure: eight times a chip's range, and no square overflows."""
 _TILE_VALUES_MAX = {
     "baseline_kpa": _KPA_MAX,
     "baseline_sigma_kpa": _KPA_MAX,
     "noise_kpa": _KPA_MAX,
-    "temperature_raw_counts": 1023.0,
+    "temperature_raw_counts": float(2**24),
     "noise_lasting": 1.0,
     "noise_lasting_s": 3600.0,
 }
@@ -115,7 +114,7 @@ class Tare:
 
 SEAL_TEMPERATURE_K = 298.0
 """A sealed bubble's pressure is proportional to its absolute temperature; about 25 degC."""
-TEMPERATURE_CHANGE_MAX_COUNTS = 4.0
+TEMPERATURE_CHANGE_MAX_K = 4.0 / 5.35  # four counts of an MPL115A2
 """Largest change of a chip's temperature since the tare with a valid baseline: 0.75 K are 0.25 kPa,
 half a newton on a tile and one and a half on a foot of four."""
 TREND_OVER_NS = 6 * 3_600_000_000_000
@@ -124,9 +123,14 @@ TREND_SPAN_MIN_NS = 600_000_000_000
 """Least time span of a trend in kPa/h."""
 
 
-def compute_warming_k(tare: Tare, temperature_counts: Floats) -> Floats:
+def compute_temperature_change_max_counts(counts_per_kelvin: Floats) -> Floats:
+    """Return `TEMPERATURE_CHANGE_MAX_K` in counts of each chip."""
+    return np.asarray(TEMPERATURE_CHANGE_MAX_K * np.abs(counts_per_kelvin))
+
+
+def compute_warming_k(tare: Tare, temperature_counts: Floats, counts_per_kelvin: Floats) -> Floats:
     """Return the rise of each chip's temperature since the tare in kelvin; NaN where unknown."""
-    return np.asarray((temperature_counts - tare.temperature_raw_counts) / TADC_PER_KELVIN)
+    return np.asarray((temperature_counts - tare.temperature_raw_counts) / counts_per_kelvin)
 
 
 def compute_sealed_gas_shift_kpa(tare: Tare, warming_k: Floats) -> Floats:
@@ -134,17 +138,20 @@ def compute_sealed_gas_shift_kpa(tare: Tare, warming_k: Floats) -> Floats:
     return np.asarray(tare.baseline_kpa / SEAL_TEMPERATURE_K * warming_k)
 
 
-def has_temperature_changed(tare: Tare, temperature_counts: npt.ArrayLike) -> Bools:
+def has_temperature_changed(
+    tare: Tare, temperature_counts: npt.ArrayLike, counts_per_kelvin: Floats
+) -> Bools:
     """Return a mask of tiles that warmed or cooled too far since the tare; False where unknown.
 
     Args:
         tare: in force; False for tiles without a temperature.
         temperature_counts: (..., tiles), NaN where unknown.
+        counts_per_kelvin: (tiles,), of their chips.
     """
     moved_counts = np.abs(
         np.asarray(temperature_counts, dtype=np.float64) - tare.temperature_raw_counts
     )
-    return np.asarray(moved_counts > TEMPERATURE_CHANGE_MAX_COUNTS)
+    return np.asarray(moved_counts > compute_temperature_change_max_counts(counts_per_kelvin))
 
 
 @dataclass(frozen=True)
@@ -162,18 +169,18 @@ class BaselineTrend:
     kelvin_per_hour: Floats
 
 
-def fit_recent_baseline_trend(tares: Sequence[Tare], *, tiles: int) -> BaselineTrend:
+def fit_recent_baseline_trend(tares: Sequence[Tare], *, counts_per_kelvin: Floats) -> BaselineTrend:
     """Fit the trends of baseline and temperature over the last six hours; NaN below ten minutes.
 
     Args:
         tares: of the same tiles, in any order.
-        tiles: number of tiles.
+        counts_per_kelvin: (tiles,), of their chips.
     """
     newest_ns = max((tare.t_ns for tare in tares), default=0)
     recent = [tare for tare in tares if newest_ns - tare.t_ns <= TREND_OVER_NS]
     t_ns = np.array([tare.t_ns - newest_ns for tare in recent], dtype=np.float64)
     if not recent or -t_ns.min() < TREND_SPAN_MIN_NS:
-        unknown = np.full(tiles, np.nan)
+        unknown = np.full(len(counts_per_kelvin), np.nan)
         return BaselineTrend(unknown, unknown, unknown)
     hours = t_ns / 3.6e12
     lever = (hours - hours.mean()) / ((hours - hours.mean()) ** 2).sum()
@@ -185,5 +192,5 @@ def fit_recent_baseline_trend(tares: Sequence[Tare], *, tiles: int) -> BaselineT
         kpa_per_hour=(lever[:, None] * by_tare["baseline_kpa"]).sum(axis=0),
         sigma_kpa_per_hour=np.sqrt(((lever[:, None] * by_tare["baseline_sigma_kpa"]) ** 2).sum(0)),
         kelvin_per_hour=(lever[:, None] * by_tare["temperature_raw_counts"]).sum(axis=0)
-        / TADC_PER_KELVIN,
+        / counts_per_kelvin,
     )

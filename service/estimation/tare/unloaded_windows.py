@@ -26,11 +26,10 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Bools, Floats, Times
-from devices.chips.compensation import Compensation
+from devices.chips.pressure_chips import Compensation
 from devices.errors import TareError
 from devices.flags import FrameFlag
-from devices.frames import FrameBatch
-from devices.temperature_hold import hold_temperature
+from devices.frames import FrameBatch, hold_temperature
 from service.estimation.calibration import Calibration
 from service.estimation.tare.tare import Tare, TareSource
 
@@ -151,6 +150,7 @@ class TareFrames:
         rig_baseline_kpa: (tiles,), baselines in the rig; NaN where unknown.
         rig_noise_kpa: (tiles,), standard deviations of a reading there; likewise.
         is_calibrated: (tiles,), False for bare tiles, which bear no load.
+        counts_per_kelvin: (tiles,), of the chips.
     """
 
     def __init__(
@@ -171,6 +171,7 @@ class TareFrames:
         )
         self.rig_noise_kpa = np.array([e.noise_kpa if e else None for e in entries], dtype=float)
         self.is_calibrated = np.array([entry is not None for entry in entries])
+        self.counts_per_kelvin = compensation.counts_per_kelvin
         self._compensation = compensation
         self._remove_recovery = remove_recovery
 

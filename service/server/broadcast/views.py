@@ -85,14 +85,19 @@ def make_drift_view(node: ServerNode) -> DriftView:
     """Return the present drift of a node."""
     live, tiles = node.estimator.live, len(node.last_info.tiles)
     line = fit_recent_baseline_trend(
-        node.estimator.tare_history.valid_tares(node.last_info), tiles=tiles
+        node.estimator.tare_history.valid_tares(node.last_info),
+        counts_per_kelvin=live.counts_per_kelvin,
     )
     unknown = np.full(tiles, np.nan)
     slope = unknown if live.ranges is None else live.ranges.slope_n_per_kpa
     warmer_by_k = (
         unknown
         if live.tare_in_use_unless_lost is None
-        else compute_warming_k(live.tare_in_use_unless_lost, live.mean_recent_temperature_raw())
+        else compute_warming_k(
+            live.tare_in_use_unless_lost,
+            live.mean_recent_temperature_raw(),
+            live.counts_per_kelvin,
+        )
     )
     since_kpa = (
         unknown

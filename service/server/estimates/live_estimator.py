@@ -12,11 +12,10 @@ from typing import Self
 import numpy as np
 
 from devices.arrays import Floats
-from devices.chips.compensation import Compensation
+from devices.chips.pressure_chips import Compensation
 from devices.errors import FootTileError, TareError
 from devices.flags import TileFlag
-from devices.frames import NOT_READ, ArrayInfo, FrameBatch
-from devices.temperature_hold import hold_temperature
+from devices.frames import NOT_READ, ArrayInfo, FrameBatch, hold_temperature
 from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.compilation import is_compiling
@@ -223,6 +222,11 @@ class LiveEstimator:
     def newest_t_ns(self) -> int | None:
         """Time of the newest frame, node's UTC."""
         return int(self._recent[-1].t_ns[-1]) if self._recent else None
+
+    @property
+    def counts_per_kelvin(self) -> Floats:
+        """Temperature counts per kelvin of each tile's chip."""
+        return self._compensation.counts_per_kelvin
 
     def mean_recent_temperature_raw(self) -> Floats:
         """Return the mean temperature counts of the last second, per tile; NaN if none was read."""

@@ -105,10 +105,13 @@ class TareController:
     def _temperature_warning(self, tare: Tare) -> str | None:
         temperature_raw = self._live.mean_recent_temperature_raw()
         bears = np.array([not tile.reference for tile in self._info.tiles])
-        tiles = np.flatnonzero(has_temperature_changed(tare, temperature_raw) & bears)
+        counts_per_kelvin = self._live.counts_per_kelvin
+        tiles = np.flatnonzero(
+            has_temperature_changed(tare, temperature_raw, counts_per_kelvin) & bears
+        )
         if not len(tiles):
             return None
-        warmer = compute_warming_k(tare, temperature_raw)
+        warmer = compute_warming_k(tare, temperature_raw, counts_per_kelvin)
         mean_k = float(warmer[tiles].mean())
         who = f"tile {self._info.serials[tiles[0]]} is" if len(tiles) == 1 else "the tiles are"
         shift_n = self._live.grf_shift_n(compute_sealed_gas_shift_kpa(tare, warmer))

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import pyarrow as pa
 
+from devices.chips.pressure_chips import get_raw_type
 from devices.errors import UsageError
 from devices.frames import ArrayInfo
 from service.server.estimates.node_estimator import EstimatedBatch
@@ -153,8 +154,11 @@ class ArrowEncoder:
     def __init__(self, info: ArrayInfo, column_names: tuple[str, ...]) -> None:
         self._chosen = _select_columns(len(info.tiles), column_names)
         self._key = tuple(name for name, _, _ in self._chosen)
+        raw_type = get_raw_type(info.tiles)
         fields = [
-            column.make_field(name, column.type, nullable=column.name not in _FRAMES or is_missing)
+            column.make_field(
+                name, column.type_for(raw_type), nullable=column.name not in _FRAMES or is_missing
+            )
             for name, column, _ in self._chosen
             for is_missing in (
                 column.missing_value is not None or pa.types.is_floating(column.type),

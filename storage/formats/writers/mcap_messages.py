@@ -30,7 +30,7 @@ from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 from rosbags.typesys import Stores, get_typestore
 
-from devices.chips.compensation import Compensation
+from devices.chips.pressure_chips import Compensation
 from devices.flags import TileFlag
 from devices.frames import NOT_READ
 from storage.formats.export import Export
@@ -349,7 +349,7 @@ class Ros2Encoder(MessageEncoder):
         )
         held = self._temperature_hold.hold_temperature(frames.t_ns, temperature_raw)
         unknown = (pressure_raw == NOT_READ) | np.isnan(held) | ((status & TileFlag.UNUSABLE) != 0)
-        pa = np.where(unknown, np.nan, self._compensation.compute_kpa(pressure_raw, held) * 1e3)
+        pa = np.where(unknown, np.nan, self._compensation.law.compute_kpa(pressure_raw, held) * 1e3)
         at_ns = frames.t_ns[:, None] + offset_us.astype(np.int64) * 1000
         for i, (channel, packed) in enumerate(
             zip(self._pressure_channels, self._pressures, strict=True)

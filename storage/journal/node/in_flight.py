@@ -18,8 +18,9 @@ from typing import NamedTuple
 import numpy as np
 
 from devices.acquisition import AcquiredFrame, RangeDetector
+from devices.chips.pressure_chips import check_chips, get_raw_type
 from devices.errors import DamagedFileError, StorageError
-from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
+from devices.frames import ArrayInfo, FrameBatch, get_frame_columns
 from storage.durable_files import make_synced_folder, read_small_file, translate_storage_errors
 
 IN_FLIGHT_FILE = "in_flight"
@@ -29,7 +30,10 @@ _MAGIC = b"FootTile in flight 1\n"
 _HEAD = struct.Struct("<21sHII36sI")
 """Magic, tiles, rows, length of the description, kernel's boot id, CRC-32 of the two before."""
 _ORDER = AcquiredFrame._fields
-_CODES = {"uint64": "Q", "int64": "q", "int32": "i", "float32": "f", "uint16": "H", "uint8": "B"}
+_CODES = {
+    **{"uint64": "Q", "int64": "q", "uint32": "I", "int32": "i", "float32": "f"},
+    **{"uint16": "H", "uint8": "B"},
+}
 
 
 class InFlightWriter:
@@ -46,7 +50,7 @@ class InFlightWriter:
     def __init__(self, folder: Path, info: ArrayInfo) -> None:
         path = folder / IN_FLIGHT_FILE
         tiles = len(info.tiles)
-        self._row = struct.Struct(_row_format(tiles))
+        self._row = struct.Struct(_row_format(info))
         self._size = self._row.size + 4
         description = info.model_dump_json().encode()
         self._begin = _HEAD.size + len(description)
@@ -125,11 +129,12 @@ def read_in_flight_of_this_boot(folder: Path) -> InFlightFrames | None:
     if info is None:
         return None
     tiles = len(info.tiles)
-    row = struct.Struct(_row_format(tiles))
+    row = struct.Struct(_row_format(info))
+    frame_columns = get_frame_columns(get_raw_type(info.tiles))
     begin = len(content) - ROW_COUNT * (row.size + 4)
     types: list[tuple[str, str] | tuple[str, str, tuple[int, ...]]] = []
     for name in _ORDER:
-        dtype, per_tile = FRAME_COLUMNS[name]
+        dtype, per_tile = frame_columns[name]
         code = dtype.newbyteorder("<").str
         types.append((name, code, (tiles,)) if per_tile else (name, code))
     rows = np.frombuffer(content, np.dtype([*types, ("crc32", "<u4")]), ROW_COUNT, begin)
@@ -149,7 +154,7 @@ def read_in_flight_of_this_boot(folder: Path) -> InFlightFrames | None:
     steps = np.flatnonzero(np.diff(found["seq"]) != 1)
     found = found[steps[-1] + 1 :] if len(steps) else found
     columns = {
-        name: np.ascontiguousarray(found[name], dtype=FRAME_COLUMNS[name][0]) for name in _ORDER
+        name: np.ascontiguousarray(found[name], dtype=frame_columns[name][0]) for name in _ORDER
     }
     frames = FrameBatch(**columns)
     RangeDetector(info.tiles).flag_out_of_range(frames)  # as acquisition does when a batch is whole
@@ -189,11 +194,12 @@ def try_create_in_flight_writer(folder: Path | None, info: ArrayInfo) -> InFligh
         return None
 
 
-def _row_format(tiles: int) -> str:
+def _row_format(info: ArrayInfo) -> str:
+    frame_columns = get_frame_columns(get_raw_type(info.tiles))
     codes = []
     for name in _ORDER:
-        dtype, per_tile = FRAME_COLUMNS[name]
-        codes.append((str(tiles) if per_tile else "") + _CODES[dtype.name])
+        dtype, per_tile = frame_columns[name]
+        codes.append((str(len(info.tiles)) if per_tile else "") + _CODES[dtype.name])
     return "<" + "".join(codes)
 
 
@@ -204,24 +210,19 @@ def _read_description(content: bytes, *, where: str) -> ArrayInfo | None:
     damage = DamagedFileError("its head is not what was written", where=where)
     if len(content) < _HEAD.size:
         raise damage
-    magic, tiles, rows, length, kernel_boot_id, check = _HEAD.unpack_from(content)
+    magic, _, rows, length, kernel_boot_id, check = _HEAD.unpack_from(content)
     description = content[_HEAD.size : _HEAD.size + length]
     kernel_boot_id = kernel_boot_id.rstrip(b"\0")
-    expected = _HEAD.size + length + rows * (struct.calcsize(_row_format(tiles)) + 4)
-    if (
-        magic != _MAGIC
-        or rows != ROW_COUNT
-        or len(content) != expected
-        or zlib.crc32(description + kernel_boot_id) != check
-    ):
+    if magic != _MAGIC or rows != ROW_COUNT or zlib.crc32(description + kernel_boot_id) != check:
         raise damage
     if kernel_boot_id.decode(errors="replace") != (read_kernel_boot_id() or ""):
         return None
     try:
-        info = ArrayInfo.model_validate_json(description)
+        info = check_chips(ArrayInfo.model_validate_json(description))
     except ValueError as error:
         raise damage from error
-    if len(info.tiles) != tiles:
+    row_bytes = struct.calcsize(_row_format(info)) + 4
+    if len(content) != _HEAD.size + length + rows * row_bytes:
         raise damage
     return info
 

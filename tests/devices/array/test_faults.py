@@ -15,9 +15,9 @@ import pytest
 
 from devices.acquisition import Acquisition
 from devices.array.startup import prepare_array
-from devices.array.tile import FAR_JUMP_KPA
 from devices.array.tile_array import TileArray
 from devices.buses.i2c import open_bus
+from devices.chips.mpl115a2 import MPL115A2
 from devices.clock import UtcAnchor, VirtualClock
 from devices.emulation.i2c_bus import EmulatedGpioLines
 from devices.emulation.world import World
@@ -347,7 +347,7 @@ def test_readings_of_a_disturbed_bus_are_hardly_ever_half_a_kilopascal_off(
     wrong = one.verdict.wrong & ((one.frames.tile_flags & TileFlag.OVER_RANGE) == 0)
     errors = one.verdict.error_kpa[wrong]
     # A flipped bit and the noise may cancel, so half a kilopascal is no sharp limit.
-    assert not (errors > FAR_JUMP_KPA).any()
+    assert not (errors > MPL115A2.far_jump_kpa).any()
     assert (errors > 0.5).sum() <= 2
     assert wrong.sum() < 0.05 * one.verdict.given[one.during].size
 

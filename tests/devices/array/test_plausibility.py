@@ -120,7 +120,8 @@ def test_a_jump_to_the_counts_of_another_tile_shows_in_the_coefficients() -> Non
     go_to_quiet_frame(array)
     array.scan_frame()
     # Channel 2 is wired to the fourth tile from now on.
-    wires.muxes[0]._channels[1] = wires.tiles[3]
+    devices = dict(wires.muxes[0]._devices) | {1: wires.tiles[3]}
+    wires.muxes[0]._devices = tuple(devices.items())
     wires.adapter._devices_by_routing.clear()
     scan = array.scan_frame()
     assert scan.tile_flags[1] & TileFlag.IMPLAUSIBLE
@@ -195,7 +196,7 @@ def test_a_part_that_changes_its_reading_after_its_time_is_tested_once() -> None
     for change in ((0, 0), (1, 0), (0, 1)):
         tiles.ports.start_conversions([1])
         tiles.clock.sleep_until_ns(tiles.clock.now_ns() + TYPICAL_NS)
-        pressure_raw, temperature_raw = tiles.ports.read_counts(with_temperature=True)
+        pressure_raw, temperature_raw = tiles.ports.read_counts(1, with_temperature=True)
         earlier = pressure_raw - change[0], temperature_raw - change[1]
         for _ in range(2):
             tiles.monitor.check_read_in_time(1, earlier)

@@ -38,7 +38,7 @@ def test_every_tile_is_identified_in_the_order_of_the_scene() -> None:
     found = identify_tiles(wires.bus, scene.tile)
     assert [tile.serial for tile in found] == ["T01", "T02", "T03"]
     assert [(tile.mux, tile.channel) for tile in found] == list(plugs)
-    assert [tile.coefficient_words for tile in found] == [FORUM_CHIP, DATA_SHEET_CHIP, THIRD]
+    assert [tile.registers for tile in found] == [FORUM_CHIP, DATA_SHEET_CHIP, THIRD]
     assert [(t.x_m, t.y_m, t.z_m) for t in found] == [(t.x_m, t.y_m, t.z_m) for t in scene.tile]
     # Before a measurement exactly the data sheet's: it is printed and stored in files.
     assert [tile.conversion_ms for tile in found] == [1.6] * 3
@@ -59,11 +59,11 @@ def test_coefficients_are_read_three_times_from_each_tile_alone_whatever_is_open
     found = identify_tiles(wires.bus, make_scene(TWO_MUXES).tile)
     alone = [[(mux, 1 << channel)] for mux, channel in TWO_MUXES]
     assert open_at_reads == [plug for plug in alone for _ in range(3)]
-    words = [tile.coefficient_words for tile in found]
+    words = [tile.registers for tile in found]
     assert words == [FORUM_CHIP, DATA_SHEET_CHIP, DATA_SHEET_CHIP, FORUM_CHIP]
     # Of a scene without tiles on an open mux, too.
     wires.adapter.i2c_rdwr(i2c_msg.write(0x73, [0xFF]))
-    assert identify_tiles(wires.bus, make_scene(ONE).tile)[0].coefficient_words == FORUM_CHIP
+    assert identify_tiles(wires.bus, make_scene(ONE).tile)[0].registers == FORUM_CHIP
 
 
 def test_an_absent_tile_an_absent_mux_and_another_part_are_named_with_their_plug() -> None:
@@ -96,7 +96,7 @@ def test_tiles_are_found_on_every_channel_of_every_mux() -> None:
     wires = Wires(plugs, words={1: FORUM_CHIP, 2: THIRD, 3: (0, 0, 0, 0)})
     found = find_tiles_on_all_channels(wires.bus)
     assert [(plug.mux, plug.channel) for plug in found] == list(plugs)
-    words = [plug.coefficient_words for plug in found]
+    words = [plug.registers for plug in found]
     assert words == [DATA_SHEET_CHIP, FORUM_CHIP, THIRD, None]
     assert [plug.problem for plug in found[:3]] == [""] * 3
     assert "no MPL115A2" in found[3].problem
@@ -160,7 +160,7 @@ def part_with(
     wires = Wires(ONE, scl_hz)
     part = EmulatedMpl115a2(EmulatedPart(DATA_SHEET_CHIP, tc_ns, sense), mode)
     wires.tiles[0] = part
-    wires.muxes[0]._channels[0] = part
+    wires.muxes[0]._devices = ((0, part),)
     wires.adapter._devices_by_routing.clear()
     return wires
 

@@ -18,7 +18,7 @@ from devices.array.startup import (
 )
 from devices.buses.i2c import I2cBus, open_bus
 from devices.clock import VirtualClock
-from devices.emulation.parts import draw_chip
+from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart, draw_chip
 from devices.emulation.world import World
 from devices.errors import BusFaultError, SceneError
 from devices.scene.emulation_sections import FaultKind, ReadDuringConversion
@@ -73,9 +73,10 @@ def test_a_part_that_cannot_be_measured_has_a_wait_of_3_ms() -> None:
     scene = make_scene(((0x70, 0), (0x70, 1)), array={"schedule": "pipelined"}, emulation=NOISY)
     clock = VirtualClock()
     world = World(scene, clock, begins_now=False)
-    world.chips[1]._silicon = type(world.chips[1]._silicon)(
-        draw_chip("T02", 0).coefficients.to_words(), 1_600_000, lambda _: (410, 507)
-    )
+    chip = world.chips[1]
+    assert isinstance(chip, EmulatedMpl115a2)
+    words = draw_chip("T02", 0).coefficients.to_words()
+    chip._silicon = EmulatedPart(words, 1_600_000, lambda _: (410, 507))
     ready = prepare_array(open_bus("emulated", world.i2c_adapter), scene, clock)
     assert ready.unmeasured_serials == ("T02",)
     assert ready.timing.conversions_s[1] == 3.0e-3
@@ -251,7 +252,7 @@ def test_a_replaced_part_is_identified_and_measured_again(plugs: Plugs, tile: in
     assert before.array.replaced_serials == (serial,)
     after = reidentify_replaced_tiles(bus, scene, clock, before)
     spare = draw_chip(f"{serial}.spare", 0)
-    assert after.tiles[tile].coefficient_words == spare.coefficients.to_words()
+    assert after.tiles[tile].registers == spare.coefficients.to_words()
     true_ms = spare.conversion_ns / 1e6
     assert true_ms <= after.tiles[tile].conversion_ms <= 1.015 * true_ms
     others = [i for i in range(len(plugs)) if i != tile]

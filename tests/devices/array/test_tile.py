@@ -1,4 +1,4 @@
-"""The readings of one tile: impossible counts, jumps, stale readings."""
+"""The readings of one tile: jumps, stale readings."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.array.tile import TileHealth, classify_impossible_counts
+from devices.array.tile import TileHealth
 from devices.flags import TileFlag
 from devices.frames import NOT_READ
-from tests.builders.arrays import DATA_SHEET_CHIP
 from tests.devices.rigs import ONE, Wires
 
 MS = 1_000_000
@@ -29,27 +28,6 @@ def settled(pressure_raw: int = 410, temperature_raw: int = 507) -> TileHealth:
     for _ in range(3):
         tile.accept_reading(pressure_raw, temperature_raw, 0)
     return tile
-
-
-# Impossible counts
-
-
-@pytest.mark.parametrize(
-    ("counts", "flags"),
-    [
-        ((0, 0), TileFlag.NOT_CONVERTED),
-        ((1023, 1023), TileFlag.IMPLAUSIBLE),
-        ((500, 1023), TileFlag.IMPLAUSIBLE),
-        ((500, 0), TileFlag.IMPLAUSIBLE),
-        ((0, 500), 0),  # hardware.md 1.3: counts fall through zero
-        ((1023, 500), 0),
-        ((410, 507), 0),
-        ((500, NOT_READ), 0),
-        ((0, NOT_READ), 0),
-    ],
-)
-def test_only_counts_of_no_part_are_impossible(counts: tuple[int, int], flags: int) -> None:
-    assert classify_impossible_counts(*counts) == flags
 
 
 # Jumps
@@ -197,11 +175,6 @@ def test_faults_are_counted_by_reason() -> None:
     tile.count_faults(TileFlag.NO_ANSWER)
     tile.count_faults(TileFlag.NO_ANSWER | TileFlag.RETRIED)
     assert tile.fault_counts == {"no_answer": 2, "retried": 1}
-
-
-def test_coefficients_are_words_and_bytes() -> None:
-    assert health().coefficient_words == DATA_SHEET_CHIP
-    assert health().coefficient_bytes.hex() == "3eceb3f9c51733c8"
 
 
 @settings(max_examples=50)

@@ -13,7 +13,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from smbus2 import SMBus, i2c_msg
 
-from devices.array.tile import classify_impossible_counts
 from devices.buses.device_files import ATTEMPT_INTERVAL_NS
 from devices.buses.i2c import I2cBus, RetryingBus, open_bus
 from devices.chips.mpl115a2 import Mpl115a2
@@ -176,7 +175,8 @@ def test_bytes_of_an_earlier_read_are_never_a_reading(stale: bytes) -> None:
     bus = I2cBus(RecordingAdapter(), "/dev/i2c-7")
     bus.transfer(read)  # which fills nothing in
     assert bytes(read) == b"\xff" * len(stale)
-    assert classify_impossible_counts(*Mpl115a2(bus).read_counts()) == TileFlag.IMPLAUSIBLE
+    driver = Mpl115a2(bus)
+    assert driver.classify_counts(*driver.read_counts()) == TileFlag.IMPLAUSIBLE
 
 
 def refuse_to_open(self: SMBus, name: str) -> None:

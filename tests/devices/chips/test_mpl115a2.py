@@ -16,18 +16,16 @@ from hypothesis import strategies as st
 from smbus2 import i2c_msg
 
 from devices.buses.i2c import I2cBus, open_bus
-from devices.chips.mpl115a2 import (
-    Coefficients,
-    Mpl115a2,
-    compensate_kpa,
-    compute_kpa_per_padc,
-    compute_padc,
-)
+from devices.chips.mpl115a2 import Coefficients, Mpl115a2, compute_padc
+from devices.chips.pressure_chips import Compensation
 from devices.clock import VirtualClock
 from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.i2c_bus import EmulatedI2cAdapter
 from devices.errors import TileSetupError
+from devices.flags import TileFlag
+from devices.frames import NOT_READ
+from tests.builders.arrays import make_tile
 from tests.devices.rigs import Adapter
 
 DATA_SHEET = bytes.fromhex("3ECE B3F9 C517 33C8")
@@ -46,14 +44,14 @@ def part_of(registers: bytes) -> Coefficients:
 
 
 def kpa_of(part: Coefficients, padc: int, tadc: int) -> float:
-    return float(compensate_kpa(padc, tadc, part.a0, part.b1, part.b2, part.c12))
+    return float(part.make_law().compute_kpa(padc, tadc))
 
 
 def connected(registers: bytes, padc: int, tadc: int) -> tuple[Mpl115a2, VirtualClock]:
     """Return the driver of an emulated part that always measures the same."""
     clock = VirtualClock()
     chip = EmulatedMpl115a2(EmulatedPart(words_of(registers), 1_600_000, lambda _: (padc, tadc)))
-    mux = EmulatedTca9548a(0x70, {2: chip})
+    mux = EmulatedTca9548a(0x70, [(2, chip)])
     bus = open_bus("emulated", EmulatedI2cAdapter([mux], clock, 400_000))
     bus.transfer(i2c_msg.write(0x70, [0b100]))
     return Mpl115a2(bus), clock
@@ -69,7 +67,7 @@ def test_a_published_part_gives_its_pressure_through_driver_bus_and_chip(
 ) -> None:
     driver, clock = connected(registers, padc, tadc)
     assert driver.read_counts() == (0, 0), "before the first conversion"
-    part = Coefficients.from_words(driver.read_coefficient_words(where="test"))
+    part = Coefficients.from_words(driver.identify(where="test"))
     assert part.find_implausibility() == ""
     driver.start_conversion()
     clock.sleep_until_ns(clock.now_ns() + 1_600_000)
@@ -126,7 +124,7 @@ COEFFICIENTS = "W60 04, R60 8"
 
 def test_coefficients_are_read_three_times() -> None:
     driver, script = scripted(*[(COEFFICIENTS, DATA_SHEET.hex())] * 3)
-    assert driver.read_coefficient_words(where="tile T01") == (0x3ECE, 0xB3F9, 0xC517, 0x33C8)
+    assert driver.identify(where="tile T01") == (0x3ECE, 0xB3F9, 0xC517, 0x33C8)
     assert not script.left
 
 
@@ -136,10 +134,10 @@ def test_readings_of_the_coefficients_that_differ_are_refused(odd_one: int) -> N
     readings[odd_one] = "3ece b3f9 c517 33c0"  # one bit
     driver, _ = scripted(*[(COEFFICIENTS, reading) for reading in readings])
     with pytest.raises(TileSetupError, match="differ") as caught:
-        driver.read_coefficient_words(where="tile T01")
+        driver.identify(where="tile T01")
     assert caught.value.where == "tile T01"
-    assert "3e ce b3 f9 c5 17 33 c8" in str(caught.value)
-    assert "3e ce b3 f9 c5 17 33 c0" in str(caught.value)
+    assert "3ece b3f9 c517 33c8" in str(caught.value)
+    assert "3ece b3f9 c517 33c0" in str(caught.value)
     assert "check pull-ups, or use 100 kHz" in caught.value.remedy
 
 
@@ -147,9 +145,31 @@ def test_readings_of_the_coefficients_that_differ_are_refused(odd_one: int) -> N
 def test_coefficients_of_a_dead_bus_are_refused(registers: str) -> None:
     driver, _ = scripted(*[(COEFFICIENTS, registers)] * 3)
     with pytest.raises(TileSetupError, match="no MPL115A2's") as caught:
-        driver.read_coefficient_words(where="tile T01")
+        driver.identify(where="tile T01")
     assert caught.value.where == "tile T01"
     assert "stuck" in caught.value.remedy
+
+
+# Impossible counts
+
+
+@pytest.mark.parametrize(
+    ("counts", "flags"),
+    [
+        ((0, 0), TileFlag.NOT_CONVERTED),
+        ((1023, 1023), TileFlag.IMPLAUSIBLE),
+        ((500, 1023), TileFlag.IMPLAUSIBLE),
+        ((500, 0), TileFlag.IMPLAUSIBLE),
+        ((0, 500), 0),  # hardware.md 1.3: counts fall through zero
+        ((1023, 500), 0),
+        ((410, 507), 0),
+        ((500, NOT_READ), 0),
+        ((0, NOT_READ), 0),
+    ],
+)
+def test_only_counts_of_no_part_are_impossible(counts: tuple[int, int], flags: int) -> None:
+    driver, _ = scripted()
+    assert driver.classify_counts(*counts) == flags
 
 
 # Coefficients
@@ -244,7 +264,7 @@ def test_pressure_falls_with_every_count(
     registers: bytes, tadc: int, kpa: float, padc_at_115_kpa: int
 ) -> None:
     part = part_of(registers)
-    assert float(compute_kpa_per_padc(tadc, part.b1, part.c12)) == pytest.approx(kpa, abs=5e-5)
+    assert float(part.make_law().compute_kpa_per_count(tadc)) == pytest.approx(kpa, abs=5e-5)
     step = kpa_of(part, 301, tadc) - kpa_of(part, 300, tadc)
     assert step == pytest.approx(kpa, abs=5e-5)
     assert float(compute_padc(115.0, tadc, part)) == pytest.approx(padc_at_115_kpa, abs=0.5)
@@ -269,7 +289,7 @@ parts = st.builds(
 def test_compensation_and_its_inverse_undo_each_other(
     part: Coefficients, padc: int, tadc: int, kpa: float
 ) -> None:
-    again = compensate_kpa(compute_padc(kpa, tadc, part), tadc, part.a0, part.b1, part.b2, part.c12)
+    again = part.make_law().compute_kpa(compute_padc(kpa, tadc, part), tadc)
     assert float(again) == pytest.approx(kpa, abs=1e-9)
     # A part measures nothing if the temperature cancels its b1.
     assume(part.b1 + part.c12 * tadc < -0.1)
@@ -281,10 +301,8 @@ def test_columns_of_frames_are_compensated_with_the_coefficients_of_each_tile() 
     tiles = [part_of(DATA_SHEET), part_of(FORUM)]
     padc = np.array([[410, 272], [0, 1023], [65535, 0]], dtype=np.uint16)
     tadc = np.array([[507, 521], [507, 521], [65535, 521]], dtype=np.uint16)
-    a0, b1, b2, c12 = (
-        np.array([getattr(tile, name) for tile in tiles]) for name in ("a0", "b1", "b2", "c12")
-    )
-    kpa = compensate_kpa(padc, tadc, a0, b1, b2, c12)
+    infos = [make_tile(registers=words_of(each)) for each in (DATA_SHEET, FORUM)]
+    kpa = Compensation(infos).law.compute_kpa(padc, tadc)
     assert kpa.dtype == np.float64
     for row in range(3):
         for i, tile in enumerate(tiles):

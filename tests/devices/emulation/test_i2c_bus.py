@@ -55,7 +55,7 @@ class Reader:
         self, muxes: dict[int, dict[int, EmulatedMpl115a2]], scl_hz: float = 400_000
     ) -> None:
         self.clock = VirtualClock(5_000_000_000)
-        devices = [EmulatedTca9548a(address, tiles) for address, tiles in muxes.items()]
+        devices = [EmulatedTca9548a(address, tiles.items()) for address, tiles in muxes.items()]
         self.adapter = EmulatedI2cAdapter(devices, self.clock, scl_hz)
 
     def send(self, *messages: i2c_msg) -> bytes:
@@ -323,7 +323,7 @@ def test_the_last_byte_written_is_the_mask_from_the_stop_on(
     before: int, after: bytes, count: int
 ) -> None:
     tiles = {channel: part() for channel in range(7)}  # none on channel 7
-    mux = EmulatedTca9548a(0x70, tiles)
+    mux = EmulatedTca9548a(0x70, tiles.items())
 
     def connected(mask: int) -> list[EmulatedMpl115a2]:
         return [t for c, t in tiles.items() if mask >> c & 1]
@@ -355,7 +355,7 @@ def open_mux(**faults: tuple[int, int]) -> EmulatedTca9548a:
     }
     for timing in timings.values():
         timing.begin_scene_time(0)
-    mux = EmulatedTca9548a(0x70, {0: part()}, timings.get("brown_out"), timings.get("mux_reset"))
+    mux = EmulatedTca9548a(0x70, [(0, part())], timings.get("brown_out"), timings.get("mux_reset"))
     write(mux, 1)
     mux.on_stop(0)
     return mux
@@ -396,7 +396,7 @@ def test_a_mux_can_be_opened_at_once_after_its_reset() -> None:
 
 
 def test_the_reset_line_clears_a_mask_that_is_not_yet_in_force() -> None:
-    mux = EmulatedTca9548a(0x70, {0: part()})
+    mux = EmulatedTca9548a(0x70, [(0, part())])
     write(mux, 1)
     mux.reset()
     mux.on_stop(0)

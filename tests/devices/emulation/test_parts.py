@@ -11,11 +11,10 @@ import pytest
 
 from devices.chips.mpl115a2 import Coefficients, compute_padc
 from devices.clock import VirtualClock
+from devices.emulation.chips.mpl115a2 import draw_chip, draw_family_chip
 from devices.emulation.parts import (
     DomeProperties,
-    draw_chip,
     draw_dome,
-    draw_family_chip,
     draw_family_dome,
 )
 from devices.emulation.world import World
@@ -117,9 +116,9 @@ def test_a_tile_is_the_same_in_every_scene_and_session() -> None:
     rig = make_scene(TWO, name="rig")
     field = make_scene(((0x70, 5), (0x74, 2), (0x70, 6)), name="field")
     field = moved_to(moved_to(field, 1, serial="T02"), 0, serial="T09")
-    words = [tile.coefficient_words for tile in identified(field, seed=3)]
+    words = [tile.registers for tile in identified(field, seed=3)]
     assert words == [draw_chip(s, 0).coefficients.to_words() for s in ("T09", "T02", "T03")]
-    assert identified(rig)[1].coefficient_words == words[1]
+    assert identified(rig)[1].registers == words[1]
     # Without noise an idle tile reads the same pressure: chip and dome are the same.
     idle_rig, idle_field = counts(rig)[:, 0, 1], counts(field, seed=3)[:, 0, 1]
     assert set(idle_rig.tolist()) == set(idle_field.tolist())
@@ -133,8 +132,8 @@ def test_a_seed_changes_the_noise_and_not_the_parts() -> None:
     assert (first[:, 0] != other[:, 0]).mean() > 0.3
     np.testing.assert_allclose(first[:, 0].mean(0), other[:, 0].mean(0), atol=2.0)
     assert identified(scene) == identified(scene, seed=1)
-    assert [t.coefficient_words for t in identified(scene)] != [
-        t.coefficient_words for t in identified(scene, parts_seed=1)
+    assert [t.registers for t in identified(scene)] != [
+        t.registers for t in identified(scene, parts_seed=1)
     ]
 
 

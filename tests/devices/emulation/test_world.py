@@ -14,9 +14,10 @@ from devices.array.tile import Scan
 from devices.array.tile_array import TileArray
 from devices.buses.i2c import open_bus
 from devices.chips.dynamixel.driver import open_servo
-from devices.chips.mpl115a2 import Coefficients, compensate_kpa
+from devices.chips.pressure_chips import Compensation
 from devices.clock import VirtualClock
-from devices.emulation.parts import draw_chip, draw_dome
+from devices.emulation.chips.mpl115a2 import draw_chip
+from devices.emulation.parts import draw_dome
 from devices.errors import TileSetupError
 from devices.scene.scene_file import load_scene
 from tests.builders.scenes import make_scene
@@ -31,12 +32,9 @@ Floats = npt.NDArray[np.float64]
 
 def compensate(array: TileArray, scans: Sequence[Scan]) -> Floats:
     """Return pressures of scans, (frames, tiles), as a user of the driver computes them."""
-    parts = [Coefficients.from_words(tile.coefficient_words) for tile in array.tiles]
-    columns = [np.array([getattr(c, name) for c in parts]) for name in ("a0", "b1", "b2", "c12")]
-    kpa: Floats = compensate_kpa(
-        [s.pressure_raw for s in scans], [s.temperature_raw for s in scans], *columns
+    return Compensation(array.tiles).law.compute_kpa(
+        [s.pressure_raw for s in scans], [s.temperature_raw for s in scans]
     )
-    return kpa
 
 
 def record(
@@ -97,10 +95,10 @@ def test_a_replaced_part_is_another_one_of_the_same_kind() -> None:
     with world.inject_fault("replaced", "T02"):
         pass
     after = array_of(open_bus("emulated", world.i2c_adapter), scene.tile, clock, wait_s=3e-3)
-    words = [tile.coefficient_words for tile in after.tiles]
-    assert words[0] == before.tiles[0].coefficient_words
+    words = [tile.registers for tile in after.tiles]
+    assert words[0] == before.tiles[0].registers
     spare = draw_chip("T02.spare", 0).coefficients.to_words()
-    assert words[1] == spare != before.tiles[1].coefficient_words
+    assert words[1] == spare != before.tiles[1].registers
     scans = [after.scan_frame() for _ in range(3)]
     assert compensate(after, scans)[-1, 1] == pytest.approx(89.9, abs=0.13)
 
@@ -108,7 +106,7 @@ def test_a_replaced_part_is_another_one_of_the_same_kind() -> None:
 def test_sixty_four_tiles_on_eight_muxes_are_found() -> None:
     plugs = tuple((mux, channel) for mux in range(0x70, 0x78) for channel in range(8))
     found = identified(make_scene(plugs))
-    assert len({tile.coefficient_words for tile in found}) == 64
+    assert len({tile.registers for tile in found}) == 64
 
 
 # Truth

@@ -14,11 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.chips.compensation import Compensation
-from devices.chips.mpl115a2 import PRESSURE_MIN_KPA, Coefficients, compensate_kpa, compute_padc
+from devices.chips.mpl115a2 import PRESSURE_MIN_KPA, Coefficients, compute_padc
+from devices.chips.pressure_chips import Compensation
 from devices.flags import EstimateFlag
-from devices.frames import NOT_READ, FrameBatch
-from devices.temperature_hold import hold_temperature
+from devices.frames import NOT_READ, FrameBatch, hold_temperature
 from service.estimation.estimate import ModelEstimator
 from service.estimation.pipeline.params import MODEL_NAMES
 from service.estimation.pipeline.plan import make_plan
@@ -223,7 +222,7 @@ def test_no_sum_is_stated_with_a_load_beyond_the_range(
     kpa = np.linspace(115.5, 100.0 + 2 * 30.0, 400)
     pressure_raw = np.full((400, 4), round(float(compute_padc(100.0, 480, part))))
     pressure_raw[:, 0] = np.rint(compute_padc(kpa, 480, part)) % 1024
-    unloaded_kpa = compensate_kpa(pressure_raw[0, 1], 480, part.a0, part.b1, part.b2, part.c12)
+    unloaded_kpa = part.make_law().compute_kpa(pressure_raw[0, 1], 480)
     tare = make_tare(4, baseline_kpa=unloaded_kpa, noise_kpa=0.05)
     tiles = [newton_tile(s, range_kpa=(0.0, 14.0)) for s in info.serials]
     plan = make_plan(info, make_calibration(*tiles), tare, models=models)

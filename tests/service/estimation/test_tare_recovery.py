@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.chips.compensation import Compensation
+from devices.chips.pressure_chips import Compensation
 from devices.frames import FrameBatch
 from service.estimation.calibration import Calibration
 from service.estimation.tare.tare import Tare

@@ -77,7 +77,7 @@ def test_a_soak_in_a_file_of_its_own_tells_the_same_of_warmth(bench: Bench) -> N
             **{
                 name: value[rows] if isinstance(value, np.ndarray) else value
                 for name, value in vars(recording).items()
-            }
+            },
         )
 
     tile = calibration.get_tile_or_wildcard("T01")

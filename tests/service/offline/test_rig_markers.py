@@ -38,8 +38,8 @@ def test_marks_say_the_same_as_the_mills_own_notes(recorded: Path, bench_cache: 
         for path in (benches.pressed(bench_cache), recorded / FRAMES_NAME)
     )
     assert set(by_notes.indentation.phase) >= {"rest", "load", "unload", "hold", "release"}
-    assert (by_marks.coefficient_words, by_marks.stream_id, by_marks.seq_range) == (
-        by_notes.coefficient_words,
+    assert (by_marks.registers, by_marks.stream_id, by_marks.seq_range) == (
+        by_notes.registers,
         by_notes.stream_id,
         by_notes.seq_range,
     )

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.chips.compensation import Compensation
+from devices.chips.pressure_chips import Compensation
 from devices.flags import FrameFlag
 from devices.frames import NO_SERVO_COUNTS, FrameBatch
 from devices.scene.emulation_sections import FaultSection

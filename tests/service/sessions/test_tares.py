@@ -64,7 +64,7 @@ def test_tares_of_other_tiles_do_not_count(tmp_path: Path) -> None:
 
 def test_a_tare_does_not_count_for_a_part_that_was_swapped(tmp_path: Path) -> None:
     tares = history(tmp_path, 1)
-    other = INFO.tiles[1].model_copy(update={"coefficient_words": (1790 * 8, 0xC000, 0, 0)})
+    other = INFO.tiles[1].model_copy(update={"registers": (1790 * 8, 0xC000, 0, 0)})
     swapped = INFO.model_copy(update={"tiles": (INFO.tiles[0], other)})
     assert tares.tare_in_force_unless_lost(swapped) is None
     assert tares.tares_in_force_or_lost_between(swapped, 0, 100) == ()

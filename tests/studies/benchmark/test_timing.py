@@ -62,8 +62,8 @@ def test_a_draw_is_itself_again_and_another_draw_is_another(recording: DrawRecor
     again, other = record_draw(scene, 2.0, 1), record_draw(scene, 2.0, 2)
     assert (again.frames.pressure_raw == recording.frames.pressure_raw).all()
     assert again.info.tiles == recording.info.tiles
-    words = [tile.coefficient_words for tile in recording.info.tiles]
-    assert [tile.coefficient_words for tile in other.info.tiles] != words
+    words = [tile.registers for tile in recording.info.tiles]
+    assert [tile.registers for tile in other.info.tiles] != words
 
 
 def test_the_look_ahead_changes_what_is_published(recording: DrawRecording) -> None:

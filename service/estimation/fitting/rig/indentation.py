@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import ArrayRecord, Bools, Floats, Ints, Times
+from devices.chips.pressure_chip import PressureChip
 from devices.errors import CalibrationError
 
 BLOCKS_PER_STROKE = 60  # many for a cubic, and each averages many readings
@@ -29,6 +30,7 @@ class Indentation:
 
     Attributes:
         serial: of the tile.
+        chip: kind of its chip.
         where: file, for messages.
         t_ns: instants of the readings.
         kpa: absolute pressure; NaN where the tile was not readable, infinite where its chip's
@@ -39,6 +41,7 @@ class Indentation:
     """
 
     serial: str
+    chip: PressureChip
     where: str
     t_ns: Times
     kpa: Floats
@@ -86,12 +89,14 @@ class ThermalSoak:
     """Thermal soak of an unloaded tile; arrays of n readings.
 
     Attributes:
+        chip: kind of the tile's chip.
         t_s: instants.
         kpa: absolute pressures, NaN where there is none.
         temperature_raw: raw temperature in counts, NaN where there is none.
         noise_kpa: standard deviation of a reading.
     """
 
+    chip: PressureChip
     t_s: Floats
     kpa: Floats
     temperature_raw: Floats
@@ -240,6 +245,7 @@ def extract_soak_or_empty(recording: Indentation, noise_kpa: float) -> ThermalSo
     """Return the thermal soak of a recording, without any load."""
     rows = recording.phase == "soak"
     return ThermalSoak(
+        chip=recording.chip,
         t_s=(recording.t_ns[rows] - recording.t_ns[0]) * 1e-9,
         kpa=recording.kpa[rows],
         temperature_raw=recording.temperature_raw[rows],

@@ -13,11 +13,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from devices.chips.mpl115a2 import Coefficients, compensate_kpa
-from devices.emulation.chips.mpl115a2 import FrontEnd
+from devices.chips.mpl115a2 import Coefficients
+from devices.emulation.chips.mpl115a2 import ChipProperties, FrontEnd
 from devices.emulation.fault_timing import FaultTiming
-from devices.emulation.parts import ChipProperties
-from devices.emulation.surroundings import Surroundings
+from devices.emulation.surroundings import ChipSite, Surroundings
 from devices.scene.emulation_sections import EmulationSection
 from tests.builders.arrays import DATA_SHEET_CHIP
 from tests.devices.emulation.domes import PART
@@ -28,21 +27,30 @@ DATA_SHEET = Coefficients.from_words(DATA_SHEET_CHIP)
 # With -5.35 counts per kelvin this chip reads 507, the data sheet's example, at 21 degC.
 CHIP = ChipProperties(DATA_SHEET, conversion_ns=1_600_000, tadc_at_25_degc=507 - 4 * 5.35)
 STEP_NS = 1_000_000
+LAGS_S = PART.chip_lag_s, PART.gas_lag_s
 COUNT_KPA = 0.1255  # hardware.md 1.3
 
 
 def front_end(
     pressure: float | Callable[[float], float] = 96.587326,
     label: str = "test",
-    faults: tuple[FaultTiming | None, FaultTiming | None] = (None, None),
+    over_range: FaultTiming | None = None,
+    frozen: FaultTiming | None = None,
     **emulation: Any,
 ) -> FrontEnd:
-    """Return a sense in a scene that begins at 7 us. Faults: over range, frozen."""
+    """Return a sense in a scene that begins at 7 us."""
     scene = EmulationSection(**emulation)
-    pressure_kpa = pressure if callable(pressure) else (lambda _: pressure)
-    sense = FrontEnd(CHIP, PART, pressure_kpa, Surroundings(scene), scene, label, *faults)
-    sense.begin_scene_time(7_000)
-    return sense
+    site = ChipSite(
+        pressure if callable(pressure) else (lambda _: pressure),
+        LAGS_S,
+        Surroundings(scene),
+        scene,
+        label,
+        over_range=over_range,
+        frozen=frozen,
+    )
+    site.begin_scene_time(7_000)
+    return FrontEnd(CHIP, site)
 
 
 def counts(sense: FrontEnd, n: int, step_ns: int = STEP_NS) -> tuple[Floats, Floats]:
@@ -52,8 +60,7 @@ def counts(sense: FrontEnd, n: int, step_ns: int = STEP_NS) -> tuple[Floats, Flo
 
 
 def kpa(padc: Floats, tadc: Floats) -> Floats:
-    c = DATA_SHEET
-    return compensate_kpa(padc, tadc, c.a0, c.b1, c.b2, c.c12)
+    return DATA_SHEET.make_law().compute_kpa(padc, tadc)
 
 
 # Noise
@@ -153,7 +160,7 @@ def test_an_analogue_clip_limits_the_pressure(pressure_kpa: float, clipped_kpa: 
 
 def test_a_tile_over_its_range_reads_45_kpa_more() -> None:
     fault = FaultTiming()
-    sense = front_end(100.0, faults=(fault, None), noise_kpa=0.0)
+    sense = front_end(100.0, over_range=fault, noise_kpa=0.0)
     assert kpa(*counts(sense, 1))[0] == pytest.approx(100.0, abs=0.15)
     with fault.inject():
         assert kpa(*counts(sense, 1))[0] == pytest.approx(145.0, abs=0.15)
@@ -162,7 +169,7 @@ def test_a_tile_over_its_range_reads_45_kpa_more() -> None:
 
 def test_a_frozen_pressure_is_constant_while_the_temperature_is_not() -> None:
     frozen = FaultTiming()
-    sense = front_end(lambda t_s: 100.0 + t_s, faults=(None, frozen))
+    sense = front_end(lambda t_s: 100.0 + t_s, frozen=frozen)
     before = sense(0)[0]
     with frozen.inject():
         padc, tadc = counts(sense, 500, 2_000_000)
@@ -179,9 +186,10 @@ def test_the_pressure_is_that_of_the_scene_time_and_constant_before_it() -> None
         return 100.0
 
     scene = EmulationSection()
-    sense = FrontEnd(CHIP, PART, pressure, Surroundings(scene), scene, "test")
+    site = ChipSite(pressure, LAGS_S, Surroundings(scene), scene, "test")
+    sense = FrontEnd(CHIP, site)
     sense(5_000_000_000)
-    sense.begin_scene_time(6_000_000_000)
+    site.begin_scene_time(6_000_000_000)
     sense(5_999_999_000)  # a conversion under way
     sense(8_000_000_000)
     assert asked == pytest.approx([0.0, 0.0, 2.0])

@@ -12,10 +12,9 @@ from hypothesis import strategies as st
 from devices.emulation.chips.mpl115a2 import (
     EmulatedMpl115a2,
     EmulatedPart,
-    PartFaults,
     SampleFunction,
 )
-from devices.emulation.fault_timing import FaultTiming
+from devices.emulation.fault_timing import FaultTiming, PartFaults
 from devices.scene.emulation_sections import ReadDuringConversion
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP
 

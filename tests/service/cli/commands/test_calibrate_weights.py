@@ -10,7 +10,8 @@ import numpy.typing as npt
 import pytest
 
 from devices.arrays import Floats
-from devices.chips.compensation import Compensation
+from devices.chips.mpl115a2 import MPL115A2
+from devices.chips.pressure_chips import Compensation
 from service.estimation.calibration import Calibration
 from service.estimation.dead_weights import (
     STANDARD_GRAVITY_M_S2,
@@ -66,6 +67,7 @@ def follow(path: Path, weights: tuple[str, ...]) -> Indentation:
                     phase[begin:] = ""
     assert guide.step == "done"
     return Indentation(
+        chip=MPL115A2,
         serial="T01",
         where=str(path),
         t_ns=t_ns,

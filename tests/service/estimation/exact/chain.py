@@ -45,7 +45,7 @@ def compute_sample_stage(plan: EstimationPlan, frames: FrameBatch, run: list[int
     for i in range(4):
         counts = [None if c == NOT_READ else int(c) for c in frames.temperature_raw[:, i]]
         last = [next(c for c in reversed(counts[: k + 1]) if c is not None) for k in range(n)]
-        words = plan.info.tiles[i].coefficient_words
+        words = plan.info.tiles[i].registers
         temperature_raw.append(last)
         kpa.append(
             [

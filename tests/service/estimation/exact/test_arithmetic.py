@@ -97,7 +97,7 @@ def assert_exact(plan: EstimationPlan, frames: FrameBatch) -> Estimates:
         forces: list[tuple[Exact, Exact]] = []
         for i, tile in enumerate(plan.info.tiles):
             counts = int(frames.pressure_raw[row, i]), int(frames.temperature_raw[row, i])
-            kpa = sample_stage.pressure_kpa(tile.coefficient_words, *counts)
+            kpa = sample_stage.pressure_kpa(tile.registers, *counts)
             is_faulty = int(frames.tile_flags[row, i]) & (1 | 2 | 8 | 32) or NOT_READ in counts
             is_missing = is_faulty or kpa is None
             gauge_kpa.append(None if is_missing else kpa - mpf(plan.tare.baseline_kpa[i]))

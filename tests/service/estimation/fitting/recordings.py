@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from devices.chips.mpl115a2 import MPL115A2
 from service.estimation.effects import WALL_PER_KPA, Effects
 from service.estimation.fitting.dome_model import DomeModel
 from service.estimation.fitting.effects_fit import fit_determined_effects
@@ -80,6 +81,7 @@ def record(
     gain = 1.0 + scatter * rng.standard_normal(loading[-1] + 1)
     kpa = (press or make_dome())(t_s, np.interp(t_s + late_s, turns_s, turns_n))
     return Indentation(
+        chip=MPL115A2,
         serial="T01",
         where="here",
         t_ns=np.rint(t_s * 1e9).astype(np.int64),

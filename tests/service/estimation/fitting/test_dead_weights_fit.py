@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from devices.chips.mpl115a2 import MPL115A2
 from devices.errors import CalibrationError
 from service.estimation.calibration import TileCalibration
 from service.estimation.dead_weights import STANDARD_GRAVITY_M_S2, parse_weight
@@ -28,6 +29,7 @@ def record(*steps: tuple[str, float], seconds: float = 4.0) -> Indentation:
     each = round(seconds * RATE_HZ)
     kpa = np.concatenate([np.full(each, level_kpa) for _, level_kpa in steps])
     return Indentation(
+        chip=MPL115A2,
         serial="T01",
         where="by hand",
         t_ns=np.arange(len(kpa), dtype=np.int64) * (1_000_000_000 // RATE_HZ),

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from devices.chips.mpl115a2 import MPL115A2
 from devices.errors import CalibrationError
 from service.estimation.calibration import TileCalibration
 from service.estimation.fitting.rig.indentation import Indentation
@@ -65,6 +66,7 @@ def record(
     rng = np.random.default_rng(seed)
     n = len(phase)
     return Indentation(
+        chip=MPL115A2,
         serial="T01",
         where="bench.parquet",
         t_ns=np.arange(n, dtype=np.int64) * 2_000_000,

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from devices.chips.mpl115a2 import MPL115A2
 from service.estimation.effects import TemperatureEffect
 from service.estimation.fitting.rig.indentation import ThermalSoak
 from service.estimation.fitting.thermal_soak import LAG_RANGE_S, fit_temperature_effect
@@ -30,7 +31,9 @@ def make_soak(
     gas_k = step_k * (1 - (gas_lag_s * b - CHIP_LAG_S * a) / (gas_lag_s - CHIP_LAG_S))
     kpa = BASE_KPA + how.get("kpa_per_k", KPA_PER_K) * gas_k + rng.normal(0, 0.165, len(t_s))
     temperature_raw = np.rint(498 - 5.35 * chip_k + rng.normal(0, 0.5, len(t_s)))
-    return ThermalSoak(t_s=t_s, kpa=kpa, temperature_raw=temperature_raw, noise_kpa=0.165)
+    return ThermalSoak(
+        chip=MPL115A2, t_s=t_s, kpa=kpa, temperature_raw=temperature_raw, noise_kpa=0.165
+    )
 
 
 def test_known_parameters_are_within_their_intervals() -> None:
@@ -65,7 +68,9 @@ def make_lagging_soak(
     chip_k, gas_k = (quick_k, slow_k) if lag_s > 0.0 else (slow_k, quick_k)
     kpa = BASE_KPA + KPA_PER_K * gas_k + rng.normal(0, 0.165, len(t_s))
     temperature_raw = np.rint(498 - 5.35 * chip_k + rng.normal(0, 0.5, len(t_s)))
-    return ThermalSoak(t_s=t_s, kpa=kpa, temperature_raw=temperature_raw, noise_kpa=0.165)
+    return ThermalSoak(
+        chip=MPL115A2, t_s=t_s, kpa=kpa, temperature_raw=temperature_raw, noise_kpa=0.165
+    )
 
 
 @pytest.mark.parametrize("lag_s", [-3.0, -2.0, -0.5, 0.5, 2.0])
@@ -119,7 +124,10 @@ SOAK = make_soak()
 @pytest.mark.parametrize(
     ("soak", "reason"),
     [
-        (ThermalSoak(np.empty(0), np.empty(0), np.empty(0), 0.165), "no soak at two temperatures"),
+        (
+            ThermalSoak(MPL115A2, np.empty(0), np.empty(0), np.empty(0), 0.165),
+            "no soak at two temperatures",
+        ),
         (
             replace(SOAK, kpa=np.where(np.abs(SOAK.t_s - 20.0) < 0.3, np.nan, SOAK.kpa)),
             "no soak at two temperatures",

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.chips.compensation import Compensation
+from devices.chips.pressure_chips import Compensation
 from devices.flags import EstimateFlag, FrameFlag
 from devices.frames import NO_SERVO_COUNTS
 from service.estimation.calibration import make_paper_shape_preset
@@ -53,7 +53,7 @@ def test_the_sum_has_no_bias_in_flight() -> None:
 
 def test_zero_load_has_no_centre_and_no_warning() -> None:
     plan = newton_plan(array_at(SQUARE))
-    unloaded_kpa = Compensation(plan.info.tiles).compute_kpa([[500] * 4], [[480] * 4])[0]
+    unloaded_kpa = Compensation(plan.info.tiles).law.compute_kpa([[500] * 4], [[480] * 4])[0]
     tare = replace(plan.tare, baseline_kpa=unloaded_kpa)
     plan = make_plan(plan.info, plan.calibration, tare, models=plan.models)
     e = estimate_load([0] * 4, plan)

@@ -85,7 +85,7 @@ def test_a_tile_without_calibration_is_refused_by_serial() -> None:
 
 def test_another_chip_under_the_same_serial_is_refused() -> None:
     chips = [DATA_SHEET_CHIP] * 3
-    own = [newton_tile(serial, coefficient_words=chips[0]) for serial in INFO.serials]
+    own = [newton_tile(serial, registers=chips[0]) for serial in INFO.serials]
     assert newton_plan(array_at(LINE, chips=chips), tiles=own).calibration.tiles == tuple(own)
     chips[1] = (0x3ECE, 0xB3F9, 0xC517, 0x33C4)
     with pytest.raises(CalibrationError, match="T02 is not the part that was calibrated"):

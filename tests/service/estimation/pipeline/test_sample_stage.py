@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from devices.arrays import Floats
-from devices.chips.mpl115a2 import Coefficients, compensate_kpa, compute_kpa_per_padc
+from devices.chips.mpl115a2 import Coefficients
 from service.estimation.effects import Effects, Parameter
 from service.estimation.pipeline.plan import EstimationPlan
 from service.estimation.pipeline.sample_stage import unwrap_pressure
@@ -25,8 +25,10 @@ DATA_SHEET_PART, FORUM_PART = map(Coefficients.from_words, (DATA_SHEET_CHIP, FOR
 
 
 def unwrap(pressure_raw: int, temperature_raw: int, c: Coefficients) -> float:
-    kpa = float(compensate_kpa(pressure_raw, temperature_raw, c.a0, c.b1, c.b2, c.c12))
-    return float(unwrap_pressure(kpa, float(compute_kpa_per_padc(temperature_raw, c.b1, c.c12))))
+    law = c.make_law()
+    kpa = float(law.compute_kpa(pressure_raw, temperature_raw))
+    count_kpa = float(law.compute_kpa_per_count(temperature_raw))
+    return float(unwrap_pressure(kpa, count_kpa, 50.0, 1024.0))
 
 
 @given(
@@ -50,9 +52,9 @@ def test_a_wrapped_pressure_is_recognised_below_50_kpa() -> None:
     # hardware.md 1.3: cells pressed past their range came back 18 to 37 counts past zero
     assert unwrap(1024 - 18, 500, DATA_SHEET_PART) > 148.0 + 18 * 0.12
     less = float(np.nextafter(50.0, 0.0))
-    assert unwrap_pressure(50.0, -0.125) == 50.0
-    assert unwrap_pressure(less, -0.125) == less + 128.0
-    assert math.isnan(unwrap_pressure(math.nan, -0.1))
+    assert unwrap_pressure(50.0, -0.125, 50.0, 1024.0) == 50.0
+    assert unwrap_pressure(less, -0.125, 50.0, 1024.0) == less + 128.0
+    assert math.isnan(unwrap_pressure(math.nan, -0.1, 50.0, 1024.0))
 
 
 # --- sample delay ---------------------------------------------------------------------------------

@@ -8,12 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.arrays import Floats
-from devices.chips.mpl115a2 import (
-    TADC_PER_KELVIN,
-    Coefficients,
-    compensate_kpa,
-    compute_padc,
-)
+from devices.chips.mpl115a2 import TADC_PER_KELVIN, Coefficients, compute_padc
 from devices.errors import CalibrationError
 from devices.flags import EstimateFlag
 from service.estimation.effects import Effects, GasEffect, Parameter
@@ -151,11 +146,11 @@ def test_a_bound_is_valid_for_a_warmer_and_a_colder_dome(warmer_k: float) -> Non
     true_n, temperature_raw = 98.0, round(480 + warmer_k * TADC_PER_KELVIN)
     # A gas that hardly heats, so that the bound is near.
     plan = plan_with((effects_of_gas(1.02, 1.02),) * 2, "temperature")
-    chip = Coefficients.from_words(plan.info.tiles[0].coefficient_words)
+    chip = Coefficients.from_words(plan.info.tiles[0].registers)
     # Slow, so that no heat of the squeeze is left; warmth acts on all of the gas.
     kpa = (UNLOADED_KPA + true_n * COUNT_KPA) * (1.0 + warmer_k * 0.3 / UNLOADED_KPA)
     pressure_raw = round(float(compute_padc(kpa, temperature_raw, chip)))
-    read_kpa = compensate_kpa(pressure_raw, temperature_raw, chip.a0, chip.b1, chip.b2, chip.c12)
+    read_kpa = chip.make_law().compute_kpa(pressure_raw, temperature_raw)
     plan = with_params(plan, chip_max_kpa=float(read_kpa) - 0.05)
     # So long after the first frame that the gas is as warm as the chip.
     t_mono_ns = 60_000_000_000 + PERIOD_NS * np.arange(20)

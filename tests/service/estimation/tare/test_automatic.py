@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from devices.chips.compensation import Compensation
 from devices.chips.mpl115a2 import TADC_PER_KELVIN
+from devices.chips.pressure_chips import Compensation
 from devices.frames import NOT_READ, FrameBatch
 from service.estimation.calibration import Calibration, make_paper_shape_preset
 from service.estimation.tare.automatic import (

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.chips.compensation import Compensation
+from devices.chips.pressure_chips import Compensation
 from devices.errors import TareError
 from devices.frames import FrameBatch
 from service.estimation.calibration import Calibration, make_paper_shape_preset
@@ -228,7 +228,7 @@ def test_a_changing_temperature_is_refused_because_the_gas_lags() -> None:
     frames = loaded_frames(draw_noise(1000))
     fall = np.linspace(0.0, 10.0, 1000)[:, None].astype(np.uint16) * np.array([0, 1], np.uint16)
     moving = replace(frames, temperature_raw=frames.temperature_raw + fall)
-    match = r"temperature of tile T02 has moved by \d+ counts"
+    match = r"temperature of tile T02 has moved by \d\.\d K"
     with pytest.raises(TareError, match=match) as caught:
         tare_newest(moving, present=present_tare())
     assert "Wait" in caught.value.remedy

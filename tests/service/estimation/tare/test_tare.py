@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from devices.chips.compensation import Compensation
 from devices.chips.mpl115a2 import TADC_PER_KELVIN
+from devices.chips.pressure_chips import Compensation
 from devices.errors import TareError
 from service.estimation.pipeline.plan import make_plan
 from service.estimation.tare.tare import (
-    TEMPERATURE_CHANGE_MAX_COUNTS,
     TREND_OVER_NS,
     TREND_SPAN_MIN_NS,
     Tare,
     compute_sealed_gas_shift_kpa,
+    compute_temperature_change_max_counts,
     compute_warming_k,
     fit_recent_baseline_trend,
     has_temperature_changed,
@@ -32,6 +32,7 @@ from tests.builders.noise import draw_lasting_noise
 
 HOUR_NS = 3_600_000_000_000
 INFO = make_array(2)
+PER_KELVIN = Compensation(INFO.tiles).counts_per_kelvin
 CALIBRATION = make_calibration(*INFO.serials)
 
 
@@ -107,13 +108,14 @@ def tare_at(
 
 def test_five_kelvin_are_27_counts_less_and_1_7_kilopascals_more() -> None:
     # 100 kPa sealed at 298 K: 0.3356 kPa/K
-    warmer = compute_warming_k(tare_at(), np.array([480.0 - 26.75, 500.0]))
+    warmer = compute_warming_k(tare_at(), np.array([480.0 - 26.75, 500.0]), PER_KELVIN)
     assert warmer == pytest.approx([5.0, 0.0])
     assert compute_sealed_gas_shift_kpa(tare_at(), warmer) == pytest.approx([500.0 / 298.0, 0.0])
 
 
 def test_a_temperature_has_changed_beyond_the_limit() -> None:
-    most = TEMPERATURE_CHANGE_MAX_COUNTS
+    most = float(compute_temperature_change_max_counts(PER_KELVIN)[0])
+    assert most == 4.0
     counts = [
         [480.0 - most, 500.0 + most],
         [480.0 - most - 0.5, 500.0 + most + 0.5],
@@ -121,9 +123,9 @@ def test_a_temperature_has_changed_beyond_the_limit() -> None:
         [400.0, 500.0],
     ]
     expected = [[False, False], [True, True], [False, False], [True, False]]
-    assert has_temperature_changed(tare_at(), counts).tolist() == expected
+    assert has_temperature_changed(tare_at(), counts, PER_KELVIN).tolist() == expected
     unknown = tare_at(temperature_raw=(np.nan, 500.0))
-    assert has_temperature_changed(unknown, [0.0, 0.0]).tolist() == [False, True]
+    assert has_temperature_changed(unknown, [0.0, 0.0], PER_KELVIN).tolist() == [False, True]
 
 
 def test_a_trend_is_the_straight_line_through_the_baselines() -> None:
@@ -132,7 +134,7 @@ def test_a_trend_is_the_straight_line_through_the_baselines() -> None:
         tare_at(h, kpa=(100 + 0.3 * h, 96.0), temperature_raw=(480 - 2 * h, 500.0))
         for h in (0, 0.5, 2, 3)
     ]
-    found = fit_recent_baseline_trend(tares, tiles=2)
+    found = fit_recent_baseline_trend(tares, counts_per_kelvin=PER_KELVIN)
     assert found.kpa_per_hour == pytest.approx([0.3, 0.0], abs=1e-9)
     assert found.kelvin_per_hour == pytest.approx([-2.0 / TADC_PER_KELVIN, 0.0], abs=1e-9)
     # least squares: sigma / sqrt(sum of squared distances from the mean of 1.375 h)
@@ -143,16 +145,18 @@ def test_a_trend_is_the_straight_line_through_the_baselines() -> None:
 def test_a_trend_needs_ten_minutes_and_two_tares() -> None:
     short = (TREND_SPAN_MIN_NS - 1e9) / HOUR_NS
     for hours in ([], [0.0], [0.0, short], [0.0, 0.0]):
-        found = fit_recent_baseline_trend([tare_at(h) for h in hours], tiles=2)
+        found = fit_recent_baseline_trend([tare_at(h) for h in hours], counts_per_kelvin=PER_KELVIN)
         for values in (found.kpa_per_hour, found.sigma_kpa_per_hour, found.kelvin_per_hour):
             assert np.isnan(values).tolist() == [True, True]
-    found = fit_recent_baseline_trend([tare_at(), tare_at(short + 1 / 60)], tiles=2)
+    found = fit_recent_baseline_trend(
+        [tare_at(), tare_at(short + 1 / 60)], counts_per_kelvin=PER_KELVIN
+    )
     assert np.isfinite(found.kpa_per_hour).all()
 
 
 def test_a_tare_of_unknown_temperature_has_a_pressure_trend_only() -> None:
     unknown = tare_at(temperature_raw=(np.nan, np.nan))
-    found = fit_recent_baseline_trend([unknown, tare_at(1.0)], tiles=2)
+    found = fit_recent_baseline_trend([unknown, tare_at(1.0)], counts_per_kelvin=PER_KELVIN)
     assert np.isfinite(found.kpa_per_hour).all()
     assert np.isnan(found.kelvin_per_hour).all()
 
@@ -160,5 +164,5 @@ def test_a_tare_of_unknown_temperature_has_a_pressure_trend_only() -> None:
 def test_a_trend_is_of_the_last_hours() -> None:
     old = TREND_OVER_NS / HOUR_NS + 1.5
     tares = [tare_at(-old, kpa=(50.0, 50.0)), tare_at(-1.0), tare_at(0.0, kpa=(100.5, 96.0))]
-    found = fit_recent_baseline_trend(tares, tiles=2)
+    found = fit_recent_baseline_trend(tares, counts_per_kelvin=PER_KELVIN)
     assert found.kpa_per_hour == pytest.approx([0.5, 0.0], abs=1e-9)

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.chips.compensation import Compensation
+from devices.chips.pressure_chips import Compensation
 from devices.errors import TareError
 from devices.flags import FrameFlag, TileFlag
 from devices.frames import FrameBatch

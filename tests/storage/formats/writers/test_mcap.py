@@ -17,7 +17,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from devices.chips.compensation import Compensation
+from devices.chips.pressure_chips import Compensation
 from devices.errors import UsageError
 from devices.flags import TileFlag
 from devices.frames import NOT_READ
@@ -209,7 +209,9 @@ def test_forces_of_one_row_of_tiles_act_at_the_row(tmp_path: Path) -> None:
 def test_a_tiles_pressure_is_absolute_at_its_own_time(tmp_path: Path, every: int) -> None:
     batch = frames()
     messages = ros2(tmp_path, written(ROS2, every=every))
-    kpa = Compensation(make_array(2).tiles).compute_kpa(batch.pressure_raw, batch.temperature_raw)
+    kpa = Compensation(make_array(2).tiles).law.compute_kpa(
+        batch.pressure_raw, batch.temperature_raw
+    )
     unknown = (batch.pressure_raw == NOT_READ) | ((batch.tile_flags & TileFlag.UNUSABLE) != 0)
     for i, tile in enumerate(make_array(2).tiles):
         said = messages[f"/left/tile_{i}/pressure"]

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from devices.chips.mpl115a2 import MPL115A2
 from devices.errors import CalibrationError
 from service.estimation.fitting.rig.indentation import Indentation
 from service.estimation.fitting.static_fit import fit_static_curve
@@ -43,6 +44,7 @@ def record(
         phase += ["rest"] * REST + ["load"] * READINGS + ["unload"] * READINGS
     n = len(phase)
     return Indentation(
+        chip=MPL115A2,
         serial="T01",
         where=where,
         t_ns=np.arange(n, dtype=np.int64) * 5_000_000,

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from devices.chips.mpl115a2 import MPL115A2
 from devices.errors import CalibrationError
 from service.estimation.fitting.rig.indentation import (
     Indentation,
@@ -23,6 +24,7 @@ def record(*segments: Segment, period_ms: float = 10.0, **changes: Any) -> Inden
     under = [not name.endswith("*") for name, kpa, _ in segments for _ in kpa]
     columns: dict[str, Any] = {
         "serial": "T01",
+        "chip": MPL115A2,
         "where": "bench.parquet",
         "t_ns": (np.arange(len(phase)) * period_ms * 1e6).astype(np.int64),
         "kpa": np.array([p for _, kpa, _ in segments for p in kpa]),

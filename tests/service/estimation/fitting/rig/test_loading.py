@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from devices.chips.mpl115a2 import MPL115A2
 from service.estimation.fitting.rig.indentation import Indentation
 from service.estimation.fitting.rig.loading import extract_loading_points, join_loading_points
 
@@ -20,6 +21,7 @@ def record_taps(n: int = 3, *, outlier_at: int | None = None) -> Indentation:
     if outlier_at is not None:
         kpa[outlier_at] -= 3.0
     return Indentation(
+        chip=MPL115A2,
         serial="T01",
         where="taps.parquet",
         t_ns=np.arange(len(force_n), dtype=np.int64) * 3_000_000,

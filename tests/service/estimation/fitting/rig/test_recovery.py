@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from devices.chips.mpl115a2 import MPL115A2
 from devices.errors import CalibrationError
 from service.estimation.fitting.rig.checks import (
     check_baseline_drift_between_repeats_kpa,
@@ -33,6 +34,7 @@ def record(extra_kpa: np.ndarray | None = None, *, alone_s: float = ALONE_S) -> 
     extra = np.zeros(len(force_n)) if extra_kpa is None else extra_kpa[: len(force_n)]
     noise = np.random.default_rng(1).normal(0.0, 0.165, len(force_n))
     return Indentation(
+        chip=MPL115A2,
         serial="T01",
         where="bench.parquet",
         t_ns=np.rint(1e9 * STEP_S * np.arange(len(force_n))).astype(np.int64),
