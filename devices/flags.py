@@ -95,7 +95,7 @@ TILE_FLAGS: Mapping[TileFlag, FlagText] = {
     ),
     TileFlag.OVER_RANGE: FlagText(
         "",
-        "above 115 kPa, below 50 kPa or at the end of the counts: good as a lower bound",
+        "outside the chip's rated range or at the end of its counts: good as a lower bound",
         Severity.BOUND,
     ),
     TileFlag.NOT_CONVERTED: FlagText(
@@ -181,7 +181,7 @@ ESTIMATE_FLAGS: Mapping[EstimateFlag, FlagText] = {
     ),
     EstimateFlag.OVER_RATED: FlagText(
         "above the rated pressure",
-        "a tile is above the chip's 115 kPa, but within its calibration",
+        "a tile is above its chip's rated range, but within its calibration",
         Severity.DOUBT,
     ),
     EstimateFlag.OUTLIER_REPLACED: FlagText(

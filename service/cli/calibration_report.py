@@ -112,7 +112,7 @@ def _tabulate_ranges(calibration: Calibration) -> Table:
             "end: where the range ends, above the baseline, absolute, and as a force;",
             "ended by: the load, which went no further, or the chip, whose reading did not",
         ],
-        *("tile", "end\nkPa", "absolute\nkPa", "left to 115\nkPa", "force\nN", "ended by"),
+        *("tile", "end\nkPa", "absolute\nkPa", "left to\nchip's kPa", "force\nN", "ended by"),
         *("drift\nkPa", "raw T\ncounts", "about\ndegC"),
     )
     for tile in calibration.tiles:

@@ -264,7 +264,7 @@ class Rig:
         ]
         """Start-up messages for the user."""
         self.startup_messages += [
-            f"the conversion time of tile {serial} could not be measured; 3 ms is assumed"
+            f"the conversion time of tile {serial} could not be measured; the longest is assumed"
             for serial in self._ready.unmeasured_serials
         ]
         self._servo_source = (

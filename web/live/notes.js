@@ -19,7 +19,7 @@ const FROM_ESTIMATE = [
   [ESTIMATE.STUCK, "stuck", "A tile repeats one reading: its force is unknown. Unplug and replug it."],
   [ESTIMATE.BASELINE_LOST, "baseline_lost", "Zero of a tile has dropped: force is less certain. Lift the foot, press Tare; if it recurs, the dome may leak."],
   [ESTIMATE.AFTER_SATURATION, "after_saturation", "Force is less certain: a tile was saturated or not read just before."],
-  [ESTIMATE.OVER_RATED, "over_rated", "Above the rated 115 kPa, within the calibration."],
+  [ESTIMATE.OVER_RATED, "over_rated", "Above the chip's rated range, within the calibration."],
 ];
 /** @type {[bit: number, key: string, text: string][]} */
 const FROM_FRAME = [
@@ -50,7 +50,7 @@ export class Warnings {
     for (const [bit, key, text] of FROM_FRAME) if (frame.frame_flags & bit) flag(key, text);
     node.tiles.forEach((tile, i) => {
       const isOverRange = frame.tile_flags?.[i] & TILE.OVER_RANGE;
-      if (isOverRange && !frame.saturated?.[i]) flag("over_range", `${tile.serial} is outside the chip's range of 50 to 115 kPa.`, `over_range ${tile.serial}`);
+      if (isOverRange && !frame.saturated?.[i]) flag("over_range", `${tile.serial} is outside its chip's range.`, `over_range ${tile.serial}`);
       if (frame.estimate_flags & ESTIMATE.CLIPPED && frame.saturated?.[i] && !isOverRange) flag("clipped", clippedText(tile, frame.gauge_kpa?.[i]), `clipped ${tile.serial}`);
     });
   }

@@ -13,11 +13,11 @@ const WARNINGS = {
   after_saturation: { section: "too-low",
     why: "The rubber remembers each load, and a saturated tile or frames not sampled hid one: the 95 % interval is wider until that fades. If it recurs, reduce the load on the foot or on the node's computer." },
   over_rated: { section: "too-low",
-    why: "The data sheet specifies accuracy up to 115 kPa only. The calibration covers this pressure, so the force is known, but the chip is overloaded." },
+    why: "The data sheet specifies accuracy up to the end of the chip's range only. The calibration covers this pressure, so the force is known, but the chip is overloaded." },
   below_range: { section: "a-force-in-the-air",
     why: "The pressure is below the calibrated range. Mud may pull at the foot, or the zero is old: lift the foot and press Tare." },
   over_range: { section: "it-jumps",
-    why: "The chip measures 50 to 115 kPa absolute pressure, and this reading is outside. Such readings are shown, but their accuracy is not specified." },
+    why: "This reading is outside the range of the tile's chip. Such readings are shown, but their accuracy is not specified." },
   bus_fault: { section: "it-jumps",
     why: "The bus between node and tiles is held or disturbed. Frames are incomplete until the fault ends; check plugs, cable and supply." },
   overrun: {

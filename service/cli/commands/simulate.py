@@ -151,7 +151,7 @@ def _print_result(result: SimulationResult, path: Path) -> None:
     )
     remark(f"schedule {result.schedule_choice.schedule}: {result.schedule_choice.reason}")
     for serial in result.unmeasured_serials:
-        echo(f"tile {serial}: conversion time not measurable; 3 ms assumed")
+        echo(f"tile {serial}: conversion time not measurable; the longest is assumed")
     for serial, flags in result.flag_counts.items():
         text = ", ".join(f"{n} {reason}" for reason, n in flags.items())
         echo(f"tile {serial}: of {result.frame_count} frames {text}")
