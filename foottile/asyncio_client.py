@@ -15,8 +15,7 @@ import pyarrow as pa
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
-from foottile.closeable import AsyncCloseable
-from foottile.connection import AsyncWebsocket
+from foottile.connection import AsyncCloseable, AsyncWebsocket
 from foottile.data import Clock, SessionData
 from foottile.errors import FootTileError
 from foottile.live_protocol import FrameLoss, LiveRequest, LiveStreamState, Policy

@@ -1,4 +1,4 @@
-"""Connections of a client: TLS contexts, websockets without redirects, foreign responses."""
+"""Connections of a client: TLS, websockets without redirects, closing, foreign responses."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import os
 import re
 import ssl
 import stat
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from http import HTTPStatus
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 from urllib.parse import urljoin, urlsplit
 
 from websockets.asyncio.client import ClientConnection as AsyncClientConnection
@@ -188,3 +190,41 @@ def _origin(url: str) -> str:
 
 def _printable(text: str) -> str:
     return "".join(letter for letter in text if letter.isprintable())[:_TEXT_MAX]
+
+
+class Closeable(ABC):
+    """Context manager that calls `close`."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release the connections."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class AsyncCloseable(ABC):
+    """Asynchronous context manager that calls `close`."""
+
+    @abstractmethod
+    async def close(self) -> None:
+        """Release the connections."""
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        await self.close()

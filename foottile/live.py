@@ -11,8 +11,7 @@ import pyarrow as pa
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import ClientConnection, connect
 
-from foottile.closeable import Closeable
-from foottile.connection import Websocket
+from foottile.connection import Closeable, Websocket
 from foottile.errors import FootTileError
 from foottile.live_protocol import LiveStreamState
 

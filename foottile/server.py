@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from foottile.closeable import Closeable
+from foottile.connection import Closeable
 from foottile.data import download
 from foottile.http import HttpClient
 from foottile.live import LiveStream

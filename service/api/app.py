@@ -7,7 +7,9 @@ from collections.abc import AsyncIterator, Callable, Iterable, Sequence
 from contextlib import asynccontextmanager
 from functools import cache
 from http import HTTPStatus
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from fastapi import APIRouter, FastAPI, Request, Response
 from starlette.exceptions import HTTPException
@@ -18,7 +20,6 @@ from devices.errors import FootTileError
 from service.api import problems
 from service.api.guard import AccessGuard
 from service.api.logins import Logins
-from service.api.openapi import SWAGGER_FILES, add_security_scheme, find_swagger_folder
 from service.api.routes import calibrations, common, index, login, nodes, weighings
 from service.api.routes.downloads import data, zips
 from service.api.routes.recordings import comparisons, integrity, overview, sessions, stances, takes
@@ -31,6 +32,7 @@ from service.server.server import Server
 from service.version import SOFTWARE_VERSION
 
 API = "/api/v1"
+_SWAGGER_FILES = ("swagger-ui-bundle.js", "swagger-ui.css")
 
 _DESCRIPTION = """
 Live data and recorded sessions of FootTile sensors on robot feet.
@@ -39,6 +41,12 @@ Every error is `application/problem+json` (RFC 9457) whose `detail` says what to
 carry their unit in their name; `_t_ns` are nanoseconds since 1970 in UTC. Frames come live over the
 websocket `/api/v1/live`; nodes connect to `/api/v1/ingest` with the subprotocol `foottile.v1`.
 """
+_TOKEN = {
+    "type": "http",
+    "scheme": "bearer",
+    "description": "The server's token. Reading from a server that is not private needs none; "
+    "a browser that has logged in needs none either.",
+}
 
 
 def make_app(
@@ -82,7 +90,7 @@ def make_app(
     app.state.find_urls = find_urls
     problems.install_handlers(app)
     app.router.routes.extend(_make_api_routes())
-    add_security_scheme(app)
+    _add_security_scheme(app)
 
     @app.websocket(LIVE_PATH)
     async def live_socket(socket: WebSocket) -> None:
@@ -118,11 +126,11 @@ def make_app(
     async def docs_page(request: Request) -> Response:
         return await page.get_response("docs.html", request.scope)
 
-    swagger = PageFiles(find_swagger_folder())
+    swagger = PageFiles(_find_swagger_folder())
 
     @app.get("/docs/{name}", include_in_schema=False)
     async def docs_file(name: str, request: Request) -> Response:
-        if name not in SWAGGER_FILES:
+        if name not in _SWAGGER_FILES:
             raise HTTPException(HTTPStatus.NOT_FOUND)
         return await swagger.get_response(name, request.scope)
 
@@ -177,6 +185,37 @@ def _make_api_routes() -> tuple[BaseRoute, ...]:
     routes = APIRouter()
     routes.include_router(api)
     return tuple(routes.routes)
+
+
+def _add_security_scheme(app: FastAPI) -> None:
+    """Add the token to the app's OpenAPI document as an optional security scheme."""
+    made = app.openapi
+
+    def make_schema() -> dict[str, Any]:
+        schema = made()
+        schema["components"]["securitySchemes"] = {"token": _TOKEN}
+        schema["security"] = [{}, {"token": []}]
+        return schema
+
+    app.openapi = make_schema  # type: ignore[method-assign]  # as FastAPI documents
+
+
+def _find_swagger_folder() -> Path:
+    """Return the folder of Swagger UI, which is an installed package: no other host is needed.
+
+    Raises:
+        FootTileError: the installation lacks it.
+    """
+    found = find_spec("fastapi_offline")
+    for place in (found.submodule_search_locations or ()) if found is not None else ():
+        folder = Path(place) / "static"
+        if all((folder / name).is_file() for name in _SWAGGER_FILES):
+            return folder
+    raise FootTileError(
+        "Swagger UI is not installed",
+        expected="the package fastapi-offline",
+        remedy="Install foottile again with its extra `server`",
+    )
 
 
 def find_page_folder() -> Path:

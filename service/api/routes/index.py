@@ -5,7 +5,6 @@ from __future__ import annotations
 from fastapi import APIRouter, Request
 from pydantic import BaseModel, Field
 
-from service.api.openapi import list_operations
 from service.api.routes.common import ServerState, problem_responses
 from service.protocol.codec import SUBPROTOCOL
 from service.protocol.link import INGEST_PATH
@@ -13,6 +12,8 @@ from service.protocol.live import LIVE_PATH, View
 from service.user_folders import PublicText
 from service.version import SOFTWARE_VERSION
 from storage.formats.writers.registry import FORMATS
+
+_METHODS = ("get", "post", "put", "patch", "delete")
 
 
 class RouteView(View):
@@ -51,12 +52,14 @@ async def get_index(request: Request) -> IndexView:
         ingest=INGEST_PATH,
         routes=[
             RouteView(
-                method=method,
+                method=method.upper(),
                 href=path,
-                operation=operation["operationId"],
-                summary=operation["summary"],
+                operation=methods[method]["operationId"],
+                summary=methods[method]["summary"],
             )
-            for path, method, operation in list_operations(app.openapi())
+            for path, methods in app.openapi()["paths"].items()
+            for method in _METHODS
+            if method in methods
         ],
     )
 
