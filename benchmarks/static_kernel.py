@@ -62,7 +62,11 @@ class StaticKernel:
         self.low_kpa = (
             _column([t.range_kpa[0] for t in entries]) - SIGNIFICANCE_SIGMAS * self.still_kpa
         )
-        self.plan, self.bearing, self.foot = plan, plan.bearing, plan.params.foot
+        self.plan, self.load_bearing_params, self.foot = (
+            plan,
+            plan.load_bearing_params,
+            plan.params.foot,
+        )
         self.f = [np.empty((n, rows)) for _ in range(9)]
         self.flag = [np.empty((n, rows), dtype=np.bool_) for _ in range(4)]
         self.row = [np.empty(rows) for _ in range(12)]
@@ -152,7 +156,7 @@ class StaticKernel:
         np.copyto(divisor, grf)
         np.copyto(divisor, np.nan, where=grf == 0.0)
         for axis, (at, at_sigma) in enumerate(((x, sx), (y, sy), (z, sz))):
-            arm = self.bearing["position_m"][:, axis, None]
+            arm = self.load_bearing_params["position_m"][:, axis, None]
             np.multiply(force, arm, out=u)
             np.add.reduce(u, axis=0, out=at)
             np.divide(at, divisor, out=at)
@@ -165,7 +169,7 @@ class StaticKernel:
             np.divide(at_sigma, nothing, out=at_sigma)
         if self.foot["has_grid"]:
             np.add.reduce(gauge, axis=0, out=nothing)
-            for weights in self.bearing["grid_index"].T:
+            for weights in self.load_bearing_params["grid_index"].T:
                 np.multiply(gauge, weights[:, None], out=u)
                 np.add.reduce(u, axis=0, out=index)
                 index /= nothing

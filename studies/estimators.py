@@ -38,7 +38,7 @@ class LowPassEstimator:
 
     def process_frames(self, frames: FrameBatch) -> Estimates:
         """Return the estimates of the next frames, all at once."""
-        plan, bearing, curves = self.plan, self.plan.bearing, self.plan.curves
+        plan, bearing, curves = self.plan, self.plan.load_bearing_params, self.plan.curves
         places, gain = plan.load_bearing_columns, bearing["mount_gain"]
         kpa = Compensation(plan.info.tiles).compute_usable_kpa(frames)
         gauge_kpa = kpa - plan.tare.baseline_kpa

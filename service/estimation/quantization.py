@@ -110,7 +110,7 @@ def _compute_least_sigmas(plan: EstimationPlan) -> dict[str, Floats]:
     force_n = np.full(len(plan.info.tiles), np.nan)
     force_n[plan.load_bearing_columns] = of_tile_n
     grf_n = np.array([math.sqrt(float((of_tile_n**2).sum()))])
-    bearing, curves = plan.bearing, plan.curves
+    bearing, curves = plan.load_bearing_params, plan.curves
     most_kpa = float(curves["range_high_kpa"].sum())
     end_n = compute_forces(curves, curves["range_high_kpa"][None]).force_n
     most_n = float((bearing["mount_gain"] * end_n).sum())
@@ -136,7 +136,11 @@ def _compute_least_sigmas(plan: EstimationPlan) -> dict[str, Floats]:
 
 def _compute_least_tile_sigmas_n(plan: EstimationPlan) -> Floats:
     """Compute the least sigma of each load-bearing tile's force, over its range, fully averaged."""
-    bearing, curves, left = plan.bearing, plan.curves, np.ones(len(plan.load_bearing_columns))
+    bearing, curves, left = (
+        plan.load_bearing_params,
+        plan.curves,
+        np.ones(len(plan.load_bearing_columns)),
+    )
     if "denoise" in plan.models:
         within_s = 1e-9 * (PAST_NS + plan.lookahead_ns)
         rate_hz = _RATE_MARGIN * plan.info.nominal_rate_hz

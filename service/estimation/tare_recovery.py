@@ -63,7 +63,9 @@ def remove_recovery(
     known = np.isfinite(force_n)
     left_n = np.where(known, force_n, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
     baseline_kpa, sigma_kpa = tare.baseline_kpa.copy(), tare.baseline_sigma_kpa.copy()
-    slope_n_per_kpa = plan.bearing["mount_gain"] * plan.curves["slope_at_zero_n_per_kpa"]
+    slope_n_per_kpa = (
+        plan.load_bearing_params["mount_gain"] * plan.curves["slope_at_zero_n_per_kpa"]
+    )
     shift_kpa = left_n / slope_n_per_kpa
     baseline_kpa[columns] += shift_kpa
     sigma_kpa[columns] = np.hypot(sigma_kpa[columns], RECOVERY_UNCERTAINTY * np.abs(shift_kpa))

@@ -75,7 +75,7 @@ class EstimationPlan:
     params: KernelParams
 
     @property
-    def bearing(self) -> RecordArray[TileParams]:
+    def load_bearing_params(self) -> RecordArray[TileParams]:
         """Parameters of the load-bearing tiles."""
         found: RecordArray[TileParams] = np.asarray(self.params.tiles)[self.load_bearing_columns]
         return found
@@ -322,6 +322,6 @@ def _compute_chip_max_kpa(
 
 def compute_settling_time_s(plan: EstimationPlan) -> float:
     """Return the time in seconds until the models have settled."""
-    bearing = plan.bearing
+    bearing = plan.load_bearing_params
     longest_s = max(MODELS[name].longest_time_constant_s(bearing[name]) for name in plan.models)
     return max(SETTLING_MIN_S, SETTLING_TIME_CONSTANTS * longest_s)

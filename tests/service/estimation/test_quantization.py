@@ -97,7 +97,8 @@ def test_a_step_is_a_power_of_two_and_at_most_an_eighth_of_sigma(
         assert np.all(np.frexp(steps[name])[0] == 0.5), name
         assert np.all(steps[name] <= least / STEPS_PER_SIGMA * (1.0 + 1e-12)), name
     assert np.all(
-        steps["gauge_kpa"] <= plan.bearing["noise_kpa"] * np.hypot(1.0, 0.05) / STEPS_PER_SIGMA
+        steps["gauge_kpa"]
+        <= plan.load_bearing_params["noise_kpa"] * np.hypot(1.0, 0.05) / STEPS_PER_SIGMA
     )
 
 

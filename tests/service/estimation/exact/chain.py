@@ -179,7 +179,7 @@ def compute_chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> A
         frame_ns,
         run,
         plan.lag_ns - 1,
-        plan.bearing["variance_inflation"].mean(axis=0),
+        plan.load_bearing_params["variance_inflation"].mean(axis=0),
     )
     within = [None if each is None else each[4] for each in together]
     for i in DOMES:
@@ -195,7 +195,7 @@ def compute_chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> A
             frame_ns,
             run,
             plan.lag_ns - 1,
-            plan.bearing["variance_inflation"][i],
+            plan.load_bearing_params["variance_inflation"][i],
             within,
         )
         smooth = [f if a is None else a[0] for f, a in zip(apparent, averaged, strict=True)]

@@ -38,7 +38,7 @@ def test_a_dome_transmits_ambient_pressure_as_its_wall_yields() -> None:
     tiles = [newton_tile("T01", effects=make_effects())]
     bare = array_at([(0.0, 0.0, 0.0), (0.1, 0.0, 0.0)], references=[1])
     plan = newton_plan(bare, models=("static", "ambient"), tiles=tiles)
-    found, yielded = plan.bearing["ambient"], 0.0013 * plan.tare.baseline_kpa[0]
+    found, yielded = plan.load_bearing_params["ambient"], 0.0013 * plan.tare.baseline_kpa[0]
     assert found["transmitted_fraction"] == pytest.approx([yielded / (1 + yielded)])
     assert found["relative_sigma"] == pytest.approx([0.0002 / 0.0013])
     with pytest.raises(UsageError, match="bare reference tile"):

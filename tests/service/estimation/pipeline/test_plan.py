@@ -42,7 +42,7 @@ def test_a_reference_tile_is_in_no_sum_no_hull_and_no_grid() -> None:
     assert foot["contact_on_n"] == without["contact_on_n"]
     assert sorted(plan.params.hull[:, 2].tolist()) == pytest.approx([0.0, 0.028])
     assert foot["has_grid"] == 1
-    assert plan.bearing["grid_index"][:, 0].tolist() == [1.0, 2.0, 3.0]
+    assert plan.load_bearing_params["grid_index"][:, 0].tolist() == [1.0, 2.0, 3.0]
 
 
 def test_options_are_in_ladder_order_nanoseconds_and_periods() -> None:

@@ -63,7 +63,7 @@ def test_a_tare_is_read_as_written_and_an_older_one_has_white_noise(lasting_tare
     assert Tare.from_dict(content, tiles=2).as_dict() == content
     older = Tare.from_dict(content | {"noise_lasting": None, "noise_lasting_s": None}, tiles=2)
     white, lasting = (
-        make_plan(INFO, CALIBRATION, each, models=["static", "denoise"]).bearing[
+        make_plan(INFO, CALIBRATION, each, models=["static", "denoise"]).load_bearing_params[
             "variance_inflation"
         ]
         for each in (older, lasting_tare)
