@@ -85,12 +85,11 @@ def test_a_token_read_from_a_file_may_have_its_line_end() -> None:
 def test_no_other_place_reads_a_variable_of_ours() -> None:
     allowed = {
         ROOT / "foottile" / "environment.py",
-        # It passes its whole environment on, and names the token for the node that it starts.
-        ROOT / "service" / "cli" / "commands" / "demo.py",
+        # A demo passes its whole environment on, and names the token for the node that it starts.
+        ROOT / "service" / "cli" / "commands" / "serve.py",
         ROOT / "studies" / "reproduce" / "run.py",
         # Read or set for a library.
         ROOT / "devices" / "jit.py",
-        ROOT / "service" / "memory.py",
         # It refuses paths that are not UTF-8, those in variables too.
         ROOT / "service" / "cli" / "main.py",
     }
