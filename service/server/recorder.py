@@ -214,7 +214,8 @@ class Recorder:
             StorageError: a session cannot be saved.
         """
         for session in self._store.list_unsealed(node.name):
-            if session.state != "sealing":
+            # The end of others is known: to save them can wait, also if the disk is full.
+            if session.state != "sealing" and session.parts[-1].seq_last is None:
                 self._apply_node_change(session)
 
     def advance_unsealed_sessions(self) -> None:

@@ -352,7 +352,8 @@ class SessionStore:
 
     def _edit(self, session_id: str, **changes: object) -> Session:
         step = apply_event(self.get_session(session_id), Edit(changes))
-        self.save(step.session)
+        if step.is_changed:
+            self.save(step.session)
         if step.action == "write_markers":
             write_markers(step.session, self.folder.get_path(session_id))
         return step.session

@@ -4,10 +4,10 @@ recording -- `Stop` --> pending -- all frames are here --> sealing -- `Sealed` -
 
 | event | recording | pending | sealing | sealed |
 |---|---|---|---|---|
-| `NodeChange` | follows streams | also: ends, sealing | sealing, or pending | same |
+| `NodeChange` | follows streams, or ends | sealing, or pending | sealing, or pending | same |
 | `Stop` | pending | same | same | same |
 | `Resume` | recording | refused | recording | refused |
-| `Abandon` | refused | sealing | refused | refused |
+| `Abandon` | refused | sealing, or pending | refused | refused |
 | `Sealed` | refused | refused | sealed | refused |
 | `Edit` | same | same | same | same |
 | `Delete` | refused | same | same | same |
@@ -178,9 +178,12 @@ def apply_event(session: Session, event: Event, node: NodeFacts = NO_FACTS) -> S
     """
     match session.state, event:
         case _, Edit(changes):
+            if unknown := changes.keys() - set(_EDITABLE):
+                raise ValueError(f"people do not change {', '.join(sorted(unknown))}")
             edited = session.model_copy(update=dict(changes))
-            is_written = session.state == "sealed" and "markers" in changes
-            return Step(edited, is_changed=True, action="write_markers" if is_written else None)
+            has_file = session.state == "sealed" and "markers" in changes
+            action: Literal["write_markers"] | None = "write_markers" if has_file else None
+            return Step(edited, is_changed=edited != session, action=action)
         case "recording", Stop():
             return Step(_stop(session, node), is_changed=True)
         case "recording" | "sealing", Resume():
@@ -244,20 +247,21 @@ def _resume(session: Session) -> Session:
 
 
 def _settle(before: Session, node: NodeFacts) -> Step:
-    """Let parts follow the node's streams, find the end, and begin to seal or return from it."""
+    """Let parts follow the node's streams, find the end, and set sealing or pending."""
     session, continuations = before, []
     is_recorded = before.state == "recording" and node.frames_to_come == "possible"
-    if session.state != "sealing":
-        follow = _follow_streams if node.frames_to_come == "possible" else _end_without_missing
-        session, *continuations = follow(session, node)
-    if not is_recorded:  # one that ends here, with its tiles, is pending until the next event
+    if node.frames_to_come != "possible":
+        session, *continuations = _end_without_missing(session, node)
+    elif session.state != "sealing":
+        session, *continuations = _follow_streams(session, node)
+    if not is_recorded:  # a recording that other tiles end is pending; the next event seals it
         state = "sealing" if is_ready_to_seal(session, node) else "pending"
         if state != session.state:
             session = session.model_copy(update={"state": state})
     return Step(
         session,
         tuple(continuations),
-        is_changed=session is not before,
+        is_changed=session is not before and session != before,
         action="seal" if session.state == "sealing" else None,
     )
 

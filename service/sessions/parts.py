@@ -143,9 +143,11 @@ class NodeFacts:
         find_stream: returns the facts of a stream by its id; None: it is unknown.
         stream_ids: its streams, oldest first; the present one is last.
         unreadable: ids of streams whose journals cannot be read now.
-        frames_to_come: none: all frames are here or lost; abandoned: further ones do not count.
+        frames_to_come: possible: any may come; none: all are here or lost; abandoned: further ones
+            do not count.
         is_running: True: facts of a running server; a stream without a known end may go on.
-        has_reported: True: it has reported its streams since then, so that an unknown one is gone.
+        has_reported: True: it has reported its streams since the server was started; an unknown
+            one is gone.
         is_connected: True: it is connected to the server.
         newest_seq: number of its newest frame; None: unknown.
         offset_ns: offset of its present clock to that of stops; None: unknown.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 
 import pytest
 
@@ -85,6 +86,32 @@ def test_a_hello_is_stored_in_a_thread_before_its_frames_are_acknowledged(
         assert not path.exists()
     node.acknowledged(9)
     assert path.exists()
+
+
+def test_a_full_disk_refuses_no_node_whose_stopped_session_becomes_ready(
+    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node.connect()
+    node.deliver(10)
+    recording = node.record()
+    node.deliver(20)
+    first = node.seq
+    node.frames(10)  # not sent, and lost on the node's disk later
+    node.send(10)
+    until(lambda: time.monotonic_ns() > node.next_t_mono_ns)
+    recording.stop()
+    node.send(10, now=True)
+    until(lambda: recording.now()["parts"][-1]["seq_last"] is not None)
+    node.leave()
+    save = failing_if(lambda *_: True, running.server.sessions.save, *STORAGE_FULL)
+    with monkeypatch.context() as full:
+        full.setattr(running.server.sessions, "save", save)
+        stored = ((0, first - 1), (first + 10, node.seq - 1))
+        node.connect(stored=stored, lost={"disk_full": ((first, first + 9),)})
+        node.send(10)
+        node.taken_in()
+        assert recording.now()["state"] == "pending"
+    assert recording.sealed()["complete"] == "lossy"
 
 
 def test_frames_that_a_full_disk_refuses_are_requested_again(

@@ -65,6 +65,22 @@ def test_damaged_frames_of_a_server_are_waited_for_until_abandoned(tmp_path: Pat
         assert (one.outcome, ledger.parts[0].lost) == ("sealed", {"corrupt": 10})
 
 
+def test_damaged_frames_of_a_session_that_was_being_sealed_are_abandoned(tmp_path: Path) -> None:
+    flip_a_bit(stream(servers(tmp_path), info_of(), (0, 99)))
+    parts = (Part(stream_id=BOOT, seq_first=0, seq_last=99),)
+    session(tmp_path, state="sealing", stopped_t_ns=t_ns(99), parts=parts)
+    one, ledger = recovered(tmp_path, abandon_missing=True)
+    assert (one.outcome, ledger.parts[0].lost) == ("sealed", {"corrupt": 10})
+    assert loaded(tmp_path).is_abandoned
+
+
+def test_damaged_frames_of_no_session_are_lost_to_the_one_that_is_made(tmp_path: Path) -> None:
+    flip_a_bit(stream(servers(tmp_path), info_of(), (0, 99)))
+    (one,) = recover_locked_folder(tmp_path, make_sessions=True, abandon_missing=True).sessions
+    assert one.ledger is not None
+    assert (one.outcome, one.ledger.parts[0].lost) == ("sealed", {"corrupt": 10})
+
+
 def test_a_damaged_batch_at_the_stop_is_lost_and_the_others_tell_the_end(tmp_path: Path) -> None:
     folder = stream(tmp_path, info_of(), (0, 99), next_seq=100)
     flip_a_bit(folder)  # in the batch of frames 30 to 39
