@@ -96,4 +96,6 @@ def _rules(frames: FrameBatch, info: ArrayInfo) -> Iterator[tuple[str, Violation
 def _get_counts_max(chips: tuple[str, ...]) -> Counts | npt.NDArray[np.uint32]:
     """Return the largest counts of pressure and of temperature: of all chips, or (2, tiles)."""
     limits = [get_chip(name).counts_max for name in chips]
-    return limits[0] if len(set(limits)) == 1 else np.array(limits, np.uint32).T
+    if len(set(limits)) == 1:
+        return limits[0]
+    return np.array(limits, np.uint32).reshape(-1, 2).T

@@ -45,10 +45,16 @@ def check_chips(info: ArrayInfo) -> ArrayInfo:
     """Check that this version knows the chips of an array, and return it.
 
     Raises:
-        UsageError: a tile has an unknown kind of chip, or registers of none.
+        UsageError: a tile has an unknown kind of chip, or an address or registers of none.
     """
     for tile in info.tiles:
-        get_chip(tile.chip).make_law(tile.registers)
+        chip = get_chip(tile.chip)
+        if tile.address not in chip.addresses:
+            raise UsageError(
+                f"tile {tile.serial}: a {chip.name} has no address 0x{tile.address:02x}",
+                expected=", ".join(f"0x{address:02x}" for address in chip.addresses),
+            )
+        chip.make_law(tile.registers)
     return info
 
 

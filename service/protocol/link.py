@@ -80,7 +80,7 @@ SceneContent = Annotated[dict[str, Any], AfterValidator(_check_bounds)]
 """Content of a scene file. Server and sessions only store it, for people and for `foottile node`;
 `devices.scene` interprets it."""
 
-PROTOCOL = 4
+PROTOCOL = 5
 INGEST_PATH = "/api/v1/ingest"
 MESSAGE_BYTES_MAX = 1 << 20
 """Longest message that either side accepts. A batch of 64 tiles is 0.1 MB."""

@@ -90,7 +90,7 @@ def test_counts_beyond_a_chips_own_are_refused(
     assert f"frame {int(frames.seq[5])}" in describe_first_broken_rule(wrong, info)
 
 
-def test_wide_counts_survive_wire_crash_and_file(
+def test_wide_counts_survive_wire_and_file(
     recording: tuple[ArrayInfo, FrameBatch, np.ndarray], tmp_path: Path
 ) -> None:
     info, frames, _ = recording

@@ -220,7 +220,8 @@ def _read_description(content: bytes, *, where: str) -> ArrayInfo | None:
     try:
         info = check_chips(ArrayInfo.model_validate_json(description))
     except ValueError as error:
-        raise damage from error
+        what = f"its head is of another version: {' '.join(str(error).split())[:200]}"
+        raise DamagedFileError(what, where=where) from error
     row_bytes = struct.calcsize(_row_format(info)) + 4
     if len(content) != _HEAD.size + length + rows * row_bytes:
         raise damage

@@ -72,8 +72,8 @@ def test_another_subprotocol_is_refused(healthy: FakeNode, offered: list[str] | 
 @pytest.mark.parametrize(
     ("first", "reason"),
     [
-        ('{"type":"hello","protocol":2,"array_info":{}}', "protocol 2; this server speaks 4: node"),
-        ('{"type":"identify","protocol":5,"more":0}', "protocol 5; this server speaks 4: server"),
+        ('{"type":"hello","protocol":2,"array_info":{}}', "protocol 2; this server speaks 5: node"),
+        ('{"type":"identify","protocol":6,"more":0}', "protocol 6; this server speaks 5: server"),
     ],
 )
 def test_another_protocol_is_refused(
@@ -89,7 +89,7 @@ def test_another_protocol_is_refused(
     [
         *(b"\0\1\2", "", "hello", "null", "[]", "[" * 100_000, '{"type":"identify"}'),
         *('{"type":"goodbye"}', '{"type":"probe","id":1}', '{"type":"identify","😀":1}'),
-        '{"type":"identify","protocol":4,"node":null}',
+        '{"type":"identify","protocol":5,"node":null}',
     ],
     ids=lambda first: repr(first[:30]),
 )
