@@ -15,7 +15,7 @@ SOFTWARE_VERSION = f"foottile {version('foottile')}"
 def compute_exact_version() -> str:
     """Return the version with a hash of the source code, for exact reproducibility."""
     digest = hashlib.sha256()
-    for name in ("devices", "storage", "service"):
+    for name in ("devices", "storage", "service", "studies"):
         folder = Path(str(import_module(name).__file__)).parent
         for path in sorted(folder.rglob("*.py")):
             digest.update(path.relative_to(folder).as_posix().encode() + b"\0")

@@ -11,10 +11,10 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from devices.arrays import Floats, Ints
-from devices.chips.pressure_chips import Compensation
+from devices.chips.pressure_chips import Compensation, get_raw_type
 from devices.errors import UsageError
 from devices.flags import EstimateFlag
-from devices.frames import FrameBatch
+from devices.frames import NOT_READ, FrameBatch, HeldTemperature, hold_temperature
 from service.estimation.estimate import Estimator, ModelEstimator
 from service.estimation.foot import CONTACT_UNKNOWN
 from service.estimation.models.static import compute_forces
@@ -33,15 +33,23 @@ class LowPassEstimator:
     def __init__(self, plan: EstimationPlan) -> None:
         self.plan = plan
         unknown_n = np.full(len(plan.load_bearing_columns), np.nan)  # there the low-pass starts
-        # The last frame's forces; its instant in ns, and its contact.
+        tiles = plan.info.tiles
+        # The last frame's forces; its instant in ns, and its contact; the last temperatures.
         self._state: Columns = {"force_n": unknown_n, "last": np.zeros(2, np.int64)}
+        self._state["held"] = np.full(len(tiles), NOT_READ, get_raw_type(tiles))
+        self._state["held_ns"] = np.zeros(len(tiles), np.int64)
 
     def process_frames(self, frames: FrameBatch) -> Estimates:
         """Return the estimates of the next frames, all at once."""
         plan, bearing, curves = self.plan, self.plan.load_bearing_params, self.plan.curves
         places, gain = plan.load_bearing_columns, bearing["mount_gain"]
-        kpa = Compensation(plan.info.tiles).compute_usable_kpa(frames)
-        gauge_kpa = kpa - plan.tare.baseline_kpa
+        state, compensation = self._state, Compensation(plan.info.tiles)
+        held = HeldTemperature(state["held"], state["held_ns"])
+        frames, held = hold_temperature(frames, held)
+        state["held"], state["held_ns"] = held.temperature_raw, held.t_mono_ns
+        kpa = compensation.compute_usable_kpa(frames)
+        # A count below the chip's range has wrapped.
+        gauge_kpa = np.where(kpa >= compensation.min_kpa, kpa, np.nan) - plan.tare.baseline_kpa
         static = compute_forces(curves, np.ascontiguousarray(gauge_kpa[:, places]))
         still_kpa = np.hypot(bearing["noise_kpa"], np.sqrt(bearing["baseline_variance"]))
         sigma_n = gain * np.hypot(static.slope_n_per_kpa * still_kpa, static.fit_sigma_n)
@@ -49,16 +57,19 @@ class LowPassEstimator:
         is_saturated = gauge_kpa[:, places] > curves["range_high_kpa"]
         bounds_n = np.where(is_saturated, force_n - BOUND_SIGMAS * sigma_n, force_n)
         sigma_n = np.where(is_saturated | np.isnan(force_n), np.nan, sigma_n)
-        grf_n, variance, bound_n, x, y = np.zeros((5, len(frames)))
-        for j, (x_m, y_m, _) in enumerate(bearing["position_m"]):  # the same order for any batch
-            measured_n = np.where(is_saturated[:, j], np.nan, force_n[:, j])
-            grf_n, x, y = grf_n + measured_n, x + x_m * measured_n, y + y_m * measured_n
-            variance += np.nan_to_num(sigma_n[:, j]) ** 2
-            bound_n += np.nan_to_num(bounds_n[:, j])
+        measured_n, stated_n = np.where(is_saturated, np.nan, force_n), np.nan_to_num(sigma_n)
+        grf_n, variance = _add_tiles(measured_n), _add_tiles(stated_n**2)
+        bound_n = _add_tiles(np.nan_to_num(bounds_n))
         grf_sigma_n = np.where(np.isnan(grf_n), np.nan, np.sqrt(variance))
         contact = self._detect_contact(grf_n.tolist())
         is_masked = ~((contact == 1) & (grf_n >= SIGNIFICANCE_SIGMAS * grf_sigma_n))
         divisor_n, nothing = np.where(is_masked, np.nan, grf_n), np.full(len(frames), np.nan)
+        cop_m, cop_sigma_m = [nothing, nothing], [nothing, nothing]
+        for axis in np.flatnonzero(plan.cop_measured):
+            place_m = bearing["position_m"][:, axis]
+            cop_m[axis] = _add_tiles(place_m * measured_n) / divisor_n
+            levers_m = place_m - cop_m[axis][:, None]
+            cop_sigma_m[axis] = np.sqrt(_add_tiles((levers_m * stated_n) ** 2)) / divisor_n
         flags = EstimateFlag.TILE_MISSING * np.isnan(force_n).any(axis=1)
         flags |= EstimateFlag.SATURATED * is_saturated.any(axis=1)
         flags |= EstimateFlag.COP_MASKED * is_masked
@@ -68,9 +79,9 @@ class LowPassEstimator:
         by_tile[:, :, places] = bounds_n, sigma_n
         bound_n = np.where(np.isnan(force_n).all(axis=1), np.nan, bound_n)
         columns: list[Any] = [frames.seq, frames.t_ns, gauge_kpa, *by_tile, grf_n, grf_sigma_n]
-        columns += [bound_n - BOUND_SIGMAS * np.sqrt(variance), x / divisor_n, y / divisor_n]
+        columns += [bound_n - BOUND_SIGMAS * np.sqrt(variance), *cop_m, *cop_sigma_m]
         return Estimates(
-            *[*columns, *[nothing] * 7, contact.astype(np.uint8), flags.astype(np.uint16)]
+            *[*columns, *[nothing] * 5, contact.astype(np.uint8), flags.astype(np.uint16)]
         )
 
     def finish(self) -> None:
@@ -107,6 +118,13 @@ class LowPassEstimator:
             last[1] = 1 if force_n >= on_n else 0 if force_n <= off_n else last[1]
             contact[i] = CONTACT_UNKNOWN if np.isnan(force_n) else last[1]
         return contact
+
+
+def _add_tiles(values: Floats) -> Floats:
+    total = np.zeros(len(values))
+    for column in values.T:  # in the same order for any batch
+        total = total + column
+    return total
 
 
 ESTIMATORS: dict[str, type[Estimator]] = {e.name: e for e in (ModelEstimator, LowPassEstimator)}

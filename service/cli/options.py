@@ -55,7 +55,7 @@ UnquantizedOption = Annotated[
 EstimatorOption = Annotated[
     str,
     typer.Option(
-        help="models; or low-pass: for comparison, the static curve and a low-pass of 5 ms."
+        help="Estimator: models; or, to compare, low-pass: static curve and low-pass of 5 ms."
     ),
 ]
 CaOption = Annotated[

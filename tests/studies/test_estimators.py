@@ -83,6 +83,36 @@ def test_a_missing_reading_is_nan_with_a_flag(
 
 
 @each_estimator
+def test_a_wrapped_count_is_a_missing_reading(make: type[Estimator]) -> None:
+    frames = loaded_frames(repeat_load([9, 9, 9, 9], 60))
+    frames.pressure_raw[30, 2] = 1000
+    found = run(make(plan_with("static")), frames)
+    wrapped = np.arange(60) == 30
+    assert np.array_equal(np.isnan(found.force_n[:, 2]), wrapped)
+    assert np.array_equal(found.estimate_flags & EstimateFlag.TILE_MISSING != 0, wrapped)
+
+
+@each_estimator
+def test_temperatures_that_are_read_now_and_then_are_held_between(make: type[Estimator]) -> None:
+    frames, plan = loaded_frames(repeat_load([9, 9, 9, 9], 60)), plan_with("static")
+    whole = run(make(plan), frames)
+    frames.temperature_raw[np.arange(60) % 10 != 0] = NOT_READ
+    batches = [frames.slice_rows(begin, begin + 7) for begin in range(0, 60, 7)]
+    np.testing.assert_array_equal(run(make(plan), *batches).grf_n, whole.grf_n)
+
+
+@each_estimator
+def test_a_row_of_tiles_has_no_cop_across_it(make: type[Estimator]) -> None:
+    info = array_at([(0.01 * i, 0.0, -0.15) for i in range(4)], servo=make_servo())
+    tiles = [newton_tile(serial) for serial in info.serials]
+    plan = newton_plan(info, models=("static",), lag_ms=10.0, tiles=tiles)
+    found = run(make(plan), loaded_frames(repeat_load([9, 9, 9, 9], 60)))
+    assert np.isfinite(found.cop_x_m[30:]).all()
+    assert np.isfinite(found.cop_sigma_x_m[30:]).all()
+    assert np.isnan(found.cop_y_m).all()
+
+
+@each_estimator
 def test_a_state_of_another_array_is_refused(make: type[Estimator]) -> None:
     state = make(plan_with("static")).state_dict()
     with pytest.raises(ValueError, match="not"):

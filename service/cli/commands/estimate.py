@@ -110,9 +110,13 @@ def estimate_command(
     from studies.estimators import get_estimator
 
     used = get_estimator(estimator)
-    if used is not ModelEstimator and models is not None:
-        raise UsageError(f"--estimator {estimator} and --models", expected="one or the other")
-    models = models if used is ModelEstimator else "static"
+    if used is not ModelEstimator:
+        if models is not None or lag_ms != OFFLINE_LAG_MS:
+            raise UsageError(
+                f"--estimator {estimator} takes no --models and no --lag-ms",
+                expected="one or the other",
+            )
+        models, lag_ms = "static", 0.0
     task = EstimateTask(
         calibration=calibration,
         models=None if models is None else tuple(models.split(",")),
@@ -150,6 +154,7 @@ def estimate_command(
                 "frames": result.frame_count,
                 "calibration_id": plan.calibration.id,
                 "models": plan.models,
+                "estimator": used.name,
                 "lag_ms": lag_ms,
                 "change": change,
                 "tare": {
@@ -162,9 +167,10 @@ def estimate_command(
             }
         )
         return
+    made_by = f"models {', '.join(plan.models)}" if used is ModelEstimator else used.name
     echo(
         f"{path}: {result.frame_count} frames, calibration {plan.calibration.name} "
-        f"({plan.calibration.id}), models {', '.join(plan.models)}, tare {plan.tare.source} "
+        f"({plan.calibration.id}), {made_by}, tare {plan.tare.source} "
         f"{result.tare_s[0]:.2f} to {result.tare_s[1]:.2f} s"
     )
     echo(f"look-ahead {lag_ms:g} ms{_format_change(change)}")

@@ -22,6 +22,7 @@ from devices.errors import DamagedFileError, FileFormatError, UsageError
 from devices.frames import ArrayInfo
 from service.estimation.estimate import ModelEstimator
 from service.estimation.model_sensitivity import OmittedModelEffect
+from service.estimation.pipeline.params import MODEL_NAMES
 from service.estimation.pipeline.plan import EstimationPlan
 from service.estimation.records import Columns
 from service.offline.estimate.preparation import (
@@ -194,7 +195,10 @@ class _FindingsObserver:
         self._found = EstimateSummarizer(
             has_truth=all(c.name in what.kept_columns for c in TRUTH_COLUMNS)
         )
-        self._asking = OmittedModelEffect(what.info, what.options.calibration, what.options.models)
+        options = what.options
+        # Another estimator could not take a further model.
+        models = options.models if options.estimator is ModelEstimator else MODEL_NAMES
+        self._asking = OmittedModelEffect(what.info, options.calibration, models)
 
     def observe(
         self, pieces: Iterable[BatchWithColumns], stream: EstimateStream

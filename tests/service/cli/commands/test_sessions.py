@@ -150,7 +150,12 @@ def test_another_estimator_is_noted_in_its_file_until_the_models_estimate_again(
     Path("paper.toml").write_text(preset)
     run("simulate", "--scene", "paper.toml", "--seconds", 3, "--out", "s.parquet").succeeds()
     low_pass = ("--estimator", "low-pass", "--out", "low.parquet")
-    assert run("estimate", "s.parquet", *low_pass, "--json").printed()["models"] == ["static"]
+    printed = run("estimate", "s.parquet", *low_pass, "--json").printed()
+    assert (printed["estimator"], printed["models"], printed["lag_ms"]) == (
+        "low-pass",
+        ["static"],
+        0,
+    )
     run("estimate", "low.parquet", "--out", "again.parquet").succeeds()
     notes = {}
     for name in ("s", "low", "again"):
