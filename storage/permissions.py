@@ -85,7 +85,8 @@ _OWNER_ONLY = 0o600
 
 
 class _Secrets(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    # An error must not show a secret.
+    model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True)
 
     secrets: dict[str, Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]]
 

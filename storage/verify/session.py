@@ -201,7 +201,12 @@ def _check_sums(problems: list[str], folder: Path, frames_sha256: str) -> None:
     path = folder / SUMS_NAME
     if problems or not os.path.lexists(path):
         return
-    if read_bytes_or_none(path) != format_sha256_sums(folder, frames_sha256):
+    try:
+        is_true = read_bytes_or_none(path) == format_sha256_sums(folder, frames_sha256)
+    except OSError as error:
+        problems.append(f"{CLOCK_NAME}: cannot be read: {error.strerror}")
+        return
+    if not is_true:
         problems.append(f"{SUMS_NAME} has other hashes than the files")
 
 

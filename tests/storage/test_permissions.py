@@ -106,10 +106,11 @@ def test_secrets_are_read_back_and_only_by_their_owner(secrets: dict[str, str]) 
 
 
 @pytest.mark.parametrize(
-    "content", [b'{"secrets":[]}', b'{"secrets":{"leg":5}}', b'{"secrets":{"a":"5"}}']
+    "content", [b'{"secrets":[]}', b'{"secrets":{"leg":5}}', b'{"secrets":{"a":"deadbeef"}}']
 )
 def test_another_file_is_no_file_of_secrets(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / SECRETS_NAME
     write_checksummed_json(path, content)
-    with pytest.raises(FileFormatError, match=f"{SECRETS_NAME}: written by another version"):
+    with pytest.raises(FileFormatError, match=r"secrets\.json: written by another") as found:
         read_secrets_or_empty(path)
+    assert "deadbeef" not in f"{found.value}{found.value.__cause__}"
