@@ -1,4 +1,4 @@
-"""Estimators by name: that of the models, and a plain low-pass to measure their gain by.
+"""Estimators by name: that of the models, and a plain low-pass to compare it with.
 
 The low-pass has no model but the static curve, whose force it smooths tile by tile, without
 look-ahead. A missing reading is NaN, and the low-pass starts again after it.
@@ -22,7 +22,7 @@ from service.estimation.pipeline.plan import SIGNIFICANCE_SIGMAS, EstimationPlan
 from service.estimation.pipeline.smoothing_stage import BOUND_SIGMAS
 from service.estimation.records import Columns, Estimates
 
-TIME_CONSTANT_S = 0.005  # two or three readings: shorter than a step, longer than their noise
+TIME_CONSTANT_S = 0.005  # two or three readings: short against a footstep
 
 
 class LowPassEstimator:
@@ -34,7 +34,7 @@ class LowPassEstimator:
         self.plan = plan
         unknown_n = np.full(len(plan.load_bearing_columns), np.nan)  # there the low-pass starts
         tiles = plan.info.tiles
-        # The last frame's forces; its instant in ns, and its contact; the last temperatures.
+        # The last smoothed forces; their instant in ns, and contact; the last temperatures.
         self._state: Columns = {"force_n": unknown_n, "last": np.zeros(2, np.int64)}
         self._state["held"] = np.full(len(tiles), NOT_READ, get_raw_type(tiles))
         self._state["held_ns"] = np.zeros(len(tiles), np.int64)
@@ -48,11 +48,11 @@ class LowPassEstimator:
         frames, held = hold_temperature(frames, held)
         state["held"], state["held_ns"] = held.temperature_raw, held.t_mono_ns
         kpa = compensation.compute_usable_kpa(frames)
-        # A count below the chip's range has wrapped.
+        # A reading below the rated range is invalid: the count of an MPL115A2 has wrapped.
         gauge_kpa = np.where(kpa >= compensation.min_kpa, kpa, np.nan) - plan.tare.baseline_kpa
         static = compute_forces(curves, np.ascontiguousarray(gauge_kpa[:, places]))
-        still_kpa = np.hypot(bearing["noise_kpa"], np.sqrt(bearing["baseline_variance"]))
-        sigma_n = gain * np.hypot(static.slope_n_per_kpa * still_kpa, static.fit_sigma_n)
+        unloaded_sigma_kpa = np.hypot(bearing["noise_kpa"], np.sqrt(bearing["baseline_variance"]))
+        sigma_n = gain * np.hypot(static.slope_n_per_kpa * unloaded_sigma_kpa, static.fit_sigma_n)
         force_n = self._smooth(frames.t_mono_ns.tolist(), gain * static.force_n)
         is_saturated = gauge_kpa[:, places] > curves["range_high_kpa"]
         bounds_n = np.where(is_saturated, force_n - BOUND_SIGMAS * sigma_n, force_n)

@@ -103,17 +103,17 @@ class PressureChip:
         name: name in scenes and descriptions of arrays.
         addresses: I2C addresses that a part may have, the usual one first.
         min_kpa: begin of the rated range.
-        max_kpa: its end, from which readings are saturated.
+        max_kpa: end of the rated range; a part may read somewhat beyond it.
         raw_type: type of a column of counts, unsigned.
         counts_max: largest count of pressure and of temperature.
-        wrap_counts: number of pressure counts after which they wrap beyond the range; 0: never.
+        wrap_counts: modulus of pressure counts, which wrap beyond the rated range; 0: they do not.
         counts_per_kelvin: temperature counts per kelvin.
         temperature_raw_at_25_degc: temperature counts at 25 degC; an estimate where the chip is not
             calibrated for it.
         temperature_raw_usual: temperature counts of a foot in use.
         conversion_typical_ns: typical time of a conversion.
         conversion_max_ns: longest time, for a part that is not measured.
-        sample_delay_divisor: divisor of the conversion time for the sample instant.
+        sample_delay_divisor: conversion time over the delay from its start to the sample instant.
         pressure_bytes: bytes of a read of the pressure alone.
         counts_bytes: bytes of a read of pressure and temperature.
         readable_register: first of twelve registers whose reading changes nothing.

@@ -45,7 +45,7 @@ def check_chips(info: ArrayInfo) -> ArrayInfo:
     """Check that this version knows the chips of an array, and return it.
 
     Raises:
-        UsageError: a tile has an unknown kind of chip, or an address or registers of none.
+        UsageError: the chip of a tile is unknown, or its address or registers are not the chip's.
     """
     for tile in info.tiles:
         chip = get_chip(tile.chip)

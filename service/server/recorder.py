@@ -1,7 +1,7 @@
 """Recording on a server: start, stop, abandon, delete and restore sessions, seal and report them.
 
-Starting and stopping only note numbers and times; the frames are in the journals anyway. What
-becomes of a session is decided in `service.sessions.lifecycle`; here its steps are saved and done.
+Starting and stopping only store numbers and times; the frames are in the journals anyway.
+`service.sessions.lifecycle` decides the next state of a session; this module saves it and acts.
 Sealing runs in a thread and is retried if the disk is full.
 """
 
@@ -140,7 +140,7 @@ class Recorder:
     def stop_session(self, session_id: str) -> Session:
         """Stop a session now; it is sealed as soon as all its frames are here.
 
-        A stopped session is unchanged: a repeated stop is the same stop.
+        To stop a stopped session has no effect.
 
         Raises:
             UnknownError: no session has this id.
@@ -178,7 +178,7 @@ class Recorder:
         Raises:
             UnknownError: no session has this id.
             ChangedError: its revision is another one.
-            StateError: it is being recorded, or sealed.
+            StateError: it is being recorded, or is being sealed now.
             StorageError: it cannot be moved.
         """
         session = self._store.get_session(session_id)
@@ -198,11 +198,11 @@ class Recorder:
             UnknownError: it is not in the trash.
             StorageError: it cannot be moved.
         """
-        book = self._store
-        book.cache(self._with_clock_offsets(book.trash.restore(session_id, book.folder)))
+        store = self._store
+        store.cache(self._with_clock_offsets(store.trash.restore(session_id, store.folder)))
         self.advance_unsealed_sessions()
-        book.on_change(book.get_session(session_id))
-        return book.get_session(session_id)
+        store.on_change(store.get_session(session_id))
+        return store.get_session(session_id)
 
     def extend_node_sessions(self, node: ServerNode) -> None:
         """Extend the unsealed sessions of a node into the streams that its hello lists.
@@ -214,7 +214,7 @@ class Recorder:
             StorageError: a session cannot be saved.
         """
         for session in self._store.list_unsealed(node.name):
-            # The end of others is known: to save them can wait, also if the disk is full.
+            # The ends of the others are known: with a full disk, saving them can wait.
             if session.state != "sealing" and session.parts[-1].seq_last is None:
                 self._apply_node_change(session)
 
@@ -270,7 +270,9 @@ class Recorder:
         lasted_s = (end_t_ns - session.started_t_ns) * 1e-9
         return max(frame_count / node.last_info.nominal_rate_hz, lasted_s)
 
-    def pending_reason(self, session: Session, ledger: Ledger) -> Literal["frames", "end"] | None:
+    def find_pending_reason(
+        self, session: Session, ledger: Ledger
+    ) -> Literal["frames", "end"] | None:
         """Return the reason why a session is pending: missing frames, or an unknown end."""
         if session.state != "pending":
             return None
@@ -295,7 +297,7 @@ class Recorder:
             unquantized=self._unquantized,
         )
 
-    def needed_frames(self, node_name: str) -> dict[str, Intervals]:
+    def collect_needed_frames(self, node_name: str) -> dict[str, Intervals]:
         """Return the frames that unsealed sessions of a node need in its journals, by stream id.
 
         A session in the trash can be restored, so its frames count as well.
@@ -312,10 +314,10 @@ class Recorder:
         )
 
     def make_retention_request(self, node_name: str) -> RetentionMessage:
-        """Return `needed_frames` as the message to the node."""
+        """Return `collect_needed_frames` as the message to the node."""
         streams = tuple(
             StreamNumbers(stream_id=stream_id, numbers=to_open_pairs(numbers))
-            for stream_id, numbers in sorted(self.needed_frames(node_name).items())
+            for stream_id, numbers in sorted(self.collect_needed_frames(node_name).items())
         )
         return RetentionMessage(streams=streams, recording=bool(self.list_recording(node_name)))
 
@@ -346,7 +348,8 @@ class Recorder:
     def cache_missing_clock_offsets(self, node: ServerNode) -> None:
         """Add missing clock measurements to a node's unsealed sessions, in memory.
 
-        Those are missing after a first contact, and for streams into which a session was extended.
+        Measurements are missing after a first contact, and for streams into which a session was
+        extended.
         """
         for session in self._store.list_unsealed(node.name):
             if session.state != "sealing":
@@ -357,9 +360,9 @@ class Recorder:
     ) -> None:
         """Record a plausible measurement of a node's clock, in its stream and its sessions.
 
-        The stream's log has it already; sessions are saved with their next change. A measurement
-        whose server time is far from the present time is dropped, as is one that is far from the
-        node's clock as hello stated it.
+        The stream's log stores it at once; sessions are saved with their next change. It is
+        dropped if its server time is far from the present time, or its node time far from the
+        clock that the hello stated.
         """
         stated_t_ns = row.t_mono_ns + node.last_info.utc_offset_ns + row.server_minus_node_ns
         if abs(stated_t_ns - now_t_ns) > CLOCK_ERROR_MAX_NS + row.uncertainty_ns:
@@ -435,7 +438,7 @@ class Recorder:
                 self._retry_after_s[session.id] = time.monotonic() + _RETRY_S
                 return
             self._failures.pop(session.id, None)
-        if session.state == "recording":  # it changes with its node's hello only
+        if session.state == "recording":  # changes only at its node's hello
             return
         if session.state == "sealing" or self._apply_node_change(session).action == "seal":
             self._sealing[session.id] = asyncio.create_task(self._seal(session.id))
@@ -452,7 +455,7 @@ class Recorder:
             await asyncio.sleep(_COMPILE_POLL_S)
         try:
             session = store.get_session(session_id)
-            self._nodes.get(session.node)  # of an unknown node nothing is known
+            self._nodes.get(session.node)  # raises if it is unknown: nothing is known of its frames
             # The disk may have lost frames that it had accepted: the node has to send them again.
             step = self._apply(session, NodeChange())
             if step.action != "seal":

@@ -179,7 +179,7 @@ class Server:
         for node in list(self.nodes):
             with self._isolate_errors(f"node {node.name}, deleting unneeded journals"):
                 while node.delete_old_frames_and_up_to_one_ended_journal(
-                    self.recorder.needed_frames(node.name)
+                    self.recorder.collect_needed_frames(node.name)
                 ):
                     await asyncio.sleep(0)
                     if time.monotonic() >= until_s:

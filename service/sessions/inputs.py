@@ -19,7 +19,7 @@ from devices.frames import ArrayInfo, FrameBatch
 from service.estimation import OFFLINE_LAG_MS
 from service.estimation.calibration import Calibration
 from service.estimation.tare.tare import Tare
-from service.sessions.parts import RATE_MAX_HZ, NodeFacts, SessionStream, find_likely_end
+from service.sessions.parts import RATE_MAX_HZ, NodeFacts, SessionStream, close_at_likely_end
 from service.sessions.tares import TareHistory
 from storage.clock.table import ClockTable, StreamClockFacts, group_rows_by_stream_in_given_order
 from storage.intervals import NO_END
@@ -121,7 +121,7 @@ def make_inputs(
         default_array: array if no stream describes one.
         unquantized: True: estimates are not rounded.
     """
-    session = find_likely_end(session, node)
+    session = close_at_likely_end(session, node)
     streams = node.collect_streams(session)
     infos = [streams[part.stream_id].info for part in session.parts]
     info = next(

@@ -12,10 +12,10 @@ recording -- `Stop` --> pending -- all frames are here --> sealing -- `Sealed` -
 | `Edit` | same | same | same | same |
 | `Delete` | refused | same | same | same |
 
-Frames that come or are lost, a restart of the node or of the server and a crash are no events of
-their own: the needs of a session follow from its node's present facts (`NodeFacts`), so the next
-`NodeChange` makes up for a missed one. The caller saves the sessions of a `Step`, then does its
-action. Server, node alone and recovery call the same function; it does nothing itself.
+Arriving or lost frames, restarts and crashes are no events of their own: the needs of a session
+follow from the present facts of its node (`NodeFacts`), so the next `NodeChange` makes up for a
+missed one. The caller saves the sessions of a `Step`, then does its action. Server, node alone and
+recovery call the same function; it has no side effects.
 
 The trash is a folder, no state. A session whose `session.json` is damaged has no state: it is
 rebuilt from its sealed file, or left out (`service.sessions.sealing`).
@@ -35,13 +35,13 @@ from service.estimation.calibration import Calibration
 from service.server_clock import server_utc_ns
 from service.sessions.parts import (
     NodeFacts,
+    close_at_likely_end,
     close_at_stop_if_passed,
     close_at_stream_end_or_newest_frame,
     close_part,
     close_unfinished,
     find_begin_t_ns,
     find_later_streams,
-    find_likely_end,
     has_begun_before_stop,
     reopen_earlier_part,
 )
@@ -128,7 +128,7 @@ class Step:
         return (*reversed(self.continuations), self.session) if self.is_changed else ()
 
 
-NO_FACTS = NodeFacts()
+_NO_FACTS = NodeFacts()
 
 
 def create_session(
@@ -164,7 +164,7 @@ def create_session(
     return Session(**facts | fields)
 
 
-def apply_event(session: Session, event: Event, node: NodeFacts = NO_FACTS) -> Step:
+def apply_event(session: Session, event: Event, node: NodeFacts = _NO_FACTS) -> Step:
     """Return the step of a session at an event; the table is above.
 
     Args:
@@ -174,6 +174,7 @@ def apply_event(session: Session, event: Event, node: NodeFacts = NO_FACTS) -> S
 
     Raises:
         StateError: the session's state refuses the event.
+        ValueError: an `Edit` of a field that people do not change.
         DamagedFramesError: the frames at its end are damaged; nothing has changed.
     """
     match session.state, event:
@@ -189,18 +190,18 @@ def apply_event(session: Session, event: Event, node: NodeFacts = NO_FACTS) -> S
         case "recording" | "sealing", Resume():
             return Step(_resume(session), is_changed=True)
         case "pending", Abandon():
-            return _settle(session, replace(node, frames_to_come="abandoned"))
+            return _update_parts_and_state(session, replace(node, frames_to_come="abandoned"))
         case "sealing", Sealed(sealed):
-            # People may have edited it meanwhile.
-            people = {name: getattr(session, name) for name in _EDITABLE}
+            # A person may have edited the session during sealing.
+            user_fields = {name: getattr(session, name) for name in _EDITABLE}
             has_other_markers = session.markers != sealed.markers
             return Step(
-                sealed.model_copy(update=people),
+                sealed.model_copy(update=user_fields),
                 is_changed=True,
                 action="write_markers" if has_other_markers else None,
             )
         case "recording" | "pending" | "sealing", NodeChange():
-            return _settle(session, node)
+            return _update_parts_and_state(session, node)
         case ("sealed", NodeChange()) | (_, Stop()) | ("pending" | "sealing" | "sealed", Delete()):
             return Step(session)
     raise _make_refusal(session, event)
@@ -246,8 +247,8 @@ def _resume(session: Session) -> Session:
     return session.model_copy(update=update)
 
 
-def _settle(before: Session, node: NodeFacts) -> Step:
-    """Let parts follow the node's streams, find the end, and set sealing or pending."""
+def _update_parts_and_state(before: Session, node: NodeFacts) -> Step:
+    """Extend or close the parts, and set the state that follows: pending, sealing, or the same."""
     session, continuations = before, []
     is_recorded = before.state == "recording" and node.frames_to_come == "possible"
     if node.frames_to_come != "possible":
@@ -392,7 +393,7 @@ def compute_present_ledger(session: Session, node: NodeFacts) -> Ledger:
     if session.state == "sealed" and session.ledger is not None:
         return session.ledger
     is_finished = session.stopped_t_ns is not None and session.parts[-1].seq_last is not None
-    likely = find_likely_end(session, node)
+    likely = close_at_likely_end(session, node)
     states = mark_damaged_and_abandoned_lost(likely, node.collect_streams(likely))
     return compute_ledger(likely.parts, states, has_all_parts=is_finished)
 

@@ -180,9 +180,9 @@ class NodeFacts:
         return self.stream_ids[-1] if self.stream_ids else None
 
     def get_stream(self, session: Session, stream_id: str) -> SessionStream:
-        """Return a stream's facts, with its offset as well as a session has it.
+        """Return a stream's facts; a missing offset of its clock is taken from the session.
 
-        The node may have all frames of an unknown stream until it has reported its streams.
+        Until the node has reported its streams, all frames of an unknown one are obtainable.
         """
         stream = self.find_stream(stream_id)
         if stream is None:
@@ -223,14 +223,16 @@ def close_at_stop_if_passed(
     for part in session.parts:
         if part.seq_last is None:
             stream = node.get_stream(session, part.stream_id)
-            last = _seq_at_stop(session, part, stream, waiting=leave_open_while_missing)
+            last = _find_last_seq_at_stop(
+                session, part, stream, leave_open_while_missing=leave_open_while_missing
+            )
             if last is not None:
                 session = close_part(session, part, last)
     return session
 
 
-def find_likely_end(session: Session, node: NodeFacts) -> Session:
-    """Return a session with its likely end, while frames close to it may still come."""
+def close_at_likely_end(session: Session, node: NodeFacts) -> Session:
+    """Return the session closed at its likely end; frames close to the stop may still come."""
     with suppress(FootTileError):  # the frames at the stop are damaged
         return close_at_stop_if_passed(session, node)
     return session
@@ -244,7 +246,7 @@ def close_at_stream_end_or_newest_frame(session: Session, node: NodeFacts) -> Se
             newest = stream.stored.last
             beyond = 0 if newest is None else newest + 1
             if stream.next_seq is None:
-                unsent = _max_unsent_frames(session, stream, node)
+                unsent = _bound_unsent_frames(session, stream, node)
                 session = close_part(session, part, beyond - 1, unsent)
             else:
                 # Frames that a node lost in a power failure may be stored here.
@@ -423,20 +425,22 @@ def bound_lost_tail_frames(stream: SessionStream) -> int:
     return max(stream.max_lost_tail_frames, compute_max_lost_tail_frames(_rate_hz(stream)))
 
 
-def _seq_at_stop(
-    session: Session, part: Part, stream: SessionStream, *, waiting: bool
+def _find_last_seq_at_stop(
+    session: Session, part: Part, stream: SessionStream, *, leave_open_while_missing: bool
 ) -> int | None:
     """Return the last frame of a stream before the stop; None if the stream has not passed it."""
     if session.stopped_t_ns is None or stream.offset_ns is None:
         return None
     stop_t_ns = session.stopped_t_ns - stream.offset_ns
-    found = stream.find_seqs_around(stop_t_ns, min_seq=part.seq_first, may_be_stale=waiting)
+    found = stream.find_seqs_around(
+        stop_t_ns, min_seq=part.seq_first, may_be_stale=leave_open_while_missing
+    )
     if found is None:
         return None
     last, after = found
     if after == last + 1:
         return last
-    if waiting and stream.obtainable & Intervals([(last + 1, after - 1)]):
+    if leave_open_while_missing and stream.obtainable & Intervals([(last + 1, after - 1)]):
         return None
     # The stop lies among lost frames: the rate gives the number of those after it.
     after_t_ns = stream.find_batch_t_ns_near(after, at_or_before=False) or stop_t_ns
@@ -444,17 +448,17 @@ def _seq_at_stop(
     return min(after - 1, max(last, after - late))
 
 
-def _max_unsent_frames(session: Session, stream: SessionStream, node: NodeFacts) -> int:
-    """Return the upper bound of frames after the last known one.
+def _bound_unsent_frames(session: Session, stream: SessionStream, node: NodeFacts) -> int:
+    """Return the upper bound of frames after the newest known one.
 
-    Until the stop, on a running server the present time if that is earlier; if neither is known,
-    until the newest was synced.
+    The stream is assumed to have run at its rate until the stop or, on a running server, until now
+    if that is earlier. With neither, the bound is that of a power failure.
     """
     limits_ns = [session.stopped_t_ns] if session.stopped_t_ns is not None else []
     limits_ns += [node.now_t_ns] if node.is_running else []
     if not limits_ns:
         return bound_lost_tail_frames(stream)
-    # Arrival times of delayed frames are too late.
+    # Prefer the frame's own time: a delayed frame arrives late.
     newest_t_ns, seen_t_ns = (
         stream.find_batch_t_ns_near(NO_END, at_or_before=True),
         stream.last_seen_t_ns,

@@ -7,15 +7,13 @@ import math
 from pathlib import Path
 from typing import Literal
 
-import pydantic
-
 import devices
 import service
 import storage
 from devices.errors import FootTileError
 from devices.types import StrictModel
 from service.offline.accuracy import CoverageCount
-from storage.documents import read_checksummed_json, write_checksummed_json
+from storage.documents import read_document, write_document
 
 Seeds = Literal["development", "judgement"]
 FIRST_SEEDS: dict[Seeds, int] = {"development": 1_000_000, "judgement": 2_000_000}
@@ -148,12 +146,12 @@ def write_result(folder: Path, result: ArrayResult) -> None:
         StorageError: the disk is full or not writable.
     """
     path = get_result_path(folder, result.seeds, result.number)
-    write_checksummed_json(path, result.model_dump_json(indent=1).encode())
+    write_document(path, result)
 
 
 def read_result(path: Path) -> ArrayResult | None:
     """Read a result file; None if it is missing or damaged."""
     try:
-        return ArrayResult.model_validate_json(read_checksummed_json(path))
-    except (FileNotFoundError, FootTileError, pydantic.ValidationError):
+        return read_document(path, ArrayResult)
+    except (FileNotFoundError, FootTileError):
         return None

@@ -18,7 +18,7 @@ from service.estimation.records import KernelRecord, RecordArray
 
 
 @dataclass(frozen=True)
-class BearingTiles:
+class LoadBearingTiles:
     """Load-bearing tiles of an array, from which models make their parameters; arrays (tiles,).
 
     Attributes:
@@ -50,7 +50,7 @@ class BearingTiles:
 
 
 class ModelParams(KernelRecord):
-    """Parameters of a model for a tile; all but `is_named` are of load-bearing tiles only."""
+    """Parameters of a model for a tile; all but `is_used` are of load-bearing tiles only."""
 
     effect: ClassVar[EffectName | None] = None
     """Effect of a calibration that determines the parameters; None: there are none to determine."""
@@ -58,10 +58,10 @@ class ModelParams(KernelRecord):
     """True: every tile needs the effect, since the correction is as large as any load. Else a tile
     may lack it; its uncertainty then contains the missing correction."""
 
-    is_named: int  # 1: the scene names the model
+    is_used: int  # 1: the estimate uses the model
 
     @classmethod
-    def make(cls, tiles: BearingTiles) -> RecordArray[Self]:
+    def make(cls, tiles: LoadBearingTiles) -> RecordArray[Self]:
         """Make the parameters of load-bearing tiles, (tiles,)."""
         return cls.array(len(tiles.calibrations))
 

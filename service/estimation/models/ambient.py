@@ -14,7 +14,7 @@ import numpy as np
 
 from devices.errors import UsageError
 from devices.jit import jit_cached
-from service.estimation.models import BearingTiles, ModelParams
+from service.estimation.models import LoadBearingTiles, ModelParams
 from service.estimation.records import KernelRecord, RecordArray
 
 SMOOTHING_S = 0.03  # long against noise, short against a foot that sinks in
@@ -32,7 +32,7 @@ class AmbientParams(ModelParams):
     relative_sigma: float  # its standard uncertainty, relative
 
     @classmethod
-    def make(cls, tiles: BearingTiles) -> RecordArray[Self]:
+    def make(cls, tiles: LoadBearingTiles) -> RecordArray[Self]:
         """Make the parameters of load-bearing tiles, (tiles,).
 
         Raises:

@@ -23,7 +23,7 @@ import numpy as np
 from devices.jit import jit_cached
 from service.estimation.effects import MISFIT_MIN, parameter_values
 from service.estimation.foot import LONG_GAP_NS
-from service.estimation.models import BearingTiles, ModelParams
+from service.estimation.models import LoadBearingTiles, ModelParams
 from service.estimation.records import KernelRecord, RecordArray
 
 RESTART_TIME_CONSTANTS = 5.0
@@ -46,7 +46,7 @@ class GasParams(ModelParams):
     misfit: float  # uncertain part of the correction
 
     @classmethod
-    def make(cls, tiles: BearingTiles) -> RecordArray[Self]:
+    def make(cls, tiles: LoadBearingTiles) -> RecordArray[Self]:
         """Make the parameters of load-bearing tiles, (tiles,)."""
         found = [tile.effects.gas for tile in tiles.calibrations]
         known = [effect for effect in found if effect is not None]

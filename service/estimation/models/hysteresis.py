@@ -20,7 +20,7 @@ from devices.arrays import Floats
 from devices.errors import CalibrationError
 from devices.jit import jit_cached
 from service.estimation.effects import parameter_values
-from service.estimation.models import BearingTiles, ModelParams, flow
+from service.estimation.models import LoadBearingTiles, ModelParams, flow
 from service.estimation.models.flow import FlowParams, FlowState
 from service.estimation.records import KernelRecord, RecordArray
 
@@ -43,7 +43,7 @@ class HysteresisParams(ModelParams):
     flow: FlowParams
 
     @classmethod
-    def make(cls, tiles: BearingTiles) -> RecordArray[Self]:
+    def make(cls, tiles: LoadBearingTiles) -> RecordArray[Self]:
         """Make the parameters of load-bearing tiles, (tiles,).
 
         Raises:

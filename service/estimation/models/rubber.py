@@ -20,7 +20,7 @@ from devices.arrays import Floats
 from devices.jit import jit_cached
 from service.estimation.effects import MISFIT_MIN, TERMS_MAX, parameter_values
 from service.estimation.foot import LONG_GAP_NS
-from service.estimation.models import BearingTiles, ModelParams
+from service.estimation.models import LoadBearingTiles, ModelParams
 from service.estimation.records import KernelRecord, RecordArray
 
 
@@ -34,7 +34,7 @@ class RubberParams(ModelParams):
     n_terms: int  # largest number of terms of any tile
 
     @classmethod
-    def make(cls, tiles: BearingTiles) -> RecordArray[Self]:
+    def make(cls, tiles: LoadBearingTiles) -> RecordArray[Self]:
         """Make the parameters of load-bearing tiles, (tiles,)."""
         found = [tile.effects.rubber for tile in tiles.calibrations]
         terms = [0 if effect is None else len(effect.part) for effect in found]
@@ -51,7 +51,7 @@ class RubberParams(ModelParams):
         return float(params["tau_s"][params["creep_fraction"] > 0.0].max())
 
 
-def collect_misfits(tiles: BearingTiles) -> Floats:
+def collect_misfits(tiles: LoadBearingTiles) -> Floats:
     """Return the uncertain part of each tile's corrections of creep and loop."""
     found = [tile.effects.rubber for tile in tiles.calibrations]
     return np.array([0.0 if e is None else max(e.misfit, MISFIT_MIN) for e in found])

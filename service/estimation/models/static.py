@@ -22,7 +22,7 @@ from service.estimation.calibration import (
     LOOP_HALF_WIDTH_FORCE_N,
     TileCalibration,
 )
-from service.estimation.models import BearingTiles, ModelParams
+from service.estimation.models import LoadBearingTiles, ModelParams
 from service.estimation.records import RecordArray
 
 
@@ -54,7 +54,7 @@ class StaticParams(ModelParams):
     curve_misfit_n: float
 
     @classmethod
-    def make(cls, tiles: BearingTiles) -> RecordArray[Self]:
+    def make(cls, tiles: LoadBearingTiles) -> RecordArray[Self]:
         """Make the curves of load-bearing tiles, of settled forces if `rubber` is named."""
         return cls.from_calibrations(tiles.calibrations, use_settled_curve="rubber" in tiles.models)
 

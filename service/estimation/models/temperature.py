@@ -21,7 +21,7 @@ import numpy as np
 from devices.arrays import Floats, Times
 from devices.jit import jit_cached
 from service.estimation.effects import parameter_values
-from service.estimation.models import BearingTiles, ModelParams
+from service.estimation.models import LoadBearingTiles, ModelParams
 from service.estimation.records import KernelRecord, RecordArray
 
 STARTUP_S = 0.5
@@ -52,7 +52,7 @@ class TemperatureParams(ModelParams):
     noise_counts: float
 
     @classmethod
-    def make(cls, tiles: BearingTiles) -> RecordArray[Self]:
+    def make(cls, tiles: LoadBearingTiles) -> RecordArray[Self]:
         """Make the parameters of load-bearing tiles, (tiles,)."""
         found = [e for tile in tiles.calibrations if (e := tile.effects.temperature) is not None]
         lag_s = parameter_values(e.lag_s for e in found)

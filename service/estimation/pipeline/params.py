@@ -1,8 +1,8 @@
 """Parameters of an estimate as records for compiled code: of the models, the foot and the tiles.
 
-`ModelRegistry` lists the models in the order of their use. Those up to `skew` belong to the sample
-stage, reading by reading; the others to the smoothing stage, within the look-ahead. Fields `has_`
-and `is_` are 0 or 1.
+`ModelParamsByName` lists the models in the order of their use. Those up to `skew` belong to the
+sample stage, reading by reading; the others to the smoothing stage, within the look-ahead. Fields
+`has_` and `is_` are 0 or 1.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from devices.arrays import Floats
 from devices.errors import CalibrationError, UsageError
 from service.estimation.fault_detection.fault_limits import FaultParams
 from service.estimation.fault_detection.stuck import RunLimits
-from service.estimation.models import BearingTiles, ModelParams
+from service.estimation.models import LoadBearingTiles, ModelParams
 from service.estimation.models.ambient import AmbientParams
 from service.estimation.models.denoise import WINDOW_READINGS_MAX
 from service.estimation.models.gas import GasParams
@@ -26,7 +26,7 @@ from service.estimation.pipeline.saturation import SaturationParams
 from service.estimation.records import KernelRecord, RecordArray
 
 
-class ModelRegistry(KernelRecord):
+class ModelParamsByName(KernelRecord):
     """Parameters of a tile's models; one without further parameters has `ModelParams`."""
 
     unwrap: ModelParams
@@ -40,7 +40,7 @@ class ModelRegistry(KernelRecord):
     rubber: RubberParams
 
 
-MODELS: Mapping[str, type[ModelParams]] = ModelRegistry.fields()
+MODELS: Mapping[str, type[ModelParams]] = ModelParamsByName.fields()
 """All models by name, in the order of their use."""
 MODEL_NAMES = tuple(MODELS)
 
@@ -60,7 +60,7 @@ def check_known_models_with_static(models: Sequence[str]) -> None:
         raise UsageError("without the model 'static' there is no force", remedy="Add it")
 
 
-def make_model_params(tiles: BearingTiles) -> dict[str, RecordArray[Any]]:
+def make_model_params(tiles: LoadBearingTiles) -> dict[str, RecordArray[Any]]:
     """Make the parameters of the models in use, by name in the order of their use, (tiles,).
 
     Raises:
@@ -74,7 +74,7 @@ def make_model_params(tiles: BearingTiles) -> dict[str, RecordArray[Any]]:
     return {name: model.make(tiles) for name, model in named.items()}
 
 
-def _reject_undetermined(name: str, model: type[ModelParams], tiles: BearingTiles) -> None:
+def _reject_undetermined(name: str, model: type[ModelParams], tiles: LoadBearingTiles) -> None:
     if model.effect is None:
         return
     # ANY: fields of Effects
@@ -132,7 +132,7 @@ class FootParams(KernelRecord):
     variance_inflation: Annotated[Floats, (WINDOW_READINGS_MAX + 1,)]  # of the sum of tiles
 
 
-class TileParams(ModelRegistry):
+class TileParams(ModelParamsByName):
     """Parameters of a tile and of its models; those of models that are not named are not read."""
 
     is_load_bearing: int

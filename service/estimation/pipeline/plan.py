@@ -25,7 +25,7 @@ from service.estimation.foot.geometry import (
     compute_tilt_loss,
     fit_tile_axis_angles_rad,
 )
-from service.estimation.models import BearingTiles, denoise, rubber
+from service.estimation.models import LoadBearingTiles, denoise, rubber
 from service.estimation.models.static import StaticParams
 from service.estimation.pipeline.params import (
     MODELS,
@@ -125,7 +125,7 @@ def make_plan(
         raise UsageError("every tile of the array is a reference tile: nothing bears load")
     entries = calibration.get_tiles_or_wildcard([info.tiles[i].serial for i in bearing])
     compensation = Compensation(info.tiles)
-    seen = BearingTiles(
+    model_inputs = LoadBearingTiles(
         calibrations=entries,
         calibration_label=f"calibration {calibration.name} ({calibration.id})",
         models=models,
@@ -136,7 +136,7 @@ def make_plan(
         step_s=1.0 / info.nominal_rate_hz,
         has_bare_tile=len(bearing) < len(info.tiles),
     )
-    by_model = make_model_params(seen)
+    by_model = make_model_params(model_inputs)
     for i, entry in zip(bearing, entries, strict=True):
         tile = info.tiles[i]
         if entry.registers not in (None, tile.registers):
@@ -144,11 +144,11 @@ def make_plan(
                 f"tile {tile.serial} is not the part that was calibrated: its chip has the "
                 f"registers {tile.registers}, the calibrated one "
                 f"{entry.registers}",
-                where=seen.calibration_label,
+                where=model_inputs.calibration_label,
                 remedy="Press this tile on the test rig and calibrate it, or correct the serial",
             )
     tiles = TileParams.array(len(info.tiles))
-    tiles[bearing] = _make_bearing_params(info, calibration, tare, bearing, seen, by_model)
+    tiles[bearing] = _make_bearing_params(info, calibration, tare, bearing, model_inputs, by_model)
     faults, run_limits = make_fault_params(
         info,
         compensation,
@@ -173,7 +173,7 @@ def make_plan(
     for name, column in of_all.items():
         tiles[name] = column
     for name in by_model:
-        tiles[name]["is_named"] = 1
+        tiles[name]["is_used"] = 1
     normals, offsets_m = compute_hull_half_planes(tiles["position_m"][bearing, :2])
     foot = _make_foot_params(info, calibration, tare, models, round(lag_ms * 1e6))
     foot["run_limits"] = run_limits
@@ -248,16 +248,19 @@ def _make_bearing_params(
     calibration: Calibration,
     tare: Tare,
     bearing: npt.NDArray[np.intp],
-    seen: BearingTiles,
+    model_inputs: LoadBearingTiles,
     by_model: dict[str, RecordArray[Any]],
 ) -> RecordArray[TileParams]:
     """Make the parameters of the load-bearing tiles, but for those of all tiles."""
-    entries, curves = seen.calibrations, by_model["static"]
+    entries, curves = model_inputs.calibrations, by_model["static"]
     chip_max_kpa = np.array(
         [
             _compute_chip_max_kpa(*each)
             for each in zip(
-                entries, seen.rated_max_kpa.tolist(), seen.baseline_kpa.tolist(), strict=True
+                entries,
+                model_inputs.rated_max_kpa.tolist(),
+                model_inputs.baseline_kpa.tolist(),
+                strict=True,
             )
         ]
     )
@@ -280,10 +283,10 @@ def _make_bearing_params(
         saturation=make_saturation_params(
             curves,
             by_model["gas"]["gamma"] if "gas" in by_model else np.ones(len(bearing)),
-            seen.baseline_kpa,
+            model_inputs.baseline_kpa,
             chip_max_kpa,
         ),
-        dome_misfit=rubber.collect_misfits(seen),
+        dome_misfit=rubber.collect_misfits(model_inputs),
         position_m=positions_m,
         mount_gain=[1.0 if gain is None else gain.value for gain in gains],
         mount_gain_sigma=[0.0 if gain is None else gain.sigma for gain in gains],

@@ -160,7 +160,7 @@ def _has_temperature_changed(tile_params: TileParams, sample: TileSample) -> boo
     With a model for the temperature it may.
     """
     moved_counts = abs(sample.temperature_raw - tile_params.tare_counts)
-    is_checked = tile_params.is_load_bearing == 1 and tile_params.temperature.is_named == 0
+    is_checked = tile_params.is_load_bearing == 1 and tile_params.temperature.is_used == 0
     return (
         is_checked
         and moved_counts > tile_params.temperature_change_max_counts
@@ -223,7 +223,7 @@ def _compute_apparent_force(
     """Compute the apparent force on a load-bearing tile; return its curve's slope in N/kPa."""
     flags = 0
     kpa, variance = sample.pressure_kpa, tile_params.baseline_variance
-    if tile_params.temperature.is_named == 1:
+    if tile_params.temperature.is_used == 1:
         is_read = sample.temperature_raw != NOT_READ
         counts = float(sample.temperature_raw) if is_read else math.nan
         kpa, sigma_kpa = refer_to_tare_temperature_with_sigma(
@@ -246,7 +246,7 @@ def _compute_apparent_force(
     # As if the chip's end had been read, less the shares of warmth and surroundings.
     least_kpa = kpa - (sample.pressure_kpa - end_kpa if is_hidden else 0.0)
     cooled_kpa, gas_kpa, gas_alt_kpa = kpa, 0.0, 0.0
-    if tile_params.gas.is_named == 1:
+    if tile_params.gas.is_used == 1:
         found_kpa, gas_alt_kpa = _isothermal_pressure(
             tile_params, tile_state, kpa, least_kpa, t_ns, is_hidden
         )
@@ -288,7 +288,7 @@ def _compute_apparent_force(
         flags |= _OVER_RATED
     if static_kpa < tile_params.range_low_kpa:
         flags |= _EXTRAPOLATED
-    if tile_params.skew.is_named == 1 and foot_params.has_denoise == 0:
+    if tile_params.skew.is_used == 1 and foot_params.has_denoise == 0:
         force_n = interpolate_to_frame(
             tile_state.skew, force_n, t_ns, frame_t_ns, row.after_gap == 1
         )
@@ -430,7 +430,7 @@ def append_frames_to_buffer(
                 kpa = _kpa_of(
                     p, t, chip.a0, chip.b1, chip.b2, chip.c12, chip.unit_kpa, chip.offset_kpa
                 )
-                if tile_params.unwrap.is_named == 1:
+                if tile_params.unwrap.is_used == 1:
                     count_kpa = _kpa_per_count_of(t, chip.b1, chip.c12, chip.unit_kpa)
                     kpa = unwrap_pressure(kpa, count_kpa, chip.rated_min_kpa, chip.wrap_counts)
                 if kpa >= chip.rated_min_kpa:

@@ -108,7 +108,7 @@ def _correct_force(
     """Correct a tile's averaged force in place; return its sigma by saturation and gaps, in N."""
     averaged_n, dome_alt_n = force.force_n, 0.0
     force_n = averaged_n
-    if tile_params.hysteresis.is_named == 1 or tile_params.rubber.is_named == 1:
+    if tile_params.hysteresis.is_used == 1 or tile_params.rubber.is_used == 1:
         force_n, dome_alt_n = _remove_hysteresis_and_creep(
             tile_params, tile_state, sample, averaged_n, at_ns
         )
@@ -196,7 +196,7 @@ def _remove_hysteresis_and_creep(
 ) -> tuple[float, float]:
     """Return the force without loop and creep, and its sigma by saturation and gaps before."""
     is_saturated, had_gap = sample.is_saturated == 1, False
-    if tile_params.rubber.is_named == 1:
+    if tile_params.rubber.is_used == 1:
         last = tile_state.dome.rubber
         had_gap = not math.isnan(last.force_n) and is_after_long_gap(at_ns, last.t_ns)
     elif tile_params.hysteresis.has_flow == 1:
@@ -246,9 +246,9 @@ def _invert_dome_models(
         force_n = flow.compensate_flow(
             loop.flow, loop_state.flow, force_n, at_ns, state_force_n, gap_force_n
         )
-    if loop.is_named == 1:
+    if loop.is_used == 1:
         force_n = hysteresis.compensate_hysteresis(loop, loop_state, force_n, state_force_n)
-    if tile_params.rubber.is_named == 1:
+    if tile_params.rubber.is_used == 1:
         force_n = rubber.compensate_creep(
             tile_params.rubber, dome_state.rubber, force_n, at_ns, state_force_n, gap_force_n
         )
@@ -265,7 +265,7 @@ def _copy_dome_state(dome_state: DomeState, to: DomeState) -> None:
 def _is_same_dome_state(tile_params: TileParams, one: DomeState, other: DomeState) -> bool:
     """Return whether two states are equal in the models that are named."""
     is_same = hysteresis.is_same_state(tile_params.hysteresis, one.hysteresis, other.hysteresis)
-    if tile_params.rubber.is_named == 1:
+    if tile_params.rubber.is_used == 1:
         is_same = is_same and rubber.is_same_state(one.rubber, other.rubber)
     return is_same
 

@@ -221,7 +221,7 @@ def _list_progress_fields(session: Session, ledger: Ledger, recorder: Recorder) 
     return {
         "frames": ledger.recorded,
         "pending_frames": ledger.pending,
-        "pending_reason": recorder.pending_reason(session, ledger),
+        "pending_reason": recorder.find_pending_reason(session, ledger),
         "lost": ledger.lost,
         "missed_slots": ledger.missed_slots,
         "duration_s": recorder.compute_duration_s(session, ledger.recorded),

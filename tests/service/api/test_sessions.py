@@ -280,7 +280,7 @@ def test_a_damaged_description_is_rebuilt_or_named(running: Running, node: FakeN
     assert list(listed["unreadable"]) == [recording.id]
     refused = running.http.get(recording.url)
     assert_refused(refused, 409, "cannot be read", "foottile verify")
-    needed = running.call(lambda: running.server.recorder.needed_frames("bench"))
+    needed = running.call(lambda: running.server.recorder.collect_needed_frames("bench"))
     assert needed == {node.stream_id: Intervals([(0, NO_END)])}
     assert (recording.folder / "session.json").is_file()
 

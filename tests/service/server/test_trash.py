@@ -304,7 +304,7 @@ def test_frames_of_an_unsealed_session_are_not_deleted(
     node = running.server.nodes.get("bench")
     running.call(
         lambda: node.delete_old_frames_and_up_to_one_ended_journal(
-            running.server.recorder.needed_frames("bench")
+            running.server.recorder.collect_needed_frames("bench")
         )
     )
     assert not (Intervals([(70, 119)]) - node.present_stream.stored)
@@ -325,7 +325,7 @@ def test_unneeded_journals_are_deleted_one_at_a_time(running: Running, tared: Fa
     left = []
     while running.call(
         lambda: node.delete_old_frames_and_up_to_one_ended_journal(
-            running.server.recorder.needed_frames("bench")
+            running.server.recorder.collect_needed_frames("bench")
         )
     ):
         left.append(sorted(path.name for path in folder.iterdir()))

@@ -190,7 +190,9 @@ def _registered_node(server: Server, hello: Hello, claim: IdentityClaim) -> Iter
 async def _send_welcome(socket: WebSocket, server: Server, link: NodeLink) -> None:
     node = link.node
     link.retention_request = server.recorder.make_retention_request(node.name)
-    lacks = node.needed_and_present_frames_to_request(server.recorder.needed_frames(node.name))
+    lacks = node.needed_and_present_frames_to_request(
+        server.recorder.collect_needed_frames(node.name)
+    )
     welcome = Welcome(protocol=PROTOCOL, missing=lacks, retention=link.retention_request)
     await send_message(socket, encode_link_message(welcome))
     log.info("node %s connected, stream %s", node.name, node.stream_id)

@@ -86,7 +86,7 @@ class LiveFeedSession:
             self._memory,
             self._policy,
             position,
-            needed_frames=lambda: server.recorder.needed_frames(node.name),
+            needed_frames=lambda: server.recorder.collect_needed_frames(node.name),
             invalidate_damaged=lambda error: server.recorder.invalidate_and_request_resend(
                 node, error, "a live client"
             ),
