@@ -83,7 +83,7 @@ class Shares:
             return kpa
 
         vars(world.i2c_adapter)["i2c_rdwr"] = timed_rdwr
-        vars(domes)["_compute"] = timed_compute
+        vars(domes)["_compute_chunk"] = timed_compute
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,9 @@ def generate(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
     for number in range(round(asked.hours * 60)):
         frames = minute(number, asked.tiles, asked.rate)
         for begin in range(0, len(frames), BATCH_FRAMES):
-            journal.append_new_frames(frames.rows(begin, min(begin + BATCH_FRAMES, len(frames))))
+            journal.append_new_frames(
+                frames.slice_rows(begin, min(begin + BATCH_FRAMES, len(frames)))
+            )
         journal.sync()
     journal.close()
     return {"frames": journal.stored.number_count, "bytes": journal.size_bytes}
@@ -130,7 +132,9 @@ def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
     calibration = find_calibration(
         "paper-eq2-shape", list(info.serials), parts_seed=0, on_progress=lambda _: None
     )
-    sources = SessionInputs(session, info, {STREAM_ID: journal}, calibration, None, (), {})
+    sources = SessionInputs(
+        session, info, {STREAM_ID: journal}, calibration, None, (), {"lost": {}}
+    )
     ledger = compute_ledger(
         session.parts, {STREAM_ID: StreamState(stored=journal.stored)}, has_all_parts=True
     )
