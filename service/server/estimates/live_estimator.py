@@ -21,7 +21,7 @@ from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.compilation import is_compiling
 from service.estimation.foot import LONG_GAP_NS
 from service.estimation.models.static import StaticParams, compute_forces
-from service.estimation.pipeline.plan import make_plan
+from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from service.estimation.tare.automatic import (
     HISTORY_NS,
     FlightTareResult,
@@ -85,15 +85,104 @@ class TileRanges:
 
 _TADC_OVER_NS = 1_000_000_000
 _EPOCHS_MAX = 256
+STATE_BYTES_MAX = 4 << 20
+STATE_PERIOD_NS = 30_000_000_000
+_GAP_PERIOD_NS = 1_000_000_000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class EstimateEpoch:
-    """Frames from `seq` on, estimated with one calibration and tare; None: not estimated."""
+    """Frames that are estimated with one calibration and tare, from one state of the models on.
 
-    seq: int
+    Attributes:
+        calibration: calibration in use; None: they are not estimated.
+        tare: tare in force; None: they are not estimated.
+        seq: first frame.
+        t_ns: or time after which it is in force, node's UTC.
+        state: state of the run before the first frame; None: the initial one.
+        last_seq: newest frame that this state has seen; None: none.
+    """
+
     calibration: Calibration | None
     tare: Tare | None
+    seq: int | None = None
+    t_ns: int | None = None
+    state: Columns | None = None
+    last_seq: int | None = None
+
+    @property
+    def state_bytes(self) -> int:
+        """Size of the state."""
+        return sum(column.nbytes for column in (self.state or {}).values())
+
+    def count_rows_before(self, frames: FrameBatch) -> int:
+        """Return the number of frames before it."""
+        if self.seq is not None:
+            return int(np.searchsorted(frames.seq, self.seq, side="left"))
+        return 0 if self.t_ns is None else int(np.searchsorted(frames.t_ns, self.t_ns, "right"))
+
+    def make_run(self, info: ArrayInfo) -> EstimateRun | None:
+        """Make the run that estimates its frames; None: they are not estimated."""
+        if self.calibration is None or self.tare is None:
+            return None
+        plan = make_live_plan(info, self.calibration, self.tare)
+        return EstimateRun(plan) if self.state is None else EstimateRun.from_state(plan, self.state)
+
+
+class EpochHistory:
+    """Epochs of one stream since the server was started, with states to go on from.
+
+    States are taken now and then, and where live goes on behind frames that it has not seen. The
+    oldest go first.
+    """
+
+    def __init__(self) -> None:
+        self._begun: deque[EstimateEpoch] = deque(maxlen=_EPOCHS_MAX)
+        """Epochs from the initial state."""
+        self._states: deque[EstimateEpoch] = deque()
+        self._state_bytes = 0
+        self._next_state_ns = self._next_gap_ns = 0
+
+    def list_epochs(self) -> list[EstimateEpoch]:
+        """Return the epochs, oldest first."""
+        return sorted((*self._begun, *self._states), key=lambda epoch: epoch.seq or 0)
+
+    def begin_epoch(
+        self, frames: FrameBatch, calibration: Calibration | None, tare: Tare | None
+    ) -> None:
+        """Record that these frames are the first with this calibration and tare."""
+        self._begun.append(EstimateEpoch(calibration, tare, int(frames.seq[0])))
+        self._next_gap_ns = int(frames.t_mono_ns[0])
+        self._next_state_ns = self._next_gap_ns + STATE_PERIOD_NS
+
+    def store_state_if_due(
+        self, frames: FrameBatch, last_seq: int, calibration: Calibration, run: EstimateRun
+    ) -> None:
+        """Store the state of a run before its next frames.
+
+        Args:
+            frames: the next frames.
+            last_seq: newest frame before them.
+            calibration: calibration of the run.
+            run: the run.
+        """
+        t_mono_ns, seq = int(frames.t_mono_ns[0]), int(frames.seq[0])
+        follows_gap = seq != last_seq + 1
+        if t_mono_ns < (self._next_gap_ns if follows_gap else self._next_state_ns):
+            return
+        state, tare = run.state_dict(), run.plan.tare
+        epoch = EstimateEpoch(calibration, tare, seq, state=state, last_seq=last_seq)
+        self._states.append(epoch)
+        self._state_bytes += epoch.state_bytes
+        while self._state_bytes > STATE_BYTES_MAX:
+            self._state_bytes -= self._states.popleft().state_bytes
+        self._next_gap_ns = t_mono_ns + _GAP_PERIOD_NS
+        self._next_state_ns = t_mono_ns + STATE_PERIOD_NS
+
+
+def make_live_plan(info: ArrayInfo, calibration: Calibration, tare: Tare) -> EstimationPlan:
+    """Make the plan of live estimates of a stream."""
+    return make_plan(info, calibration, tare, models=info.models, lag_ms=LIVE_LAG_MS)
 
 
 class LiveEstimator:
@@ -103,8 +192,7 @@ class LiveEstimator:
         info: the array.
         calibration: calibration of its tiles; None if there is none.
         tare: tare in force.
-        previous: former estimator of this node; if it was of the same stream, its epochs are
-            copied.
+        previous: former estimator of this node; if it was of the same stream, its epochs go on.
     """
 
     def __init__(
@@ -130,10 +218,10 @@ class LiveEstimator:
         self._flushed: list[tuple[FrameBatch, Columns]] = []
         self._estimated_t_ns: int | None = None
         self._has_epoch = False
-        is_same = previous is not None and previous.info.stream_id == info.stream_id
-        epochs = previous.epochs if previous is not None and is_same else ()
-        self.epochs: deque[EstimateEpoch] = deque(epochs, _EPOCHS_MAX)
-        """Epochs of the estimates, oldest first, to recompute frames as they were."""
+        self.epochs = EpochHistory()
+        """Epochs of the estimates, to recompute frames as they were."""
+        if previous is not None and previous.info.stream_id == info.stream_id:
+            self.epochs = previous.epochs
         if calibration is not None:
             try:
                 EstimateStream(info, EstimateOptions(calibration, info.models, LIVE_LAG_MS))
@@ -169,14 +257,7 @@ class LiveEstimator:
         if self._calibration is None or tare is None:
             self._run = None
             return
-        plan = make_plan(
-            self._info,
-            self._calibration,
-            tare,
-            models=self._info.models,
-            lag_ms=LIVE_LAG_MS,
-        )
-        self._run = EstimateRun(plan)
+        self._run = EstimateRun(make_live_plan(self._info, self._calibration, tare))
 
     def drain_frames_from(self, previous: LiveEstimator) -> None:
         """Take the frames of an estimator of the same stream with another calibration, and end it.
@@ -189,16 +270,16 @@ class LiveEstimator:
 
     def estimate_or_pass_frames(self, frames: FrameBatch) -> Iterator[tuple[FrameBatch, Columns]]:
         """Add the next frames; yield the frames that are due, with or without estimates."""
+        last_seq = int(self._recent[-1].seq[-1]) if self._recent else -1
         self._recent.append(frames)
         while int(frames.t_ns[-1]) - int(self._recent[0].t_ns[-1]) > HISTORY_NS:
             self._recent.popleft()
         flushed, self._flushed = self._flushed, []
         yield from flushed
-        if not self._has_epoch and not (self._run is not None and is_compiling()):
-            self._has_epoch = True
-            tare = None if self._run is None else self._run.plan.tare
-            self.epochs.append(EstimateEpoch(int(frames.seq[0]), self._calibration, tare))
         if self._run is None:
+            if not self._has_epoch:
+                self._has_epoch = True
+                self.epochs.begin_epoch(frames, self._calibration, None)
             yield frames, {}
             return
         if is_compiling():
@@ -209,6 +290,12 @@ class LiveEstimator:
             )
             yield frames, {"gauge_kpa": kpa}
             return
+        assert self._calibration is not None  # noqa: S101  # or there was no run
+        if self._has_epoch:
+            self.epochs.store_state_if_due(frames, last_seq, self._calibration, self._run)
+        else:
+            self._has_epoch = True
+            self.epochs.begin_epoch(frames, self._calibration, self._run.plan.tare)
         for due, columns in self._run.feed_frames(frames, {}):
             self._update_contact(due, columns)
             yield due, columns

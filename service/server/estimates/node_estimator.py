@@ -21,7 +21,11 @@ from devices.errors import FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
 from service.protocol.link import Hello
-from service.server.estimates.live_estimator import EstimateEpoch, LiveEstimator
+from service.server.estimates.live_estimator import (
+    STATE_BYTES_MAX,
+    EstimateEpoch,
+    LiveEstimator,
+)
 from service.server.estimates.tare_controller import TareController
 from service.sessions.pipeline import Columns
 from service.sessions.tares import TareHistory
@@ -127,7 +131,7 @@ class NodeEstimator:
         self.tare_controller: TareController
         self._hello = hello
         self._has_failed = False
-        self._ended_epochs: OrderedDict[str, tuple[EstimateEpoch, ...]] = OrderedDict()
+        self._ended_epochs: OrderedDict[str, list[EstimateEpoch]] = OrderedDict()
         """Epochs of streams before the present one."""
         self._restart()
 
@@ -167,11 +171,11 @@ class NodeEstimator:
         )
         return self.assignment.problem or self.live.calibration_problem or node_problem
 
-    def epochs_since_server_start(self, stream_id: str) -> tuple[EstimateEpoch, ...]:
+    def epochs_since_server_start(self, stream_id: str) -> list[EstimateEpoch]:
         """Return the epochs of a stream since the server was started, in order."""
         if stream_id == self.live.info.stream_id:
-            return tuple(self.live.epochs)
-        return self._ended_epochs.get(stream_id, ())
+            return self.live.epochs.list_epochs()
+        return self._ended_epochs.get(stream_id, [])
 
     def store_and_apply_calibration(self, calibration: Calibration | None, t_ns: int) -> None:
         """Store the assigned calibration, and use it from the next frame on.
@@ -200,9 +204,13 @@ class NodeEstimator:
         """Restart the estimator if hello has another stream or calibration."""
         previous, self._hello = self._hello, hello
         if previous.array_info.stream_id != hello.array_info.stream_id:
-            self._ended_epochs[previous.array_info.stream_id] = tuple(self.live.epochs)
-            if len(self._ended_epochs) > _ENDED_STREAMS_MAX:
-                self._ended_epochs.popitem(last=False)
+            self._ended_epochs[previous.array_info.stream_id] = self.live.epochs.list_epochs()
+            while (
+                len(ended := self._ended_epochs) > _ENDED_STREAMS_MAX
+                or sum(epoch.state_bytes for epochs in ended.values() for epoch in epochs)
+                > STATE_BYTES_MAX
+            ):
+                ended.popitem(last=False)
         is_same = (previous.array_info, previous.calibration) == (
             hello.array_info,
             hello.calibration,

@@ -109,6 +109,9 @@ class FeedBuffer:
 
     def find_batch(self, stream_id: str, seq: int) -> FeedBatch | None:
         """Return the batch with this frame; None if it is not in the buffer."""
+        oldest = self._batches[0] if self._batches else None
+        if oldest is not None and oldest.stream_id == stream_id and seq < oldest.first_seq:
+            return None
         return next(
             (p for p in self._batches_of(stream_id) if p.first_seq <= seq <= p.last_seq), None
         )

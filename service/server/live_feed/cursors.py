@@ -37,7 +37,7 @@ class Recompute:
 
     Attributes:
         position: first frame.
-        last_seq: greatest stored number.
+        last_seq: greatest stored number before any frame that may still come.
         is_final: True: no more frames of this stream will come.
         until_seq: first number in the buffer; None: the buffer has none.
     """
@@ -104,7 +104,10 @@ class LosslessCursor:
             ):
                 return None
             until = None if ahead is None else ahead.first_seq
-            return Recompute(position, stored.last or position.seq, stream.has_ended, until)
+            comes = _first_to_come(stream, position)
+            last = stored.restricted_to(position.seq, NO_END if comes is None else comes - 1).last
+            is_final = stream.has_ended and comes is None
+            return Recompute(position, last or position.seq, is_final, until)
         return self._gap_event(position, stream, ahead)
 
     def _buffered_batch(self, position: Position) -> FeedBatch | None:
@@ -125,7 +128,7 @@ class LosslessCursor:
         self, position: Position, stream: StreamView, ahead: FeedBatch | None
     ) -> FeedEvent | None:
         """Return the event for a frame that is not stored: none yet, a gap, or the next stream."""
-        comes = stream.compute_unstored_obtainable().restricted_to(position.seq, NO_END).first
+        comes = _first_to_come(stream, position)
         if comes == position.seq:
             return None
         next_stored = stream.stored.restricted_to(position.seq, NO_END).first
@@ -149,6 +152,11 @@ class LosslessCursor:
 
     def _move_to(self, position: Position) -> None:
         self.position, self._next_number = position, None
+
+
+def _first_to_come(stream: StreamView, position: Position) -> int | None:
+    """Return the first frame from a position on that is not stored and may still come."""
+    return stream.compute_unstored_obtainable().restricted_to(position.seq, NO_END).first
 
 
 def _loss_reason(stream: StreamView, first: int, last: int) -> tuple[str, int]:

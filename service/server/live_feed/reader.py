@@ -4,10 +4,11 @@ A reader is a position, not a queue: a slow reader costs no memory. The next eve
 `cursors`; `FeedReader` waits for it, and recomputes frames in a thread, one reader after the other.
 
 Frames that are no longer buffered are estimated again as they were live: with the live look-ahead,
-and the tare that was in force. The recorded epochs of the server's own estimates are repeated, so
-that the bits are the same, if the frames before were there then, too. For the time before the
-server was started the history of tares says which tare was in force, by the frames' times; models
-start so many frames earlier that their initial state is forgotten.
+the tare that was in force, and from a state that live had. So the bits are the same; frames that
+live has not seen, of a backlog, go on from the state before them. Where no state is kept any more,
+as for the time before the server was started, models start so many frames earlier that their
+initial state is forgotten, and the history of tares says which tare was in force, by the frames'
+times.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
-from collections.abc import AsyncGenerator, Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import AsyncGenerator, Callable, Iterator, Mapping
+from itertools import chain
 
 import numpy as np
 
@@ -25,10 +26,14 @@ from devices.frames import ArrayInfo, FrameBatch
 from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
 from service.estimation.compilation import is_compiling
-from service.estimation.pipeline.plan import compute_settling_time_s, make_plan
-from service.estimation.tare.tare import Tare
+from service.estimation.pipeline.plan import compute_settling_time_s
 from service.protocol.codec import CloseConnection, LinkCloseCode
 from service.protocol.live import Policy
+from service.server.estimates.live_estimator import (
+    STATE_PERIOD_NS,
+    EstimateEpoch,
+    make_live_plan,
+)
 from service.server.estimates.node_estimator import EstimatedBatch
 from service.server.live_feed.buffer import (
     FeedBuffer,
@@ -42,85 +47,12 @@ from service.server.node import ServerNode
 from service.server.streams import ServerStream
 from service.sessions.pipeline import EstimateOptions, EstimateRun, EstimateStream
 from storage.intervals import Intervals
-from storage.journal.journal import Journal
 
 ROWS_AT_ONCE = 1024
 
 
-@dataclass(frozen=True)
-class EstimateInputsChange:
-    """Change of calibration or tare; without both, frames are not estimated.
-
-    Attributes:
-        calibration: calibration in use from here on.
-        tare: tare in force from here on.
-        seq: first frame of the change.
-        t_ns: or time after which it is in force, node's UTC.
-    """
-
-    calibration: Calibration | None
-    tare: Tare | None
-    seq: int | None = None
-    t_ns: int | None = None
-
-    def count_rows_before(self, frames: FrameBatch) -> int:
-        """Return the number of frames before the change."""
-        if self.seq is not None:
-            return int(np.searchsorted(frames.seq, self.seq, side="left"))
-        return 0 if self.t_ns is None else int(np.searchsorted(frames.t_ns, self.t_ns, "right"))
-
-
-def estimate_again(
-    batches: Iterable[FrameBatch],
-    info: ArrayInfo,
-    changes: Iterable[EstimateInputsChange],
-    *,
-    is_final: bool,
-) -> Iterator[EstimatedBatch]:
-    """Yield frames with their estimates, each once, in order.
-
-    Args:
-        batches: frames of one stream, in order.
-        info: array of the stream.
-        changes: changes of calibration and tare, in order; frames before the first are not
-            estimated.
-        is_final: True: no more frames will come; else frames that wait for their look-ahead are
-            left out.
-    """
-    run: EstimateRun | None = None
-    to_come = deque(changes)
-    for frames in batches:
-        rest = frames
-        while to_come and (count := to_come[0].count_rows_before(rest)) < len(rest):
-            if count:
-                yield from _feed_run(run, rest.slice_rows(0, count))
-                rest = rest.slice_rows(count, len(rest))
-            if run is not None:
-                yield from run.flush()
-            run = _make_run(info, to_come.popleft())
-        if len(rest):
-            yield from _feed_run(run, rest)
-    if is_final and run is not None:
-        yield from run.flush()
-
-
-def _make_run(info: ArrayInfo, change: EstimateInputsChange) -> EstimateRun | None:
-    calibration, tare = change.calibration, change.tare
-    if calibration is None or tare is None:
-        return None
-    plan = make_plan(info, calibration, tare, models=info.models, lag_ms=LIVE_LAG_MS)
-    return EstimateRun(plan)
-
-
-def _feed_run(run: EstimateRun | None, frames: FrameBatch) -> Iterator[EstimatedBatch]:
-    if run is None:
-        yield frames, {}
-    else:
-        yield from run.feed_frames(frames, {})
-
-
 class RecomputedFrames:
-    """Recomputed frames of one stream from one number on, up to the journal's present end.
+    """Recomputed frames of one stream from one number on: each is estimated once, in order.
 
     Created on the event loop; `next_rows` may run in another thread.
 
@@ -128,47 +60,115 @@ class RecomputedFrames:
         node: node of the stream.
         stream: stream with a journal.
         position: first frame.
-        is_final: True: no more frames of this stream will come.
 
     Raises:
         StorageError: the journal cannot be read.
     """
 
-    def __init__(
-        self, node: ServerNode, stream: ServerStream, position: Position, *, is_final: bool
-    ) -> None:
+    def __init__(self, node: ServerNode, stream: ServerStream, position: Position) -> None:
         assert stream.journal is not None  # noqa: S101  # the caller holds a frame of it
-        self._journal: Journal = stream.journal
         self.position = position
         """Next frame."""
+        self._node, self._stream, self._journal = node, stream, stream.journal
         calibration = node.estimator.live.calibration
         if calibration is not None and not _is_compatible(calibration, stream.info, node.last_info):
             calibration = None
-        last = self._journal.stored.last or 0
-        begin = self._first_model_seq(node, stream, calibration, position.seq)
-        self._pieces = estimate_again(
-            self._journal.read_frames(begin, last),
-            stream.info,
-            _list_changes(node, stream, calibration, begin, last),
-            is_final=is_final,
-        )
+        self._calibration = calibration
+        self._next_seq = self._find_first_seq()
+        """Next frame to estimate."""
+        self._last: tuple[int, int] | None = None
+        """Number and time of the last estimated frame."""
+        self._run: EstimateRun | None = None
+        self._end: tuple[int, bool] | None = None
+        self._pieces: Iterator[EstimatedBatch] = iter(())
         self._rest: EstimatedBatch | None = None
 
-    def _first_model_seq(
-        self, node: ServerNode, stream: ServerStream, calibration: Calibration | None, seq: int
-    ) -> int:
-        """Return the number of the frame with which models start."""
+    def _find_first_seq(self) -> int:
+        """Return the first frame to estimate: that of an epoch, or so early that models settle."""
+        seq, info = self.position.seq, self._stream.info
+        epochs = self._node.estimator.epochs_since_server_start(self._stream.stream_id)
+        epoch = next((each for each in reversed(epochs) if (each.seq or 0) <= seq), None)
+        if epoch is not None and epoch.seq is not None and epoch.state is not None:
+            return epoch.seq
         t_ns = self._journal.find_batch_t_ns_near(seq, at_or_before=False)
-        tare = node.estimator.tare_history.tare_in_force_or_lost(stream.info)
-        if calibration is None or tare is None or t_ns is None:
+        tare = self._node.estimator.tare_history.tare_in_force_or_lost(info)
+        if self._calibration is None or tare is None or t_ns is None:
             return seq
-        plan = make_plan(
-            stream.info, calibration, tare, models=stream.info.models, lag_ms=LIVE_LAG_MS
-        )
-        since = self._journal.find_first_batch_seq_since(
-            t_ns - round(1e9 * compute_settling_time_s(plan))
-        )
-        return seq if since is None else min(seq, since)
+        settling_s = compute_settling_time_s(make_live_plan(info, self._calibration, tare))
+        # At least the time between two states: the initial one of an epoch counts as one of them.
+        settling_ns = max(round(1e9 * settling_s), STATE_PERIOD_NS)
+        settled_seq = self._journal.find_first_batch_seq_since(t_ns - settling_ns)
+        first = seq if settled_seq is None else min(seq, settled_seq)
+        return first if epoch is None or epoch.seq is None else max(first, epoch.seq)
+
+    def extend(self, last_seq: int, *, is_final: bool) -> bool:
+        """Go on to a number, all frames before which are here or lost.
+
+        Args:
+            last_seq: the number.
+            is_final: True: no more frames will come; else frames that wait for their look-ahead go
+                on waiting.
+
+        Returns:
+            False: it has gone on to there before.
+        """
+        if self._end == (last_seq, is_final):
+            return False
+        self._end = last_seq, is_final
+        epochs = filter(self._is_to_come, self._list_epochs(last_seq))
+        self._pieces = self._estimate(deque(epochs), last_seq, is_final=is_final)
+        return True
+
+    def _is_to_come(self, epoch: EstimateEpoch) -> bool:
+        if self._last is None:
+            return True
+        seq, t_ns = self._last
+        return epoch.seq > seq if epoch.seq is not None else (epoch.t_ns or 0) >= t_ns
+
+    def _list_epochs(self, last_seq: int) -> list[EstimateEpoch]:
+        """Return the epochs of the frames still to estimate, in order."""
+        estimator, info, begin = self._node.estimator, self._stream.info, self._next_seq
+        recorded = estimator.epochs_since_server_start(self._stream.stream_id)
+        before = [epoch for epoch in recorded if (epoch.seq or 0) <= begin]
+        if before:  # this server has estimated all of these frames
+            return recorded[len(before) - 1 :]
+        until = last_seq if not recorded else max(begin, (recorded[0].seq or 0) - 1)
+        t_ns = self._journal.find_batch_t_ns_near(begin, at_or_before=False)
+        until_ns = self._journal.find_batch_t_ns_near(until, at_or_before=True)
+        if t_ns is None or until_ns is None:
+            return recorded
+        tares = estimator.tare_history.tares_in_force_or_lost_between(info, t_ns, until_ns)
+        earlier = (EstimateEpoch(self._calibration, tare, t_ns=tare.t_ns) for tare in tares)
+        return [*earlier, *recorded]
+
+    def _estimate(
+        self, to_come: deque[EstimateEpoch], last_seq: int, *, is_final: bool
+    ) -> Iterator[EstimatedBatch]:
+        """Yield the frames up to a number that are due, with their estimates."""
+        for frames in self._journal.read_frames(self._next_seq, last_seq):
+            rest = frames
+            while to_come and (count := to_come[0].count_rows_before(rest)) < len(rest):
+                yield from self._feed_run(rest.slice_rows(0, count))
+                rest = rest.slice_rows(count, len(rest))
+                epoch = to_come.popleft()
+                if epoch.state is not None and self._last and epoch.last_seq == self._last[0]:
+                    continue  # this run has that state
+                if self._run is not None:
+                    yield from self._run.flush()
+                self._run = epoch.make_run(self._stream.info)
+            yield from self._feed_run(rest)
+        if is_final and self._run is not None:
+            yield from self._run.flush()
+
+    def _feed_run(self, frames: FrameBatch) -> Iterator[EstimatedBatch]:
+        if not len(frames):
+            return
+        self._last = int(frames.seq[-1]), int(frames.t_ns[-1])
+        self._next_seq = self._last[0] + 1
+        if self._run is None:
+            yield frames, {}
+        else:
+            yield from self._run.feed_frames(frames, {})
 
     def next_rows(self) -> EstimatedBatch | None:
         """Return the next due frames, at most `ROWS_AT_ONCE`; None: no more for now.
@@ -195,6 +195,12 @@ class RecomputedFrames:
                 self.position = Position(self.position.stream_id, int(frames.seq[end - 1]) + 1)
                 return slice_batch((frames, columns), begin, end)
 
+    def put_back(self, rows: EstimatedBatch) -> None:
+        """Take back the rows that `next_rows` returned last; they are the next."""
+        rest = () if self._rest is None else (self._rest,)
+        self._pieces, self._rest = chain((rows, *rest), self._pieces), None
+        self.position = Position(self.position.stream_id, int(rows[0].seq[0]))
+
 
 def _is_compatible(calibration: Calibration, info: ArrayInfo, present: ArrayInfo) -> bool:
     """Return whether a stream can be estimated with the calibration of the node's present one."""
@@ -205,33 +211,6 @@ def _is_compatible(calibration: Calibration, info: ArrayInfo, present: ArrayInfo
     except FootTileError:
         return False
     return True
-
-
-def _list_changes(
-    node: ServerNode,
-    stream: ServerStream,
-    calibration: Calibration | None,
-    begin: int,
-    last: int,
-) -> list[EstimateInputsChange]:
-    """Return the changes of calibration and tare within these frames, in order."""
-    recorded = [
-        EstimateInputsChange(each.calibration, each.tare, seq=each.seq)
-        for each in node.estimator.epochs_since_server_start(stream.stream_id)
-    ]
-    before = [change for change in recorded if change.seq is not None and change.seq <= begin]
-    if before:  # this server has estimated all of these frames
-        return recorded[len(before) - 1 :]
-    journal = stream.journal
-    if journal is None:
-        return recorded
-    until = last if not recorded or recorded[0].seq is None else max(begin, recorded[0].seq - 1)
-    t_ns = journal.find_batch_t_ns_near(begin, at_or_before=False)
-    until_ns = journal.find_batch_t_ns_near(until, at_or_before=True)
-    if t_ns is None or until_ns is None:
-        return recorded
-    tares = node.estimator.tare_history.tares_in_force_or_lost_between(stream.info, t_ns, until_ns)
-    return [*(EstimateInputsChange(calibration, tare, t_ns=tare.t_ns) for tare in tares), *recorded]
 
 
 log = logging.getLogger("foottile.live")
@@ -296,8 +275,6 @@ class FeedReader:
             queue_ns = None if policy == "latest" else QUEUE_NS
             self._cursor = LossyCursor(buffer, self._find_stream, position, queue_ns)
         self._recomputed: RecomputedFrames | None = None
-        self._request: Recompute | None = None
-        """Request for which `_recomputed` was created."""
         self._request_without_rows: Recompute | None = None
         """Last request for which no frame was due."""
 
@@ -354,11 +331,10 @@ class FeedReader:
         begins = self._recomputed is None or self._recomputed.position != position
         try:
             if self._recomputed is None or begins:
-                self._recomputed = RecomputedFrames(
-                    self._node, stream, position, is_final=step.is_final
-                )
-                self._request = step
+                self._recomputed = RecomputedFrames(self._node, stream, position)
             found = await asyncio.to_thread(self._recomputed.next_rows)
+            if found is None and self._recomputed.extend(step.last_seq, is_final=step.is_final):
+                found = await asyncio.to_thread(self._recomputed.next_rows)
         except DamagedFramesError as error:
             self._recomputed = None
             self._invalidate_damaged(error)
@@ -372,12 +348,12 @@ class FeedReader:
             ) from error
         except FootTileError as error:
             raise self._unreadable_error(position, error) from error
-        if found is None:  # the journal's end at creation is reached
-            self._recomputed, self._request_without_rows = None, self._request
+        if found is None:
+            self._request_without_rows = step
             return None
         first, last = int(found[0].seq[0]), int(found[0].seq[-1])
-        if first > position.seq:
-            self._recomputed = None
+        if first > position.seq:  # first the reader is told what lies between
+            self._recomputed.put_back(found)
             if begins and stream.stored.restricted_to(position.seq, position.seq):
                 raise self._unreadable_error(position, "a stored frame is not in its journal")
             return None

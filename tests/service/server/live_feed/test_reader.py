@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from devices.arrays import Ints
 from devices.errors import DamagedFramesError, FileFormatError, StorageError
+from devices.frames import FrameBatch
 from service.protocol.codec import CloseConnection, LinkCloseCode
 from service.protocol.live import Policy
+from service.server.estimates.live_estimator import make_live_plan
+from service.server.estimates.node_estimator import EstimatedBatch
 from service.server.live_feed.events import (
     EncodeCache,
     FeedEvent,
@@ -20,6 +27,7 @@ from service.server.live_feed.events import (
     StreamStart,
 )
 from service.server.live_feed.reader import FeedReader, RecomputedFrames
+from service.sessions.pipeline import EstimateRun
 from storage.journal.journal import Journal
 from tests.builders.arrays import PERIOD_NS, UTC_NS
 from tests.service.server.live_feed.world import WAITING, World, bits
@@ -158,6 +166,86 @@ def test_estimates_of_a_stream_that_has_ended_are_the_bits_of_live(world: World)
     assert compared > 390
 
 
+CUT, BACK, END = 17_000, 18_500, 20_000
+
+
+def walk_with_a_lost_baseline(seq: Ints) -> Ints:
+    """Counts of a foot that steps once a second and whose first tile is pressed sideways early."""
+    load = np.maximum(0.0, 25 * np.sin(2 * np.pi * seq / 500))
+    pressed = np.where((seq > 1000) & (seq < 1600), 20, 0)
+    noise = np.random.default_rng(3).normal(0.0, 1.0, (END, 2))[seq]
+    return np.rint(500 - np.stack([load - pressed, 0.8 * load], 1) + noise).astype(np.int64)
+
+
+@pytest.fixture
+def cut(tmp_path: Path) -> Iterator[World]:
+    """A world whose link was cut for three seconds after half a minute; the backlog is to come."""
+    world = World(tmp_path, models=("static", "denoise"))
+    world.present.counts = walk_with_a_lost_baseline
+    for _ in range(CUT // 100):
+        world.send_newest(100)
+    world.leave()
+    world.take(BACK - CUT)
+    world.connect()
+    yield world
+    world.close()
+
+
+def estimates_of(items: list[FeedEvent]) -> dict[int, tuple[float, ...]]:
+    """Bits of each estimate by its number, of frames that came."""
+    return {
+        seq: bits(item.batch[1], row)
+        for item in items
+        if isinstance(item, FrameRows)
+        for row, seq in enumerate(item.batch[0].seq.tolist())
+    }
+
+
+def in_one_run(world: World) -> dict[int, tuple[float, ...]]:
+    """Bits of all frames of the stream, estimated one after another."""
+    live = world.node.estimator.live
+    calibration, tare = live.calibration, live.tare_in_use_unless_lost
+    assert calibration is not None
+    assert tare is not None
+    run = EstimateRun(make_live_plan(world.present.info, calibration, tare))
+    pieces = chain(run.feed_frames(world.present.frames(0, END - 1), {}), run.flush())
+    return {seq: bits(c, row) for f, c in pieces for row, seq in enumerate(f.seq.tolist())}
+
+
+def test_late_frames_go_on_from_the_state_before_them_and_are_estimated_once(
+    cut: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fed: list[int] = []
+    feed = EstimateRun.feed_frames
+
+    def count(run: EstimateRun, frames: FrameBatch, carried: Any) -> Iterator[EstimatedBatch]:
+        fed.extend(frames.seq.tolist())
+        return feed(run, frames, carried)
+
+    monkeypatch.setattr(EstimateRun, "feed_frames", count)
+    reader = cut.reader("lossless", Position(FIRST, CUT - 10))
+    items = all_of(cut, reader)
+    for begin in range(CUT, BACK, 20):  # as over a slow link
+        cut.send_newest(20)
+        cut.send(begin, begin + 19)
+        items += all_of(cut, reader)
+    assert len(fed) <= 2 * (END - CUT) + (CUT - 15_000)
+    whole, found = in_one_run(cut), estimates_of(items)
+    assert [seq for seq in range(CUT, BACK - WAITING) if found[seq] != whole[seq]] == []
+
+
+def test_frames_of_live_are_as_they_were_also_behind_a_gap_that_was_filled(cut: World) -> None:
+    for _ in range((END - BACK) // 100):
+        cut.send_newest(100)
+    cut.send(CUT, BACK - 1)
+    cut.forget()
+    live = [*range(14_000, CUT - WAITING), *range(BACK, END - 100)]
+    for first in (14_000, 16_000, BACK + 200):
+        found = estimates_of(all_of(cut, cut.reader("lossless", Position(FIRST, first))))
+        numbers = [seq for seq in live if seq >= first]
+        assert [seq for seq in numbers if found[seq] != cut.published[FIRST, seq]] == []
+
+
 def test_of_another_scene_that_the_calibration_does_not_fit_frames_come_alone(world: World) -> None:
     world.send_newest(40)
     world.reboot()
@@ -197,7 +285,9 @@ def test_damaged_frames_that_the_node_still_has_come_once_more(world: World) -> 
     damage(world, 25)
     reader = world.reader("lossless", Position(FIRST, 0))
     items = all_of(world, reader)
-    assert told(items) == [("came", FIRST, 0, 19)]
+    ((_, _, first, last),) = told(items)  # those before still wait for them, as look-ahead
+    assert first == 0
+    assert 20 - WAITING <= last + 1 < 20
     world.send_lacking()
     world.send_newest(20)
     items += all_of(world, reader)

@@ -7,13 +7,14 @@ are switched on again whenever a test wants. Everything but the link is the prod
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from devices.arrays import Ints
 from devices.errors import DamagedFramesError
 from devices.frames import ArrayInfo, FrameBatch
 from service.protocol.link import EarlierStream, Hello
@@ -44,6 +45,10 @@ class Taken:
     begin_t_mono_ns: int
     taken: int = 0
     lost: Intervals = field(default_factory=Intervals)
+    counts: Callable[[Ints], Ints] = lambda seq: (
+        470 + np.stack([(7 * seq) % 31, (11 * seq) % 29], 1)
+    )
+    """Counts of both tiles by number; they tell stream and number."""
     forgotten: int = 0
     """So many of the first it has not any more, for the server has them."""
 
@@ -54,12 +59,10 @@ class Taken:
         return kept - self.lost
 
     def frames(self, first: int, last: int) -> FrameBatch:
-        """Frames by their numbers; their counts tell stream and number."""
+        """Frames by their numbers."""
         seq = np.arange(first, last + 1)
-        counts = 470 + np.stack([(7 * seq) % 31, (11 * seq) % 29], axis=1)
-        return make_frames(
-            seq, t_mono_ns=self.begin_t_mono_ns + PERIOD_NS * seq, pressure_raw=counts
-        )
+        t_mono_ns = self.begin_t_mono_ns + PERIOD_NS * seq
+        return make_frames(seq, t_mono_ns=t_mono_ns, pressure_raw=self.counts(seq))
 
 
 class World:
@@ -68,9 +71,11 @@ class World:
     Args:
         folder: of the server.
         is_recording: do sessions need every frame of every stream?
+        array: facts of its array.
     """
 
-    def __init__(self, folder: Path, *, is_recording: bool = True) -> None:
+    def __init__(self, folder: Path, *, is_recording: bool = True, **array: Any) -> None:
+        self._array = array
         self.folder = folder
         self.is_recording = is_recording
         self.streams: dict[str, Taken] = {}
@@ -122,6 +127,10 @@ class World:
         if self._is_there:
             self._send(self.present, first, first + n - 1)
 
+    def send(self, first: int, last: int) -> None:
+        """It sends frames of the present stream."""
+        self._send(self.present, first, last)
+
     def send_lacking(self) -> None:
         """It sends all that the server has asked for, the present stream's last."""
         if not self._is_there:
@@ -150,7 +159,7 @@ class World:
 
     def _boot(self) -> None:
         number = len(self.streams)
-        info = make_array(stream_id=f"{number:032x}")
+        info = make_array(stream_id=f"{number:032x}", **self._array)
         self.streams[info.stream_id] = Taken(info, begin_t_mono_ns=number * 10**12)
 
     def _send(self, stream: Taken, first: int, last: int) -> None:
