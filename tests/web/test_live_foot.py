@@ -63,6 +63,13 @@ BARS_OF_THEIR_FORCE = """() => {
 }"""
 """Is each bar as long as its value says? Two pixels at each end are under lines."""
 
+HAS_THE_KPA_OF_ITS_BAR = """() => {
+  const { unit, value } = document.querySelector("#bars .tile").dataset;
+  const shown = document.querySelector("#foot .name").textContent;
+  return unit === "kPa" && value !== "" && shown === Number(value).toFixed(1);
+}"""
+"""Has the first tile of the foot the number of its bar, in kPa?"""
+
 
 class Arranged(FakeNode):
     """A node with tiles in places of the test's own."""
@@ -141,8 +148,7 @@ def test_a_grid_is_a_heat_map_with_readable_numbers_on_a_phone(
         }"""
         assert page.evaluate(on_top)  # the COP and its trail cover no number
         page.click("#unit-kpa")
-        kpa = page.locator("#bars .tile").first.get_attribute("data-value") or ""
-        expect(number).to_have_text(f"{float(kpa):.1f}")
+        page.wait_for_function(HAS_THE_KPA_OF_ITS_BAR)
         expect(page.locator("#foot .heat-legend")).to_contain_text("kPa")
         page.click("#unit-n")
         cell = box_of(page.locator("#foot rect.dome").first)
