@@ -56,8 +56,11 @@ def is_of_this_run(item: pytest.Item) -> bool:
     """Return whether this run plays a slow test. Without a turn it plays all.
 
     A run plays a quarter of the tests marked `slow`, and a quarter of the files marked `in_turn`.
+    Tests of the same parameters are played together: they share what is computed from these.
     """
-    name = item.path.name if item.get_closest_marker("in_turn") else item.name
+    name = item.name.partition("[")[2] or item.name
+    if item.get_closest_marker("in_turn"):
+        name = item.path.name
     return TURN is None or hashlib.sha256(name.encode()).digest()[0] % PARTS == int(TURN) % PARTS
 
 

@@ -30,6 +30,15 @@ def test_a_slow_test_is_played_once_in_four_runs(monkeypatch: pytest.MonkeyPatch
     assert len({tuple(each) for each in played}) > 1
 
 
+def test_tests_of_the_same_parameters_are_played_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    for each in ("pipelined-gone", "per_mux-gone", "1"):
+        first, second = (
+            _play("test_a.py", f"{name}[{each}]", {"slow"}, monkeypatch)
+            for name in ("test_one", "test_two")
+        )
+        assert first == second
+
+
 def _play(
     file: str, name: str, marks: Collection[str], monkeypatch: pytest.MonkeyPatch
 ) -> list[bool]:
