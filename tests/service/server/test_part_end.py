@@ -62,27 +62,6 @@ def test_streams_taken_without_a_link_are_parts_of_a_session(
     assert running.node()["lost_frames"] == 0
 
 
-def test_restarts_of_the_server_change_no_part(running: Running, tared: FakeNode) -> None:
-    session = tared.record()
-    tared.deliver(50)
-    running.restart()
-    tared.frames(30)
-    tared.reboot()
-    [first] = tared.before
-    tared.connect(earlier=(first.said(stored=((120, 149),)),))
-    tared.deliver(10)
-    running.restart()
-    tared.connect(earlier=(first.said(stored=((120, 149),)),))
-    tared.send_lacking()
-    while first.stream_id not in tared.acked_of or tared.acked_of[first.stream_id].last != 149:
-        tared.receive("ack")
-    running.restart()
-    tared.connect(earlier=(first.said(stored=()),))
-    tared.taken_in() if tared.seq > 10 else None
-    sealed = tared.finish(session)
-    assert whole_parts_of(sealed) == [(first.stream_id, 70, 149), (tared.stream_id, 0, 9)]
-
-
 @pytest.mark.parametrize(("announced", "open_tail"), [(250, 200), (30, 0), (50, 0)])
 def test_the_servers_frames_shorten_the_tail_of_a_power_cut(
     tared: FakeNode, session: Recording, announced: int, open_tail: int
@@ -101,61 +80,6 @@ def test_the_servers_frames_shorten_the_tail_of_a_power_cut(
     assert sealed["max_lost_tail_frames"] == open_tail
 
 
-def test_losses_of_an_earlier_stream_have_their_reasons(
-    tared: FakeNode, session: Recording
-) -> None:
-    tared.frames(30)
-    tared.reboot()
-    [first] = tared.before
-    lost = {"disk_full": ((120, 129),), "corrupt": ((130, 134),)}
-    tared.connect(earlier=(first.said(stored=((135, 149),), lost=lost, missed_slots=7),))
-    tared.send_lacking()
-    sealed = tared.finish(session)
-    assert sealed["complete"] == "lossy"
-    assert sealed["lost"] == {"corrupt": 5, "disk_full": 10}
-    ledger = session.ledger()
-    assert ledger["parts"][0]["recorded"] == 65
-    assert ledger["missed_slots"] == sealed["missed_slots"] == 7
-
-
-def test_a_stop_falls_into_the_stream_of_its_time(tared: FakeNode, session: Recording) -> None:
-    tared.frames(30)
-    tared.reboot()
-    tared.frames(40)  # long ago, as the frames before
-    session.stop()
-    tared.frames(25, now=True)
-    restart_now(tared)
-    tared.frames(10)
-    first, second = tared.come_back()
-    sealed = session.sealed()
-    assert whole_parts_of(sealed) == [(first.stream_id, 70, 149), (second.stream_id, 0, 39)]
-
-
-def test_a_stop_between_two_streams_ends_the_first_one(tared: FakeNode, session: Recording) -> None:
-    tared.frames(30)
-    session.stop()
-    restart_now(tared)
-    tared.frames(10)
-    restart_now(tared)
-    first, _ = tared.come_back()
-    sealed = session.sealed()
-    assert whole_parts_of(sealed) == [(first.stream_id, 70, 149)]
-
-
-def test_a_stop_in_the_present_stream_makes_it_a_part(tared: FakeNode, session: Recording) -> None:
-    tared.reboot()
-    tared.frames(40)
-    session.stop()
-    tared.frames(10, now=True)
-    [first] = tared.before
-    tared.connect(earlier=(first.said(),))
-    tared.send_again(tared.sent[-1])  # the newest first
-    assert session.now()["state"] == "pending"
-    tared.send_again(tared.sent[0])
-    sealed = session.sealed()
-    assert whole_parts_of(sealed) == [(first.stream_id, 70, 119), (tared.stream_id, 0, 39)]
-
-
 def test_frames_slower_than_the_nominal_rate_belong_to_the_session(
     tared: FakeNode, session: Recording
 ) -> None:
@@ -171,65 +95,6 @@ def test_frames_slower_than_the_nominal_rate_belong_to_the_session(
         tared.send_again(frames)
     sealed = session.sealed()
     assert whole_parts_of(sealed) == [(first.stream_id, 70, 119), (tared.stream_id, 0, 39)]
-
-
-def test_a_stop_among_frames_of_the_backlog_waits_for_them(
-    tared: FakeNode, session: Recording
-) -> None:
-    tared.frames(30)
-    session.stop()
-    tared.frames(30, now=True)
-    tared.frames(10)
-    tared.connect()
-    tared.send_again(tared.sent[-1])  # newest first
-    tared.taken_in()
-    time.sleep(0.1)
-    assert parts_of(session.now()) == [(tared.stream_id, 70, None)]
-    tared.send_again(tared.sent[-3])
-    tared.send_again(tared.sent[-2])
-    sealed = session.sealed()
-    assert whole_parts_of(sealed) == [(tared.stream_id, 70, 149)]
-
-
-@pytest.mark.real_time
-def test_a_stop_among_lost_frames_is_placed_by_the_rate(tared: FakeNode) -> None:
-    session = tared.record()
-    tared.deliver(50)
-    session.stop()
-    # Five hundred frames a second from now on; the first ten thousand are lost.
-    tared.next_t_mono_ns = time.monotonic_ns()
-    lost = tared.frames(10_000)
-    tared.next_t_mono_ns -= 10_000 * 2_000_000
-    tared.next_t_mono_ns += 19_000_000_000
-    tared.send(10)
-    first, last = int(lost.seq[0]), int(lost.seq[-1])
-    tared.say_lost(disk_full=[[first, last]])
-    sealed = session.sealed()
-    end = sealed["parts"][0]["seq_last"]
-    assert sealed["lost"] == {"disk_full": end - 119}
-    # 19 of 20 seconds came after the stop.
-    assert 0.03 * 10_000 < end - 119 < 0.07 * 10_000
-
-
-def test_other_tiles_in_an_earlier_stream_begin_another_session(
-    running: Running, tared: FakeNode
-) -> None:
-    session = tared.record(name="mud")
-    tared.deliver(50)
-    tared.restart()
-    tared.tiles = 3
-    tared.frames(40)
-    tared.reboot()
-    first, second = tared.come_back()
-    tared.deliver(20)
-    sealed = session.sealed()
-    assert parts_of(sealed) == [(first.stream_id, 70, 119)]
-    assert "other tiles" in sealed["problem"]
-    other = running.only_session(but=session)
-    assert (other["name"], other["state"]) == ("mud (2)", "recording")
-    sealed = tared.finish(other)
-    assert parts_of(sealed) == [(second.stream_id, 0, 39), (tared.stream_id, 0, 19)]
-    assert sealed["complete"] is True
 
 
 def test_a_forgotten_stream_has_a_tail_bounded_by_its_silence(
@@ -323,26 +188,3 @@ def test_a_pre_roll_reaches_into_the_backlog(tared: FakeNode) -> None:
     tared.deliver(30)
     sealed = tared.finish(session)
     assert whole_parts_of(sealed) == [(tared.stream_id, first, 519)]
-
-
-def test_a_marker_keeps_its_instant_without_the_node_and_after_the_stop(
-    running: Running, tared: FakeNode
-) -> None:
-    session = tared.record()
-    url = f"{session.url}/markers"
-    tared.leave()
-    assert running.http.post(url, json={"label": "away", "t_ns": 5}).status_code == 201
-    session.stop()
-    assert running.http.post(url, json={"label": "pending", "t_ns": 7}).status_code == 201
-    tared.connect()
-    tared.send(10, now=True)
-    session.sealed()
-    before = session.now()
-    assert running.http.post(url, json={"label": "sealed", "t_ns": 6}).status_code == 201
-    markers = running.http.get(url).json()["items"]
-    assert [(m["label"], m["t_ns"]) for m in markers] == [
-        ("away", 5),
-        ("sealed", 6),
-        ("pending", 7),
-    ]
-    assert session.now()["sha256"] == before["sha256"]

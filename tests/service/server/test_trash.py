@@ -15,7 +15,6 @@ import service.server
 import service.server.recorder
 from devices.errors import StorageError
 from service.sessions.sealing import seal_session
-from storage.intervals import Intervals
 from storage.sessions.folder import DELETED_PREFIX, SessionsFolder
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
@@ -101,17 +100,6 @@ def test_a_session_is_not_deleted_during_its_seal(
     session.sealed()
 
 
-def test_an_unknown_session_is_not_found(running: Running) -> None:
-    for method, path in (
-        ("DELETE", "/sessions/20200101T000000Z-000000"),
-        ("POST", "/sessions/20200101T000000Z-000000/abandon-missing"),
-        ("POST", "/trash/20200101T000000Z-000000/restore"),
-        ("POST", "/trash/..%2fx/restore"),
-        ("POST", "/trash/x/restore"),
-    ):
-        assert running.http.request(method, path).status_code == 404, path
-
-
 def test_a_pending_session_needs_its_frames_until_the_trash_is_emptied(
     running: Running, tared: FakeNode
 ) -> None:
@@ -192,34 +180,6 @@ def test_a_session_is_sealed_without_its_node(running: Running, tared: FakeNode)
     assert done["pending_frames"] == 0
 
 
-def test_abandoned_frames_are_lost_with_this_reason(running: Running, tared: FakeNode) -> None:
-    session = tared.record()
-    tared.send(50)
-    tared.frames(30)
-    tared.send(20)
-    tared.taken_in()
-    session.stop()
-    tared.send(10, now=True)
-    until(lambda: session.now()["parts"][0]["seq_last"] == 169)
-    assert session.now()["pending_frames"] == 30
-    running.http.post(f"{session.url}/abandon-missing")
-    done = session.sealed()
-    assert (done["complete"], done["frames"], done["lost"]) == ("lossy", 70, {"abandoned": 30})
-    ledger = session.ledger()
-    assert ledger["parts"][0]["max_lost_tail_frames"] == 0
-
-
-def test_a_recording_session_is_neither_deleted_nor_abandoned(
-    running: Running, tared: FakeNode
-) -> None:
-    recording = tared.record()
-    assert_refused(running.http.post(f"{recording.url}/abandon-missing"), 409, "Stop it first")
-    assert_refused(running.http.delete(recording.url), 409, "Stop it first")
-    assert recording.now()["state"] == "recording"
-    tared.finish(recording)
-    assert running.http.post(f"{recording.url}/abandon-missing").status_code == 409
-
-
 # --- damage ---------------------------------------------------------------------------------------
 
 
@@ -294,20 +254,6 @@ def test_half_written_files_of_dead_processes_are_removed_at_the_start(
     running.restart()
     assert not stale.exists()
     assert all(path.exists() for path in foreign)
-
-
-def test_frames_of_an_unsealed_session_are_not_deleted(
-    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("service.server.node.RING_DURATION_NS", 0)
-    leave_pending(tared)
-    node = running.server.nodes.get("bench")
-    running.call(
-        lambda: node.delete_old_frames_and_up_to_one_ended_journal(
-            running.server.recorder.collect_needed_frames("bench")
-        )
-    )
-    assert not (Intervals([(70, 119)]) - node.present_stream.stored)
 
 
 def test_unneeded_journals_are_deleted_one_at_a_time(running: Running, tared: FakeNode) -> None:

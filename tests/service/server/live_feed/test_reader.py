@@ -402,18 +402,6 @@ def test_latest_gives_the_newest_piece_and_says_what_lies_between(world: World) 
     assert missed == ("slow", FIRST, 0, came[2] - 1)
 
 
-@pytest.mark.parametrize("policy", ["lossless", "drop_oldest", "latest"])
-def test_one_who_comes_back_in_the_middle_of_a_piece_has_each_frame_once(
-    world: World, policy: Policy
-) -> None:
-    world.send_newest(40)
-    item = world.read(world.reader(policy, Position(FIRST, 0)))
-    middle = (item.first_seq + item.last_seq) // 2
-    following = world.read(world.reader(policy, Position(FIRST, middle)))
-    assert (following.first_seq, following.last_seq) == (middle, item.last_seq)
-    assert following.batch[0].pressure_raw.tolist() == item.batch[0].pressure_raw[middle:].tolist()
-
-
 def test_what_was_used_least_lately_goes_and_no_more_is_kept_than_is_allowed() -> None:
     shared = EncodeCache(bytes_max=30)
     for key in range(3):
