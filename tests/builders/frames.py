@@ -115,8 +115,8 @@ def laid_out(batch: FrameBatch, how: str) -> FrameBatch:
 
 
 def cut_up(batch: FrameBatch, cuts: Iterable[int], how: str = "as it is") -> list[FrameBatch]:
-    """The frames in pieces, each laid out for itself; cuts beyond the last frame do not count."""
-    edges = sorted(cut for cut in cuts if 0 < cut < len(batch))
+    """The frames in pieces, each laid out for itself; a cut twice, or at an end, leaves none."""
+    edges = sorted(cut for cut in cuts if 0 <= cut <= len(batch))
     return [laid_out(batch.slice_rows(a, b), how) for a, b in pairwise((0, *edges, len(batch)))]
 
 

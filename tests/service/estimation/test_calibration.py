@@ -18,10 +18,13 @@ from service.estimation.calibration import (
     is_increasing_cubic,
     make_paper_shape_preset,
 )
+from service.estimation.effects import Effects, FlowEffect, HysteresisEffect, Parameter
 from service.estimation.models.static import StaticParams, compute_forces
-from tests.builders.calibrations import make_calibration, newton_tile
+from tests.builders.calibrations import make_calibration, make_effects, newton_tile
 
 NUMBERS = st.floats(-100, 100)
+SOME = Parameter(value=0.1, sigma=0.1)
+FLOW = FlowEffect(part=SOME, stress_n=SOME, power=Parameter(value=4.0, sigma=0.1))
 
 
 def make_one_tile_content() -> dict[str, Any]:
@@ -55,6 +58,15 @@ def change(value: object) -> object:
     high_kpa=st.floats(0.1, 100),
     variance=st.floats(0, 1),
     serial=st.text(st.characters(exclude_categories=["C"]), min_size=1, max_size=8),
+    changes=st.none()
+    | st.fixed_dictionaries(
+        {},
+        optional={
+            "refused": st.just({"ambient": "for a test"}),
+            "hysteresis": st.just(HysteresisEffect(part=(SOME,) * 3, flow=FLOW)),
+            "late_s": st.builds(Parameter, value=st.floats(-60, 60), sigma=st.floats(0, 1)),
+        },
+    ),
 )
 def test_a_calibration_survives_its_json_bit_by_bit(
     c: tuple[float, float, float, float],
@@ -63,6 +75,7 @@ def test_a_calibration_survives_its_json_bit_by_bit(
     high_kpa: float,
     variance: float,
     serial: str,
+    changes: dict[str, Any] | None,
 ) -> None:
     tile = newton_tile(
         serial,
@@ -72,6 +85,7 @@ def test_a_calibration_survives_its_json_bit_by_bit(
         range_kpa=(0.0, high_kpa),
         covariance=((variance, 0.1, 0.0), (0.1, 1.0, 0.0), (0.0, 0.0, 1 / 3)),
         r2=0.9999,
+        effects=Effects() if changes is None else make_effects(**changes),
     )
     calibration = make_calibration(tile)
     again = Calibration.from_json_verifying_id(calibration.to_json(), where="here")
@@ -94,8 +108,9 @@ def test_the_id_is_of_the_content() -> None:
 
 
 def test_an_edit_of_any_field_of_the_file_is_refused() -> None:
-    text = make_calibration(newton_tile("T01"), newton_tile("T02", rmse_n=0.1)).to_json()
-    paths = list_leaves(json.loads(text))
+    calibration = make_calibration(newton_tile("T01"), newton_tile("T02", rmse_n=0.1))
+    text = calibration.to_json()
+    paths, edited = list_leaves(json.loads(text)), 0
     assert len(paths) > 50
     for path in paths:
         content = json.loads(text)
@@ -106,14 +121,10 @@ def test_an_edit_of_any_field_of_the_file_is_refused() -> None:
         with pytest.raises(CalibrationError) as caught:
             Calibration.from_json_verifying_id(json.dumps(content), where="bench.json")
         assert "bench.json" in str(caught.value), path
-
-
-def test_an_edited_number_is_refused_as_an_edit() -> None:
-    calibration = make_calibration(newton_tile("T01"))
-    text = calibration.to_json().replace('"repeats": 4', '"repeats": 5')
-    with pytest.raises(CalibrationError, match="edited by hand or damaged") as caught:
-        Calibration.from_json_verifying_id(text, where="bench.json")
-    assert calibration.id in str(caught.value)
+        if "edited by hand or damaged" in str(caught.value):
+            edited += 1
+            assert path == ("id",) or calibration.id in str(caught.value)
+    assert edited > 25, "its values are valid"
 
 
 @pytest.mark.parametrize(

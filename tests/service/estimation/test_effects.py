@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from service.estimation.calibration import Calibration
 from service.estimation.effects import (
     WALL_PER_KPA,
     Effects,
@@ -19,7 +18,7 @@ from service.estimation.effects import (
     RubberEffect,
     TemperatureEffect,
 )
-from tests.builders.calibrations import make_calibration, make_effects, newton_tile
+from tests.builders.calibrations import make_effects
 
 
 def p(value: float) -> Parameter:
@@ -91,16 +90,3 @@ def test_the_limits_themselves_are_accepted() -> None:
     assert HysteresisEffect(part=(p(0.0), p(0.0), p(0.999))).part[2].value == 0.999
     assert FlowEffect(part=p(0.4), stress_n=p(0.01), power=p(4.0)).part.value == 0.4
     assert make_effects(late_s=p(-60.0)).late_s is not None
-
-
-def test_effects_survive_a_calibration_file_to_the_bit() -> None:
-    flow = FlowEffect(part=p(0.08), stress_n=p(0.2), power=p(4.0))
-    loop = HysteresisEffect(part=(p(0.1), p(0.1), p(0.1)), flow=flow)
-    for effects in (
-        make_effects(refused={"ambient": "for a test"}),
-        make_effects(hysteresis=loop),
-    ):
-        calibration = make_calibration(newton_tile("T01", effects=effects))
-        again = Calibration.from_json_verifying_id(calibration.to_json(), where="a file")
-        assert again.get_tile_or_wildcard("T01").effects == effects
-        assert again.id == calibration.id

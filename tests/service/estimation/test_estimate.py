@@ -143,15 +143,6 @@ def test_a_growing_buffer_gives_the_same_bits(lag_ms: float, models: tuple[str, 
         assert_same_bits(whole, estimate(plan, *cut_up(frames, cuts)))
 
 
-def test_an_empty_batch_changes_nothing() -> None:
-    plan = newton_plan(array_at(SQUARE, servo=make_servo()), lag_ms=10)
-    frames = draw_wild_frames(30, 4, 4)
-    nothing = frames.slice_rows(0, 0)
-    first, last = cut_up(frames, [20])
-    pieces = [nothing, first, nothing, nothing, last, nothing]
-    assert_same_bits(estimate(plan, *pieces), estimate(plan, frames))
-
-
 @pytest.mark.parametrize(
     ("lag_ms", "first_in_contact"), [(0, 15), (4, 13), (8, 11), (10, 10), (50, 10)]
 )
@@ -233,14 +224,6 @@ def test_no_sum_is_stated_with_a_load_beyond_the_range(
     assert (e.grf_lower_bound_n <= true_n).all()
     doubt = EstimateFlag.SATURATED | EstimateFlag.TILE_MISSING
     assert ((e.estimate_flags & doubt) != 0).all()
-
-
-def test_an_unread_temperature_is_that_of_the_frame_before() -> None:
-    frames = loaded_frames(repeat_load([7, 8, 9, 10]))
-    frames.temperature_raw[0, 0] = frames.temperature_raw[11, 0] = 65535
-    e = estimate(newton_plan(array_at(SQUARE)), frames)
-    assert np.isnan(e.grf_n[0])
-    assert e.grf_n[1:] == pytest.approx([34.0] * 11)
 
 
 @settings(max_examples=30, deadline=None)

@@ -46,20 +46,6 @@ def test_a_faulty_tile_is_missing_and_its_neighbours_are_not(fault: TileFlag) ->
     assert e.grf_n[10] == pytest.approx(34)
 
 
-def test_a_retried_or_high_reading_is_not_missing() -> None:
-    flags = np.full((12, 4), TileFlag.RETRIED | TileFlag.OVER_RANGE)
-    e = estimate_load([7, 8, 9, 10], tile_flags=flags)
-    assert e.grf_n == pytest.approx([34.0] * 12)
-
-
-def test_unread_counts_without_a_flag_are_missing() -> None:
-    frames = loaded_frames(repeat_load([7, 8, 9, 10]))
-    frames.pressure_raw[11, 0] = 65535
-    e = estimate(newton_plan(INFO), frames)
-    assert np.isnan(e.grf_n[11])
-    assert find(EstimateFlag.TILE_MISSING, e.estimate_flags) == [11]
-
-
 # --- flags of forces ------------------------------------------------------------------------------
 
 
@@ -186,22 +172,3 @@ def test_a_lost_tare_leaves_the_angle_and_missing_tiles(lag_ms: float) -> None:
     expected = EstimateFlag.TARE_LOST | EstimateFlag.COP_MASKED
     assert e.estimate_flags.tolist() == [expected] * 11 + [expected | EstimateFlag.TILE_MISSING]
     assert e.angle_rad.tobytes() == whole.angle_rad.tobytes()
-
-
-def test_every_flag_has_its_documented_bit() -> None:
-    assert {str(flag.name).lower(): int(flag) for flag in EstimateFlag} == {
-        "saturated": 1,
-        "extrapolated": 2,
-        "outlier_replaced": 4,
-        "gap": 8,
-        "cop_masked": 16,
-        "tile_missing": 32,
-        "assumed_scale": 64,
-        "tare_old": 128,
-        "over_rated": 256,
-        "tare_lost": 512,
-        "after_saturation": 1024,
-        "stuck": 2048,
-        "clipped": 4096,
-        "baseline_lost": 8192,
-    }

@@ -122,7 +122,7 @@ def smoothed(kpa: list[Exact], t_ns: list[int]) -> list[Exact]:
                 value = p
             else:
                 passed = max(mpf(0), mpf(now_ns - last_ns) / 10**9)
-                value += (1 - mp.exp(-passed / mpf(ambient.SMOOTHING_S))) * (p - value)
+                value += (1 - mp.exp(-passed / (mpf(3) / 100))) * (p - value)
             last_ns = now_ns
         is_recent = now_ns - last_ns <= ambient.HELD_S * 1e9
         out.append(value if is_recent else None)

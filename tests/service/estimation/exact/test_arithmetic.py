@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpmath import mp, mpf
 
-from devices.flags import EstimateFlag, TileFlag
+from devices.flags import EstimateFlag
 from devices.frames import NOT_READ, FrameBatch
 from service.estimation.calibration import TileCalibration, make_paper_shape_preset
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
@@ -172,10 +172,3 @@ def test_forces_of_any_size_and_sign_and_their_centre_are_exact() -> None:
     e = assert_exact(plan_with(*CHIPS["real"]), frames)
     assert np.isfinite(e.cop_x_m).sum() > 30
     assert (e.estimate_flags & EstimateFlag.SATURATED).any()
-
-
-def test_the_reference_gives_the_data_sheets_example() -> None:
-    # hardware.md 1.2: 96.587326 kPa with exact coefficients; a real part of a forum: 100.8227 kPa
-    assert abs(sample_stage.pressure_kpa(DATA_SHEET_CHIP, 410, 507) - mpf("96.587326")) < 1e-6
-    assert abs(sample_stage.pressure_kpa(FORUM_CHIP, 272, 521) - mpf("100.8227")) < 1e-4
-    assert TileFlag.UNUSABLE == 1 | 2 | 8 | 32, "the reference's bits of a faulty tile"

@@ -6,20 +6,11 @@ import numpy as np
 import pytest
 
 from devices.errors import UsageError
-from service.estimation.models.ambient import SMOOTHING_S, AmbientState, low_pass_ambient_kpa
+from service.estimation.models.ambient import AmbientState, low_pass_ambient_kpa
 from tests.builders.arrays import array_at
 from tests.builders.calibrations import make_effects, newton_tile
 from tests.builders.estimates import newton_plan
 from tests.builders.readings import through
-
-
-def test_a_step_of_water_follows_a_low_pass_of_thirty_milliseconds() -> None:
-    t_s = np.array([0.0, 0.001, 0.031, 0.061, 60.0])
-    t_ns = np.rint(1e9 * t_s).astype(np.int64)
-    kpa = np.array([0.0, 1.0, 1.0, 1.0, 1.0])
-    smoothed_kpa = through(low_pass_ambient_kpa, None, AmbientState.array(1), kpa, t_ns)
-    expected_kpa = [0.0, *(1 - np.exp(-t_s[1:] / SMOOTHING_S))]
-    assert smoothed_kpa == pytest.approx(expected_kpa, abs=1e-9)
 
 
 def test_a_silent_bare_tile_keeps_its_pressure_for_a_fifth_of_a_second() -> None:

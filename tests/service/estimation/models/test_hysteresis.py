@@ -41,26 +41,6 @@ def test_forces_are_recovered_from_their_loop(
     assert compensate(apparent_n, part) == pytest.approx(force_n, abs=1e-11, rel=1e-12)
 
 
-def test_plays_lag_the_first_load_by_their_opening() -> None:
-    # All open at 0.4 F until the narrowest is at its width, which is at 1.5 N.
-    force_n = np.linspace(0.0, WIDTHS_N[0] / LOOP_OPENING, 20)
-    apparent_n = force_n * (1 - LOOP_OPENING * sum(PART))
-    assert compensate(apparent_n.tolist()) == pytest.approx(force_n, abs=1e-12)
-
-
-def test_the_branches_of_a_large_loop_are_twice_the_widths_apart() -> None:
-    width_n = sum(w * r for w, r in zip(PART, WIDTHS_N, strict=True))
-    out = compensate([30.0, 50.0, 30.0])
-    assert out[0] - out[2] == pytest.approx(2 * width_n, abs=1e-12)
-    assert out[1] == pytest.approx(50.0 + width_n, abs=1e-12)
-
-
-def test_an_unloaded_dome_starts_a_new_loop() -> None:
-    out = compensate([30.0, 3.0, 0.0, -2.0, 0.0, 0.7])
-    assert out[2:5].tolist() == [0.0, -2.0, 0.0]
-    assert out[5] == compensate([0.7])[0]
-
-
 @given(st.lists(st.floats(-1.0, 50.0), min_size=2, max_size=30), st.floats(0.0, 1.0))
 def test_more_apparent_force_is_more_force(apparent_n: list[float], more_n: float) -> None:
     last_n = compensate([*apparent_n, apparent_n[-1]])[-1]

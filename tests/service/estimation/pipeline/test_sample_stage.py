@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from devices.arrays import Floats
@@ -17,7 +17,7 @@ from service.estimation.pipeline.sample_stage import unwrap_pressure
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP, PERIOD_NS, array_at
 from tests.builders.calibrations import newton_tile
 from tests.builders.estimates import estimate, newton_plan
-from tests.builders.frames import assert_same_bits, loaded_frames
+from tests.builders.frames import loaded_frames
 
 # --- unwrap ---------------------------------------------------------------------------------------
 
@@ -90,14 +90,6 @@ def test_an_uncertain_delay_makes_a_changing_force_uncertain(
     added = compute_added_variance(own_s, common_s)
     assert added[10:20] == pytest.approx(np.full(10, expected), rel=1e-6)
     assert added[[*range(5), *range(-4, 0)]] == pytest.approx(np.zeros(9), abs=1e-12)
-
-
-@settings(max_examples=10)
-@given(cut=st.integers(1, 28))
-def test_an_uncertain_delay_gives_the_same_bits_in_any_batches(cut: int) -> None:
-    plan = plan_with_delay(1e-4, 2e-4)
-    parts = RAMP.slice_rows(0, cut), RAMP.slice_rows(cut, len(RAMP))
-    assert_same_bits(estimate(plan, *parts), estimate(plan, RAMP))
 
 
 def test_a_silent_tile_has_no_rate_and_changes_no_later_one() -> None:

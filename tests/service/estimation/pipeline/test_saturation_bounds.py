@@ -12,8 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from devices.arrays import Bools, Floats
 from devices.flags import EstimateFlag, TileFlag
@@ -26,7 +24,7 @@ from service.estimation.records import Estimates
 from tests.builders.arrays import UNLOADED_KPA, make_array
 from tests.builders.calibrations import make_calibration, make_effects, make_tare, newton_tile
 from tests.builders.estimates import estimate
-from tests.builders.frames import assert_same_bits, cut_up, make_frames
+from tests.builders.frames import make_frames
 
 STEP_S = 0.002
 NOISE_KPA = 0.165
@@ -183,23 +181,3 @@ def test_a_load_is_unseen_after_50_ms_without_an_answer(frames: int, flagged: li
     e = estimate(plan, draw_frames(np.full(300, 110.0), rng, away))
     found = np.flatnonzero(e.estimate_flags & EstimateFlag.AFTER_SATURATION)
     assert found[:1].tolist() == flagged
-
-
-@settings(max_examples=15, deadline=None)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    cuts=st.lists(st.integers(0, 1500), max_size=6),
-    lag_ms=st.sampled_from([0.0, 10.0]),
-)
-def test_any_batches_give_the_same_bits_through_an_unseen_load(
-    seed: int, cuts: list[int], lag_ms: float
-) -> None:
-    rng = np.random.default_rng(seed)
-    dome, plan = draw_dome(rng, lag_ms)
-    true_n = draw_load(rng)[:1500]
-    kpa = dome.compute_response(STEP_S * np.arange(len(true_n), dtype=np.float64), true_n).kpa
-    away = np.zeros(len(true_n), dtype=bool)
-    begin = rng.integers(0, 1400)
-    away[begin : begin + 60] = True
-    frames = draw_frames(kpa, rng, away)
-    assert_same_bits(estimate(plan, frames), estimate(plan, *cut_up(frames, set(cuts))))

@@ -76,16 +76,6 @@ def test_a_good_recording_has_its_facts() -> None:
     assert facts.band_95[0].mean_n == facts.band_95[0].new_loading_n == 0.0
 
 
-def test_the_band_is_t_based_over_the_repeats() -> None:
-    gains = (0.97, 1.0, 1.0, 1.03)
-    tile = fit_static_curve(record(gains=gains))
-    assert tile.rig is not None
-    last = tile.rig.band_95[-1]
-    standard_error = np.std(gains, ddof=1) / 2
-    assert last.mean_n == pytest.approx(3.182446 * standard_error * last.force_n, rel=1e-3)
-    assert last.new_loading_n > last.mean_n
-
-
 def test_repeats_of_two_files_are_fitted_together_from_their_own_zeros() -> None:
     one = record(gains=(0.98, 1.0))
     other = record(gains=(1.0, 1.02), baseline_kpa=101.5, zero_n=-3.0, where="more.parquet")
