@@ -1,17 +1,12 @@
-"""A real server, a real node on emulated tiles, and a real browser."""
+"""A real browser, and servers for its pages."""
 
 from __future__ import annotations
 
-import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 from playwright.sync_api import Browser, Page, Route, expect, sync_playwright
 
@@ -20,8 +15,6 @@ from tests.service.running import Running
 from tests.waiting import PATIENCE_S
 from tests.web.login import log_in
 from tests.web.scripted import Scripted
-
-COMMAND = [sys.executable, "-c", "from service.cli.main import main; main()"]
 
 CHROMIUM = next(
     (
@@ -40,69 +33,6 @@ CHROMIUM_OPTIONS = [
 ]
 
 expect.set_options(timeout=1e3 * PATIENCE_S)
-
-
-@dataclass
-class Field:
-    """Server and node as processes of their own, on one machine."""
-
-    folder: Path
-    environment: dict[str, str]
-    port: int = 0
-    server: subprocess.Popen[str] | None = None
-    others: list[subprocess.Popen[bytes]] = field(default_factory=list)
-
-    @property
-    def url(self) -> str:
-        return f"http://127.0.0.1:{self.port}"
-
-    def serve(self) -> None:
-        options = ["serve", "--port", str(self.port), "--data", str(self.folder / "data")]
-        self.server = subprocess.Popen(
-            COMMAND + options, env=self.environment, stdout=subprocess.PIPE, text=True
-        )
-        assert self.server.stdout is not None
-        line = self.server.stdout.readline()
-        self.port = int(line.strip().rstrip("/").rsplit(":", 1)[1])
-
-    def start_node(self, scene: str, *options: str) -> None:
-        node = ["node", "--scene", scene, "--server", self.url, *options]
-        self.others.append(subprocess.Popen(COMMAND + node, env=self.environment))
-
-    def get(self, path: str) -> Any:
-        return httpx.get(f"{self.url}/api/v1{path}", timeout=PATIENCE_S, trust_env=False).json()
-
-    def is_tared(self) -> bool:
-        return any(node["tare"] for node in self.get("/nodes")["items"])
-
-    def kill_server(self) -> None:
-        assert self.server is not None
-        self.server.kill()
-        self._reap(self.server)
-
-    def close(self) -> None:
-        processes: list[subprocess.Popen[Any]] = [*self.others]
-        if self.server is not None:
-            processes.append(self.server)
-        for process in processes:
-            process.terminate()
-        for process in processes:
-            self._reap(process)
-
-    @staticmethod
-    def _reap(process: subprocess.Popen[Any]) -> None:
-        try:
-            process.wait(10)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait(10)
-        if process.stdout is not None:
-            process.stdout.close()
-
-
-@pytest.fixture(scope="session")
-def field_environment(bench_cache: Path) -> dict[str, str]:
-    return {**os.environ, "XDG_CACHE_HOME": str(bench_cache)}
 
 
 @pytest.fixture(scope="session")
