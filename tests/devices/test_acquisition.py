@@ -351,12 +351,3 @@ def test_an_unusable_reading_is_not_also_over_range(flag: TileFlag) -> None:
     RangeDetector((make_tile(registers=DATA_SHEET_CHIP),)).flag_out_of_range(batch)
     added = 0 if flag & TileFlag.UNUSABLE else TileFlag.OVER_RANGE
     assert batch.tile_flags[0, 0] == flag | added
-
-
-def test_a_tile_beyond_its_range_is_flagged_and_keeps_its_counts() -> None:
-    one = four_tiles()
-    before = one.take(5).pressure_raw[-1, 1]
-    with one.world.inject_fault("over_range", "T02"):
-        batch = one.take(20)
-    assert (batch.tile_flags == [0, TileFlag.OVER_RANGE, 0, 0]).all()
-    assert (batch.pressure_raw[:, 1] < before - 200).all()  # 45 kPa

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from smbus2 import i2c_msg
 
 from devices.array.schedules import BusTiming, compute_frame_s
-from devices.scene.emulation_sections import ReadDuringConversion
 from devices.scene.hardware_sections import ScheduleName
 from tests.devices.rigs import (
     CONVERT,
@@ -264,17 +263,3 @@ def test_no_read_begins_before_the_conversion_of_its_part_has_finished(
     wires.on_transaction = before
     scanned(array_on(wires, schedule), 21)  # some of them with a second reading of a tile
     assert reads >= 20 * len(plugs)
-
-
-@pytest.mark.parametrize("mode", ["stale", "abort", "torn"])
-@every_schedule
-def test_no_conversion_is_lost_or_torn_whatever_the_effect_of_an_early_read(
-    schedule: ScheduleName, mode: ReadDuringConversion
-) -> None:
-    tc_ns = [1_412_345, 1_999_999, 1_600_001, 1_723_456]
-    _, array = settled_on(TWO_MUXES, schedule, mode=mode, tc_ns=tc_ns)
-    last = array.scan_frame().pressure_raw
-    for _ in range(100):
-        scan = array.scan_frame()
-        assert scan.pressure_raw == [pressure_raw + 1 for pressure_raw in last]
-        last = scan.pressure_raw

@@ -7,8 +7,6 @@ from itertools import count, repeat
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from devices.array.tile import TileHealth
 from devices.flags import TileFlag
@@ -175,16 +173,6 @@ def test_faults_are_counted_by_reason() -> None:
     tile.count_faults(TileFlag.NO_ANSWER)
     tile.count_faults(TileFlag.NO_ANSWER | TileFlag.RETRIED)
     assert tile.fault_counts == {"no_answer": 2, "retried": 1}
-
-
-@settings(max_examples=50)
-@given(pressure_raw=st.integers(0, 1023), temperature_raw=st.integers(1, 1022))
-def test_a_reading_equal_to_the_ones_before_is_no_jump(
-    pressure_raw: int, temperature_raw: int
-) -> None:
-    tile = settled(pressure_raw, temperature_raw)
-    assert not tile.is_jump(pressure_raw, temperature_raw)
-    assert not tile.is_far_jump(pressure_raw, temperature_raw)
 
 
 def test_half_as_far_is_a_jump_on_a_disturbed_line() -> None:

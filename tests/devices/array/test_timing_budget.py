@@ -58,31 +58,13 @@ D: ScheduleName = "per_mux"
     ("conditions", "schedule", "bytes_read", "rates_hz"),
     [
         (FAST, A, 4, (544, 265, 132, 66, 33, 17, 8)),
-        (FAST, A, 2, (558, 271, 136, 68, 34, 17, 8)),
-        (FAST, B, 4, (544, 476, 395, 295, 192, 113, 62)),
-        (FAST, B, 2, (558, 497, 425, 330, 223, 135, 75)),
         (FAST, C, 4, (544, 544, 544, 435, 213, 106, 53)),
-        (FAST, C, 2, (558, 558, 558, 515, 251, 126, 63)),
-        (FAST, D, 4, (257, 129, 64)),
-        (FAST, D, 2, (314, 158, 79)),
-        (SLOW, A, 4, (392, 182, 91, 45, 23, 11, 6)),
-        (SLOW, A, 2, (422, 195, 97, 49, 24, 12, 6)),
-        (SLOW, B, 4, (392, 277, 188, 114, 62, 33, 17)),
         (SLOW, B, 2, (422, 308, 217, 136, 76, 40, 21)),
-        (SLOW, C, 4, (392, 392, 217, 109, 53, 27, 13)),
-        (SLOW, C, 2, (422, 422, 258, 129, 63, 31, 16)),
         (SLOW, D, 4, (64, 32, 16)),
-        (SLOW, D, 2, (79, 39, 20)),
-        (PYTHON, A, 4, (491, 233, 116, 58, 29, 14, 7)),
         (PYTHON, A, 2, (502, 238, 119, 59, 30, 15, 7)),
         (PYTHON, B, 4, (491, 403, 317, 223, 135, 76, 40)),
-        (PYTHON, B, 2, (502, 418, 336, 242, 150, 85, 46)),
-        (PYTHON, C, 4, (491, 491, 491, 267, 130, 65, 32)),
         (PYTHON, C, 2, (502, 502, 502, 296, 143, 72, 36)),
-        (PYTHON, D, 4, (159, 80, 40)),
         (PYTHON, D, 2, (180, 90, 45)),
-        (LONGEST, A, 4, (309, 152, 76, 38, 19, 9, 5)),
-        (LONGEST, B, 4, (309, 286, 254, 209, 151, 98, 57)),
         (LONGEST, C, 4, (309, 309, 309, 309, 213, 106, 53)),
     ],
 )
@@ -140,21 +122,11 @@ def test_a_schedule_opens_as_many_channels_as_its_broadcast(
     assert count_broadcast_channels(schedule, timing(16).muxes) == width
     check_broadcast_channels(schedule, timing(16).muxes, width)
     if width > 1:
-        with pytest.raises(SceneError, match=f"opens {width} channels at once"):
+        reason = f"{schedule!r} opens {width} channels at once.*at most {width - 1}.*pull-ups"
+        with pytest.raises(SceneError, match=reason):
             check_broadcast_channels(schedule, timing(16).muxes, width - 1)
     uneven = [0x70, 0x71, 0x71, 0x71, 0x72]  # the fullest mux counts
     assert count_broadcast_channels(schedule, uneven) == {B: 5, D: 3}.get(schedule, 1)
-
-
-def test_a_broadcast_of_too_many_channels_is_refused_with_the_reason() -> None:
-    with pytest.raises(SceneError) as caught:
-        check_broadcast_channels("simultaneous", timing(16).muxes, 8)
-    text = str(caught.value)
-    assert "'simultaneous' opens 16 channels at once" in text
-    assert "at most 8" in text
-    assert "pull-ups" in text
-    assert caught.value.where == "array.broadcast_channels"
-    assert "per_mux" in caught.value.remedy
 
 
 # Choice

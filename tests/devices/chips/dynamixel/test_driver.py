@@ -91,30 +91,10 @@ def status_1(error: int, *data: int, servo_id: int = 1) -> bytes:
 
 # hardware.md 5.1; three bytes are requested, see devices.chips.dynamixel.protocol
 READ_3_FROM_36 = bytes.fromhex("FFFF 01 04 02 24 03 D1")
-READ_3_FROM_0 = bytes.fromhex("FFFF 01 04 02 00 03 F5")
 STATUS_1_AT_548 = status_1(0, 0x24, 0x02, 0)
 
 
 # Both protocols
-
-
-def test_requests_of_protocol_2_are_the_golden_ones() -> None:
-    port = ScriptedPort(STATUS_OF_1_AT_166)
-    reading = servo_on(port).read_position()
-    assert (reading.counts, reading.half_width_ns) == (166, 0)
-    assert port.written == READ_POSITION_OF_1
-    port = ScriptedPort(status(0, 55, 1, 42))
-    assert servo_on(port).read_identity() == ServoIdentity(311, 42)
-    assert port.written == PING_1
-
-
-def test_requests_of_protocol_1_are_the_golden_ones() -> None:
-    port = ScriptedPort(STATUS_1_AT_548)
-    assert servo_on(port, protocol=1).read_position().counts == 548
-    assert port.written == READ_3_FROM_36
-    port = ScriptedPort(status_1(0, 0x36, 0x01, 41))
-    assert servo_on(port, protocol=1).read_identity() == ServoIdentity(310, 41)
-    assert port.written == READ_3_FROM_0
 
 
 @pytest.mark.parametrize("piece", [1, 2, 3, 7, 100])

@@ -29,10 +29,7 @@ PING_1 = bytes.fromhex("FFFF 01 02 01 FB")
 READ_1 = bytes.fromhex("FFFF 01 04 02 24 02 D2")
 PING_2 = bytes.fromhex("FFFFFD00 01 0300 01 194E")
 READ_2 = PROTOCOL_2.encode_read_request(1, 132, 4)
-SYNC_READ_1_2 = bytes.fromhex("FFFFFD00 FE 0900 82 84000400 0102 CEFA")
 PONG_2 = bytes.fromhex("37 01 2A")  # model number 311, firmware 42
-FIVE_BELOW = struct.pack("<i", -5)
-both_protocols = pytest.mark.parametrize("protocol", [1, 2])
 
 encode_1, encode_2 = PROTOCOL_1.encode_packet, PROTOCOL_2.encode_packet
 
@@ -131,15 +128,6 @@ def test_a_servo_of_protocol_1_counts_seven_turns(counts: int, seen: int) -> Non
         assert line.ask(READ_1) == (1, 0, struct.pack("<h", seen))
 
 
-def test_a_sync_read_is_answered_by_the_servos_that_it_names() -> None:
-    position = struct.pack("<HH", 132, 4)
-    others = encode_2(0xFE, Instruction.SYNC_READ, position + b"\x02\x03")
-    none = encode_2(0xFE, Instruction.SYNC_READ, position)
-    with line_to() as line:
-        assert line.ask(SYNC_READ_1_2) == (1, 0, FIVE_BELOW)
-        assert line.ask(others + none + PING_2) == (1, 0, PONG_2)
-
-
 @pytest.mark.parametrize(
     ("protocol", "requests"),
     [
@@ -152,7 +140,6 @@ def test_a_sync_read_is_answered_by_the_servos_that_it_names() -> None:
                 "another id, wrong sum": damage(encode_1(2, PING)),
                 "broadcast ping, wrong sum": damage(encode_1(0xFE, PING)),
                 "broadcast read": PROTOCOL_1.encode_read_request(0xFE, 36, 2),
-                "bulk read": encode_1(0xFE, 0x92, bytes([0, 2, 1, 36])),
             },
         ),
         (
@@ -164,11 +151,7 @@ def test_a_sync_read_is_answered_by_the_servos_that_it_names() -> None:
                 "a status": encode_2(1, Instruction.STATUS, b"\x00"),
                 "another id, wrong CRC": damage(encode_2(2, PING)),
                 "broadcast ping, wrong CRC": damage(encode_2(0xFE, PING)),
-                "sync read, wrong CRC": damage(SYNC_READ_1_2),
                 "broadcast read": PROTOCOL_2.encode_read_request(0xFE, 132, 4),
-                "broadcast write": encode_2(0xFE, 0x03, bytes([64, 0, 1])),
-                "fast sync read": encode_2(0xFE, 0x8A, bytes([132, 0, 4, 0, 1])),
-                "unknown broadcast": encode_2(0xFE, 0x77),
             },
         ),
     ],
@@ -186,16 +169,12 @@ def test_a_request_to_other_servos_is_not_answered(
     ("request_", "error"),
     [
         (encode_1(1, 0x77), ErrorFlag.INSTRUCTION),
-        (encode_1(1, 0x03, bytes([24, 1])), ErrorFlag.INSTRUCTION),
-        (encode_1(1, 0x92, bytes([0, 2, 1, 36])), ErrorFlag.INSTRUCTION),
         (damage(PING_1), ErrorFlag.CHECKSUM),
         (damage(READ_1), ErrorFlag.CHECKSUM),
         (PROTOCOL_1.encode_read_request(1, 73, 2), ErrorFlag.RANGE),
         (PROTOCOL_1.encode_read_request(1, 36, 0), ErrorFlag.RANGE),
         (encode_1(1, READ, b"\x24"), ErrorFlag.RANGE),
         (encode_2(1, 0x77), 2),
-        (encode_2(1, 0x03, bytes([64, 0, 1])), 2),
-        (encode_2(1, Instruction.SYNC_READ, bytes([132, 0, 4, 0, 1])), 2),
         (damage(PING_2), 3),
         (damage(READ_2), 3),
         (PROTOCOL_2.encode_read_request(1, 660, 4), 4),
@@ -220,29 +199,19 @@ def test_an_alert_of_protocol_2_shows_in_the_hardware_error_status() -> None:
         assert line.ask(PROTOCOL_2.encode_read_request(1, 70, 1)) == (1, 0, b"\x00")
 
 
-@pytest.mark.parametrize("level", [0, 1, 2])
+@pytest.mark.parametrize("level", [0, 1])
 @pytest.mark.parametrize(
-    ("protocol", "request_", "from_level", "answer"),
+    ("protocol", "request_", "data", "ping", "pong"),
     [
-        (1, READ_1, 1, (1, 0, struct.pack("<h", -5))),
-        (1, encode_1(1, 0x77), 2, (1, ErrorFlag.INSTRUCTION, b"")),
-        (1, encode_1(1, 0x82), 2, (1, ErrorFlag.INSTRUCTION, b"")),
-        (2, READ_2, 1, (1, 0, FIVE_BELOW)),
-        (2, SYNC_READ_1_2, 1, (1, 0, FIVE_BELOW)),
-        (2, encode_2(1, 0x77), 2, (1, 2, b"")),
-    ],
-    ids=[
-        *("read in 1.0", "unknown in 1.0", "sync read, which 1.0 has not"),
-        *("read", "sync read", "unknown"),
+        (1, READ_1, struct.pack("<h", -5), PING_1, b""),
+        (2, READ_2, struct.pack("<i", -5), PING_2, PONG_2),
     ],
 )
-def test_a_request_is_answered_from_its_status_return_level_on(
-    level: int, protocol: int, request_: bytes, from_level: int, answer: tuple[int, int, bytes]
+def test_a_read_is_answered_from_status_return_level_1_on(
+    level: int, protocol: int, request_: bytes, data: bytes, ping: bytes, pong: bytes
 ) -> None:
-    ping, pong = (PING_1, b"") if protocol == 1 else (PING_2, PONG_2)
     with line_to(protocol=protocol, status_return_level=level) as line:
-        first = line.ask(request_ + ping)
-    assert first == (answer if level >= from_level else (1, 0, pong))
+        assert line.ask(request_ + ping) == (1, 0, data if level else pong)
 
 
 # Opening and closing
