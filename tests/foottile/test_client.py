@@ -58,7 +58,9 @@ def test_a_session_is_recorded_marked_found_and_read(
     assert (session.state, session.complete, session.node) == ("sealed", True, "bench")
     assert [marker.label for marker in session.markers()] == ["a stone"]
     now = datetime.now(UTC)
-    found = list(server.sessions("trial", node="bench", tag="mud", since=now - timedelta(1)))
+    found = list(
+        server.sessions("trial", node=["left", "bench"], tag="mud", since=now - timedelta(1))
+    )
     assert [each.id for each in found] == [session.id]
     assert not list(server.sessions(since=now + timedelta(1)))
     data = session.open(["t_ns", "grf_n", "force_n"])
@@ -104,28 +106,6 @@ def test_an_answer_that_breaks_off_is_said_to_be_damaged(
     monkeypatch.setattr(httpx.Response, "iter_bytes", short)
     with pytest.raises(foottile.DamagedError, match="arrived incomplete or damaged"):
         session.open("seq").to_arrow()
-
-
-def test_a_frames_instant_in_the_servers_utc_is_beside_its_columns_on_request(
-    server: foottile.Server, tared: FakeNode
-) -> None:
-    session = recorded(server, tared)
-    data = session.open(["t_server_ns", "grf_n"], clock="server")
-    assert data.to_arrow().column_names == ["t_server_ns", "grf_n"]
-    assert data["t_server_ns"].shape == data["grf_n"].shape
-    assert "t_server_uncertainty_ns" in session.open(clock="server").to_arrow().column_names
-    with pytest.raises(foottile.UsageError, match="no column 't_server_ns'"):
-        session.open("t_server_ns").to_arrow()
-
-
-def test_sessions_are_found_of_several_nodes_and_with_several_tags(
-    server: foottile.Server, tared: FakeNode
-) -> None:
-    session = recorded(server, tared).update(tags=["mud", "wet"])
-    assert [each.id for each in server.sessions(node=["left", "bench"])] == [session.id]
-    assert [each.id for each in server.sessions(tag=("mud", "wet"))] == [session.id]
-    assert not list(server.sessions(node=["left", "right"]))
-    assert not list(server.sessions(tag=["mud", "dry"]))
 
 
 def test_what_has_no_method_is_asked_for_by_its_path(

@@ -19,7 +19,7 @@ from service.node_identity import compute_fingerprint
 from tests.service.cli.outcome import Outcome, Run
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import Running, ServeWith, closed
-from tests.service.strangers import answer_of, portal, tls_before
+from tests.service.strangers import tls_before
 
 TOKEN = "a-token-of-this-test"  # noqa: S105  # of this test
 AWAY = "http://192.168.4.1:8000"
@@ -212,15 +212,6 @@ def test_a_ca_is_named_with_an_option(
     assert "certificate" not in trusted.err
 
 
-@pytest.mark.parametrize("words", [words for words, _, _ in ASKING])
-def test_a_login_page_is_an_error_of_one_line(run: Run, words: tuple[str, ...]) -> None:
-    with portal(answer_of("302 Found", "Location: http://portal.example/login")) as url:
-        done = run(*words, "--server", url)
-    assert done.code == 1
-    assert len(done.err.splitlines()) == 1
-    assert "portal.example/login" in done.err
-
-
 # --- machines of nodes ----------------------------------------------------------------------------
 
 
@@ -252,15 +243,3 @@ def test_the_machine_that_asked_last_is_accepted_and_named(
     assert (outcome.code, outcome.err) == (0, "")
     assert compute_fingerprint(stranger.secret) in outcome.out
     stranger.connect()
-
-
-def test_a_machine_with_another_fingerprint_or_that_did_not_ask_is_refused(
-    accept: Accept, stranger: FakeNode
-) -> None:
-    other = accept("bench", "--fingerprint", "0000-0000-0000-0000")
-    other.fails(1, "another machine was refused as 'bench' meanwhile")
-    stranger.open_with_hello()
-    assert closed(stranger.socket)[0] == 4013
-    assert accept("bench").code == 0
-    accept("bench").fails(1, "no other machine asks to connect as 'bench'")
-    accept("nobody").fails(1, "no node 'nobody'")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -16,8 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
-import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
 import foottile
@@ -122,14 +119,6 @@ def test_sessions_are_listed_from_a_server_and_from_a_folder(
     table = run("sessions", "--server", demo.url)
     assert session in table.out
     assert "=1+1 [b]" in table.out
-
-
-@pytest.mark.real_time
-def test_pull_brings_the_file_verified(run: Run, demo: Demo, session: str, tmp_path: Path) -> None:
-    pulled = run("pull", session, "--server", demo.url, "--out", tmp_path, "--json").printed()
-    table = pq.read_table(pulled["path"])
-    assert (np.diff(table["seq"].to_numpy()) == 1).all()
-    assert len(table) == pulled["frames"]
 
 
 @pytest.mark.real_time
@@ -243,10 +232,3 @@ def test_a_token_is_made_kept_and_asked_for_and_commands_of_its_user_find_it(
     message = log.read_text()
     assert str(tmp_path / "token") in message
     assert token not in message + line  # they may be a log
-
-
-def test_a_taken_port_is_named(run: Run, tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        done = run("demo", "--scene", str(tiny_scene(tmp_path)), "--port", str(port))
-    done.fails(1, f"port {port}")

@@ -224,9 +224,3 @@ def test_an_output_through_a_link_lands_where_the_link_points(run: Run, tmp_path
     assert run(*simulate, "link.parquet").code == 0
     assert (tmp_path / "link.parquet").is_symlink()
     assert (tmp_path / "real.parquet").stat().st_size > 1000
-
-
-def test_a_tare_under_load_is_refused(run: Run, simulate: Simulate, tmp_path: Path) -> None:
-    loaded = simulate("s.parquet", "standing", "--seconds", 4)
-    run("estimate", loaded, "--tare-s", "2,3", "--out", "e.parquet").fails(1, "seems to be loaded")
-    assert [*tmp_path.iterdir()] == [loaded]

@@ -182,38 +182,6 @@ def test_an_assumed_scale_is_named_on_the_terminal_and_in_the_file(run: Run) -> 
         assert json.loads(table.schema.metadata[b"foottile.notes"])["absolute_scale"] == "assumed"
 
 
-def test_a_silent_tile_is_null_and_flagged_while_the_others_go_on(simulate: Simulate) -> None:
-    fault = faulty("no_answer", tile="T02", t_s=1.2, duration_s=0.5)
-    table = pq.read_table(simulate("s.parquet", scene_text("standing") + fault, "--seconds", 2))
-    silent = table["tile_flags_1"].to_numpy() & 1 == 1
-    assert 0.4 < silent.mean() * 2 < 0.6
-    assert table["pressure_raw_1"].null_count == silent.sum()
-    assert table["grf_n"].null_count == silent.sum()
-    assert table["pressure_raw_0"].null_count == table["force_n_0"].null_count == 0
-    assert (table["estimate_flags"].to_numpy()[silent] & 32 == 32).all()
-
-
-def test_a_tile_with_a_wrapped_count_gives_a_lower_bound_and_no_light_touch(
-    run: Run, tmp_path: Path
-) -> None:
-    (tmp_path / "foot.toml").write_text(scene_text("standing").replace("T01", "T09"))
-    rows = "".join(f"{0.01 * i:.2f},110,5,5,5\n" for i in range(100))
-    (tmp_path / "load.csv").write_text("time_s,cell1_n,cell2_n,cell3_n,cell4_n\n" + rows)
-    simulate = ("simulate", "--scene", "foot.toml", "--load", "load.csv", "--out", "s.parquet")
-    assert run(*simulate, "--truth").code == 0
-    table = pq.read_table(tmp_path / "s.parquet")
-    pressed = table["true_force_n_0"].to_numpy() == 110.0
-    wrapped = pressed & (table["pressure_raw_0"].to_numpy() > 900)
-    assert wrapped.sum() > 100
-    assert (table["tile_flags_0"].to_numpy()[wrapped] & 16 == 16).all()
-    assert (table["estimate_flags"].to_numpy()[pressed] & 1 == 1).all()
-    assert (table["force_n_0"].to_numpy()[pressed] > 15.0).all()  # as creep may have left it
-    assert np.isnan(table["force_sigma_n_0"].to_numpy()[pressed]).all()
-    # Without the model it is no force at all.
-    run("estimate", "s.parquet", "--models", "static", "--out", "e.parquet").succeeds()
-    assert np.isnan(pq.read_table(tmp_path / "e.parquet")["force_n_0"].to_numpy()[wrapped]).all()
-
-
 def test_a_rate_beyond_the_bus_is_named_with_exit_code_3(run: Run, tmp_path: Path) -> None:
     text = scene_text("standing").replace('name = "standing"', 'name = "fast"\nrate_hz = 1000')
     (tmp_path / "fast.toml").write_text(text)
