@@ -21,7 +21,6 @@ from typing import Any, get_args
 import pytest
 from pydantic import BaseModel
 
-from devices.flags import EstimateFlag
 from devices.scene.emulation_sections import (
     EmulationSection,
     FaultSection,
@@ -124,11 +123,6 @@ def test_every_column_is_documented_with_its_unit() -> None:
         assert row is not None, name
         assert f"| {column.unit} |" in row
         assert column.description in row
-
-
-def test_every_estimate_status_bit_is_documented() -> None:
-    for bit in EstimateFlag:
-        assert f"| {bit.value} | {str(bit.name).lower()} |" in FORMATS
 
 
 def commands() -> dict[str, Any]:

@@ -285,12 +285,6 @@ def test_a_failed_sync_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert_holds(journal, set(range(20)))
 
 
-def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path: Path) -> None:
-    (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(StorageError):
-        begun(tmp_path / "file" / "journal")
-
-
 def test_recovery_on_a_full_disk_leaves_nothing(tmp_path: Path) -> None:
     filled(tmp_path, (0, 9)).close()
     (path,) = segments(tmp_path)

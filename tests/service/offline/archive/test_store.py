@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from devices.errors import FileFormatError
 from service.offline.archive import locations
 from service.offline.archive.jobs import Job, run_job, run_jobs
 from service.offline.archive.locations import find_session_locations
@@ -19,7 +18,7 @@ from service.offline.archive.query import find_sessions, run_query
 from service.offline.archive.tasks import VerifyTask
 from service.offline.process_pool import Unfinished, map_in_processes
 from tests.service.offline.archive.stores import BUCKET, BadWay, Store
-from tests.service.offline.archives import IDS, STATIC, long_session, made, ran, with_a_damaged_page
+from tests.service.offline.archives import IDS, STATIC, long_session, made, ran
 from tests.service.sessions.pieces import calibration
 
 pytestmark = pytest.mark.slow
@@ -157,14 +156,3 @@ def test_questions_to_a_store_read_only_their_files_and_are_answered_as_for_fold
         find_sessions(mixed, tmp_path / "mirror1"), "SELECT count(*) AS n FROM frames"
     )
     assert of_two.to_pylist() == [{"n": 800}]
-
-
-def test_a_damaged_page_in_a_store_is_an_error_and_no_number(
-    store: Store, archive: Path, tmp_path: Path
-) -> None:
-    content = with_a_damaged_page(archive / "sessions" / IDS[0] / "frames.parquet")
-    with store.files.open_output_stream(f"{BUCKET}/2026/sessions/{IDS[0]}/frames.parquet") as sink:
-        sink.write(content)
-    found = find_sessions([f"s3://{BUCKET}/2026"], tmp_path)
-    with pytest.raises(FileFormatError, match="frames cannot be read"):
-        run_query(found, "SELECT sum(grf_n) FROM frames")

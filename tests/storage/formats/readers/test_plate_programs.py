@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from devices.errors import FileFormatError, FootTileError, UsageError
-from storage.formats.readers import plate_texts
 from storage.formats.reference import ReferenceOptions
 from tests.storage.formats.readers.reading import check, count_refused, read
 
@@ -387,15 +386,6 @@ def test_what_is_no_measurement_is_refused(tmp_path: Path, text: str, says: str)
 def test_a_header_without_text_names_no_option_that_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match=r"it is no text; expected a header.*numbers$"):
         read(tmp_path, "\0" + OPENSIM, name="grf.mot")
-
-
-def test_too_little_memory_is_the_cause(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise MemoryError
-
-    monkeypatch.setattr(plate_texts, "parse_columns", refuse)
-    with pytest.raises(FileFormatError, match=r"to read it; expected a file that fits in memory"):
-        read(tmp_path, BIOWARE)
 
 
 def test_many_sections_without_plates_are_skipped(tmp_path: Path) -> None:

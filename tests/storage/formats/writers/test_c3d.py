@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +22,6 @@ from tests.storage.formats.walks import (
     ROW,
     ROWS,
     STANCES,
-    compared,
     export_of_walk,
     row_walk,
     saturated,
@@ -294,12 +292,3 @@ def test_an_event_says_which_foot_it_is_of() -> None:
     expected = [("Left", 0.2), ("right-2", 0.5), ("Left", 1.0), ("right-2", 1.3)]
     assert [context for context, _ in strikes] == [context for context, _ in expected]
     np.testing.assert_allclose([t for _, t in strikes], [t for _, t in expected], atol=1e-3)
-
-
-def test_sessions_of_different_days_are_refused_and_not_joined() -> None:
-    one, _ = two_feet()
-    other = replace(
-        one, frame_source=two_feet()[1].frame_source, clock=compared(86_400_000_000_000)
-    )
-    with pytest.raises(UsageError, match="gaps included"):
-        list(C3D.encode_together_on_server_clock([one, other]))
