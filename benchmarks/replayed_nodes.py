@@ -33,7 +33,7 @@ from service.node_identity import generate_secret
 from service.offline.calibration_lookup import find_calibration
 from service.protocol.link import PROTOCOL, Hello, NodeStatus
 from storage.intervals import EVICTED, Intervals
-from storage.journal.node.retention_requests import RetentionRequests
+from storage.journal.node.retention import RetentionRequests
 from storage.journal.node.stream import NodeStream
 from storage.journal.stream_notes import StreamNotes
 from storage.message_layout import check_and_compute_layout

@@ -41,7 +41,7 @@ from service.protocol.link import (
 from service.rig.emulated_foot import RigOptions
 from storage.durable_files import try_set_aside_and_describe
 from storage.journal.node.journal import NodeJournal
-from storage.journal.node.retention_requests import RetentionRequest
+from storage.journal.node.retention import RetentionRequest
 from storage.journal.node.stream import NodeStream
 from storage.permissions import SECRETS_NAME, read_secrets_or_empty, write_secrets
 

@@ -15,7 +15,7 @@ from devices.frames import FrameBatch
 from storage.intervals import Intervals, OpenPairs
 from storage.journal.node.in_flight import InFlightWriter
 from storage.journal.node.journal import NodeJournal
-from storage.journal.node.retention_requests import RetentionRequest
+from storage.journal.node.retention import RetentionRequest
 from storage.journal.node.stream import NodeStream
 from storage.wire import encode_as_messages
 from tests.builders.arrays import make_array

@@ -19,7 +19,7 @@ from service.sessions.recovery import recover_locked_folder
 from service.sessions.tares import TareHistory
 from storage.clock.log import ClockLog, ClockOffset
 from storage.documents import write_document
-from storage.journal.node.retention_requests import RetentionRequest, RetentionRequests
+from storage.journal.node.retention import RetentionRequest, RetentionRequests
 from storage.permissions import SECRETS_NAME, write_secrets
 from storage.sessions.folder import FRAMES_NAME, Marker, Part, SessionsFolder
 from storage.sessions.metadata import MARKERS_NAME, load_clock_table, read_existing_markers

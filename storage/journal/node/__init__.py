@@ -1,4 +1,4 @@
-"""A node's journals: frames in memory and in flight, retention, and servers' retention requests.
+"""A node's journals: frames in memory and in flight, and the retention that servers request.
 
 `journal` has all streams, `stream` has one; the other modules have one task each. A server uses
 none of them.

@@ -32,8 +32,12 @@ from storage.journal.node.in_flight import (
     read_in_flight_of_this_boot,
     read_kernel_boot_id,
 )
-from storage.journal.node.retention import DEFAULT_BUDGET_BYTES, RetentionPolicy
-from storage.journal.node.retention_requests import RetentionRequest, RetentionRequests
+from storage.journal.node.retention import (
+    DEFAULT_BUDGET_BYTES,
+    RetentionPolicy,
+    RetentionRequest,
+    RetentionRequests,
+)
 from storage.journal.node.stream import NodeStream
 from storage.journal.stream_notes import StreamNotes
 from storage.wire import EncodedBatch, encode_as_messages

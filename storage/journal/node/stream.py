@@ -25,7 +25,7 @@ from storage.journal.node.in_flight import (
     read_newest_in_flight_run,
     try_delete_in_flight_file,
 )
-from storage.journal.node.retention_requests import RetentionRequests
+from storage.journal.node.retention import RetentionRequests
 from storage.journal.stream_notes import MAX_UNSYNCED_S, StreamNotes, compute_max_lost_tail_frames
 from storage.wire import EncodedBatch, encode_as_messages
 

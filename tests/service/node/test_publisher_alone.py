@@ -38,7 +38,7 @@ from service.protocol.link import (
     Welcome,
 )
 from storage.intervals import Intervals
-from storage.journal.node.retention_requests import RetentionRequests as NodeWanted
+from storage.journal.node.retention import RetentionRequests as NodeWanted
 from storage.journal.node.stream import NodeStream
 from storage.journal.stream_notes import StreamNotes
 from storage.schema import wire_schema

@@ -26,7 +26,7 @@ from storage.documents import write_checksummed_json
 from storage.journal import journal as journal_module
 from storage.journal.node.in_flight import IN_FLIGHT_FILE, InFlightWriter
 from storage.journal.node.journal import NodeJournal
-from storage.journal.node.retention_requests import RetentionRequest, RetentionRequests
+from storage.journal.node.retention import RetentionRequest, RetentionRequests
 from storage.journal.stream_notes import StreamNotes
 from tests.builders.arrays import make_array
 from tests.builders.calibrations import make_calibration, make_tare

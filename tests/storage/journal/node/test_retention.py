@@ -13,7 +13,7 @@ from storage.intervals import NO_END, Intervals
 from storage.journal.node import journal as node_journal
 from storage.journal.node import retention
 from storage.journal.node.journal import NodeJournal
-from storage.journal.node.retention_requests import RetentionRequest, RetentionRequests
+from storage.journal.node.retention import RetentionRequest, RetentionRequests
 from storage.journal.node.stream import NodeStream
 from tests.builders.arrays import make_array
 from tests.storage.journal.node.leg import Start, fill, given, store
