@@ -28,9 +28,8 @@ from service.estimation.fitting.effects_fit import (
     separate_delays,
 )
 from service.estimation.fitting.rig.indentation import Indentation, select_loaded
-from service.estimation.fitting.rig.loading import has_weights
 from service.estimation.fitting.static_fit import fit_static_curve
-from service.estimation.fitting.weights_fit import fit_curve_to_dead_weights
+from service.estimation.fitting.weights_fit import fit_curve_to_dead_weights, has_weights
 from storage.schema import UNKNOWN_T_NS
 from storage.sessions.folder import Marker
 from storage.sessions.metadata import MARKERS_NAME, load_clock_table, read_existing_markers

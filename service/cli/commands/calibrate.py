@@ -391,7 +391,7 @@ def calibrate_command(
     from service.cli.calibration_report import calibration_to_json, make_calibration_tables
     from service.estimation.effects import Parameter
     from service.estimation.fitting.effects_fit import DEFAULT_REFERENCE_DELAY
-    from service.estimation.fitting.rig.loading import has_weights
+    from service.estimation.fitting.weights_fit import has_weights
     from service.offline.calibration_fit import fit_calibration, read_indentations
     from service.sessions.calibration_file import write_calibration
     from storage.durable_files import write_atomically

@@ -22,7 +22,7 @@ from scipy.interpolate import PchipInterpolator
 from devices.arrays import Floats
 from devices.jit import jit_cached
 from service.estimation.effects import FLOW_FRACTION_MAX, FLOW_STRESS_MIN_N
-from service.estimation.fitting.rig.loading import LoadingPoints
+from service.estimation.fitting.rig.indentation import LoadingPoints
 from service.estimation.models.flow import step_branch_stress
 from service.estimation.models.hysteresis import WIDTHS_N, step_play_closed_at_zero_load
 from service.estimation.models.rubber import compute_creep_weights

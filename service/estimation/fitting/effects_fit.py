@@ -32,15 +32,13 @@ from service.estimation.fitting.dome_model import (
 from service.estimation.fitting.effect_selection import fit_significant_effects
 from service.estimation.fitting.rig.indentation import (
     Indentation,
+    LoadingPoints,
     ThermalSoak,
+    extract_loading_points,
     extract_soak_or_empty,
+    join_loading_points,
     measure_last_second_before_first_load,
     select_loaded,
-)
-from service.estimation.fitting.rig.loading import (
-    LoadingPoints,
-    extract_loading_points,
-    join_loading_points,
 )
 from service.estimation.fitting.thermal_soak import fit_temperature_effect
 

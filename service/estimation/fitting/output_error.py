@@ -29,7 +29,7 @@ from service.estimation.fitting.least_squares import (
     compute_step_beyond_bound,
     minimize_squares,
 )
-from service.estimation.fitting.rig.loading import LoadingPoints
+from service.estimation.fitting.rig.indentation import LoadingPoints
 from service.estimation.models.hysteresis import WIDTHS_N
 
 _SCATTER = (0.003, 0.03)
