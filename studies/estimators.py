@@ -15,8 +15,8 @@ from devices.chips.pressure_chips import Compensation, get_raw_type
 from devices.errors import UsageError
 from devices.flags import EstimateFlag
 from devices.frames import NOT_READ, FrameBatch, HeldTemperature, hold_temperature
+from service.estimation import CONTACT_UNKNOWN
 from service.estimation.estimate import Estimator, ModelEstimator
-from service.estimation.foot import CONTACT_UNKNOWN
 from service.estimation.models.static import compute_forces
 from service.estimation.pipeline.plan import SIGNIFICANCE_SIGMAS, EstimationPlan
 from service.estimation.pipeline.smoothing_stage import BOUND_SIGMAS

@@ -18,9 +18,8 @@ from devices.arrays import Floats, Times
 from devices.flags import EstimateFlag
 from devices.frames import FrameBatch, allocate_columns
 from devices.jit import jit_cached, jit_inlined
-from service.estimation.foot import CONTACT_UNKNOWN
-from service.estimation.foot.contact import is_debounced
-from service.estimation.foot.geometry import interpolate_servo_counts, transform_to_ground_x_m
+from service.estimation import CONTACT_UNKNOWN
+from service.estimation.foot import interpolate_servo_counts, is_debounced, transform_to_ground_x_m
 from service.estimation.models import denoise
 from service.estimation.pipeline import grf_cop
 from service.estimation.pipeline.params import KernelParams

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from devices.arrays import Floats, Times
 from devices.flags import EstimateFlag
-from service.estimation.foot import CONTACT_UNKNOWN, LONG_GAP_NS
+from service.estimation import CONTACT_UNKNOWN, LONG_GAP_NS
 from service.estimation.records import SIGMAS_95
 from service.estimation.stance_curves import PeakSearch
 

@@ -24,7 +24,7 @@ from devices.errors import CalibrationError, FileFormatError
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration, MountCalibration
 from service.estimation.effects import Parameter
-from service.estimation.foot.geometry import fit_tile_axis_angles_rad
+from service.estimation.foot import fit_tile_axis_angles_rad
 from service.offline.compare.alignment import HUBER_SIGMAS
 from service.offline.compare.block_covariance import (
     NORMAL_95,

@@ -18,7 +18,7 @@ import math
 import numpy as np
 
 from devices.jit import jit_cached
-from service.estimation.foot import LONG_GAP_NS
+from service.estimation import LONG_GAP_NS
 from service.estimation.records import KernelRecord
 
 STROKE_N_PER_S = 10.0

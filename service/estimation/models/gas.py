@@ -21,8 +21,8 @@ from typing import Self
 import numpy as np
 
 from devices.jit import jit_cached
+from service.estimation import LONG_GAP_NS
 from service.estimation.effects import MISFIT_MIN, parameter_values
-from service.estimation.foot import LONG_GAP_NS
 from service.estimation.models import LoadBearingTiles, ModelParams
 from service.estimation.records import KernelRecord, RecordArray
 

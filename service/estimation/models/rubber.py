@@ -18,8 +18,8 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.jit import jit_cached
+from service.estimation import LONG_GAP_NS
 from service.estimation.effects import MISFIT_MIN, TERMS_MAX, parameter_values
-from service.estimation.foot import LONG_GAP_NS
 from service.estimation.models import LoadBearingTiles, ModelParams
 from service.estimation.records import KernelRecord, RecordArray
 

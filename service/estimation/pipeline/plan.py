@@ -18,7 +18,7 @@ from devices.errors import CalibrationError, UsageError
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.fault_detection.fault_limits import make_fault_params
-from service.estimation.foot.geometry import (
+from service.estimation.foot import (
     compute_grid_indices_from_1,
     compute_hull_half_planes,
     compute_segment_rad_per_count,

@@ -28,8 +28,7 @@ from service.estimation.fault_detection.baseline_loss import (
 )
 from service.estimation.fault_detection.clipping import update_clipping_limit_kpa
 from service.estimation.fault_detection.stuck import update_stuck_and_toggles
-from service.estimation.foot.contact import update_candidate
-from service.estimation.foot.geometry import store_servo_reading_and_link_to_previous
+from service.estimation.foot import store_servo_reading_and_link_to_previous, update_candidate
 from service.estimation.models import gas
 from service.estimation.models.ambient import low_pass_ambient_kpa
 from service.estimation.models.denoise import WINDOW_READINGS_MAX, is_outlier

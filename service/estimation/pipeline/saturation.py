@@ -13,7 +13,7 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.jit import jit_cached
-from service.estimation.foot import LONG_GAP_NS
+from service.estimation import LONG_GAP_NS
 from service.estimation.models.static import StaticParams, compute_forces
 from service.estimation.records import KernelRecord, RecordArray
 

@@ -16,8 +16,7 @@ from devices.frames import NOT_READ
 from service.estimation.fault_detection.baseline_loss import BaselineLossState, ThermalDriftState
 from service.estimation.fault_detection.clipping import ClippingState
 from service.estimation.fault_detection.stuck import StuckState
-from service.estimation.foot.contact import ContactState
-from service.estimation.foot.geometry import ServoReading
+from service.estimation.foot import ContactState, ServoReading
 from service.estimation.models.ambient import AmbientState
 from service.estimation.models.gas import GasState
 from service.estimation.models.hysteresis import HysteresisState

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from devices.arrays import Floats
 from devices.frames import FrameBatch
-from service.estimation.foot import CONTACT_UNKNOWN
+from service.estimation import CONTACT_UNKNOWN
 from service.protocol.codec import encode_message
 from service.protocol.live import FrameMessage, FramesDropped, SessionProgress, SessionsProgress
 from storage.intervals import NO_END, Intervals

@@ -16,10 +16,9 @@ from devices.chips.pressure_chips import Compensation
 from devices.errors import FootTileError, TareError
 from devices.flags import TileFlag
 from devices.frames import NOT_READ, ArrayInfo, FrameBatch, hold_temperature
-from service.estimation import LIVE_LAG_MS
+from service.estimation import LIVE_LAG_MS, LONG_GAP_NS
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.compilation import is_compiling
-from service.estimation.foot import LONG_GAP_NS
 from service.estimation.models.static import StaticParams, compute_forces
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from service.estimation.tare.automatic import (

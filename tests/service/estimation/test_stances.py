@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.flags import EstimateFlag
-from service.estimation.foot import CONTACT_UNKNOWN
+from service.estimation import CONTACT_UNKNOWN
 from service.estimation.stances import Stance, StanceDetector, compute_stances
 
 STEP_NS = 2_000_000

@@ -14,7 +14,7 @@ from devices.flags import FrameFlag
 from devices.frames import NO_SERVO_COUNTS, FrameBatch
 from devices.scene.emulation_sections import FaultSection
 from devices.scene.scene_file import load_scene
-from service.estimation.foot.geometry import compute_segment_rad_per_count
+from service.estimation.foot import compute_segment_rad_per_count
 from service.offline.simulation import EmulatedRun, SimulationOptions
 from service.rig.emulated_foot import EmulatedFoot
 

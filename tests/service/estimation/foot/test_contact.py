@@ -9,11 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.estimation.foot.contact import (
-    ContactState,
-    is_debounced,
-    update_candidate,
-)
+from service.estimation.foot import ContactState, is_debounced, update_candidate
 
 ON_N, OFF_N, MIN_NS = 5.0, 3.0, 10_000_000
 MS = 1_000_000

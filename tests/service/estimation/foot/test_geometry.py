@@ -12,7 +12,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from devices.frames import ServoInfo
-from service.estimation.foot.geometry import (
+from service.estimation.foot import (
     compute_grid_indices_from_1,
     compute_hull_half_planes,
     compute_segment_rad_per_count,

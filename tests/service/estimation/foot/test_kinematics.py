@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from devices.flags import FrameFlag
 from devices.frames import NO_SERVO_COUNTS, FrameBatch
-from service.estimation.foot.geometry import (
+from service.estimation.foot import (
     ServoReading,
     interpolate_servo_counts,
     store_servo_reading_and_link_to_previous,

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.frames import FrameBatch
-from service.estimation.foot import CONTACT_UNKNOWN
+from service.estimation import CONTACT_UNKNOWN
 from service.protocol.live import SessionProgress
 from service.server.broadcast.summary import (
     SUMMARY_NS,
