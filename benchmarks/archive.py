@@ -31,14 +31,13 @@ from recording_data import emulated, lengthened, of_scene
 from side_by_side import in_turns, note, spread, table
 
 from service.estimation.compilation import compile_models
-from service.offline.archive.dask_cluster import map_on_cluster
 from service.offline.archive.jobs import Job, JobMapper, limit_arrow_threads, run_job, run_jobs
 from service.offline.archive.locations import find_session_locations
 from service.offline.archive.tasks import EstimateTask, SessionTask, VerifyTask
 from service.offline.estimate.preparation import CHUNK_FRAMES
 from service.offline.estimate.session import estimate_session
-from service.offline.process_pool import Unfinished
-from service.offline.process_pool import map_in_processes as over_processes
+from service.offline.worker_pool import Unfinished, map_on_cluster
+from service.offline.worker_pool import map_in_processes as over_processes
 from storage.sessions.folder import FRAMES_NAME, SessionsFolder
 from tests.service.offline.archive.clusters import Cluster
 

@@ -169,11 +169,11 @@ def run_jobs_with_report(
 def make_job_mapper(jobs: int | None, scheduler: str | None) -> JobMapper:
     """Return a mapper to processes of this machine or to a cluster."""
     if scheduler is not None:
-        from service.offline.archive.dask_cluster import map_on_cluster
+        from service.offline.worker_pool import map_on_cluster
 
         return partial(map_on_cluster, scheduler_address=scheduler)
     from service.offline.archive.jobs import limit_arrow_threads
-    from service.offline.process_pool import count_available_cores, map_in_processes
+    from service.offline.worker_pool import count_available_cores, map_in_processes
 
     return partial(
         map_in_processes,

@@ -39,8 +39,11 @@ from service.offline.compare.plausibility import (
     check_time_unit,
     describe_implausible_alignment,
 )
-from service.offline.compare.plot import plot_comparison
-from service.offline.compare.report import FIGURES_WITH_LOWER_LIMIT, format_comparison_report
+from service.offline.compare.report import (
+    FIGURES_WITH_LOWER_LIMIT,
+    format_comparison_report,
+    plot_comparison,
+)
 from service.offline.compare.signals import ForceSignal
 from storage.documents import write_checksummed_json
 from storage.durable_files import write_atomically

@@ -18,7 +18,7 @@ from devices.scene.scene_file import Scene
 from service.estimation.calibration import PRESETS
 from service.estimation.estimate import Estimator, ModelEstimator
 from service.estimation.pipeline.params import MODEL_NAMES
-from service.offline.process_pool import map_in_processes
+from service.offline.worker_pool import map_in_processes
 from service.version import SOFTWARE_VERSION
 from studies.benchmark.draws import (
     BATCH_FRAMES,

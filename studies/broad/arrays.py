@@ -27,7 +27,7 @@ from service.estimation.effects import Effects, Parameter
 from service.estimation.records import SIGMAS_95
 from service.offline.accuracy import ACCURACY_COLUMNS, PHASES, classify_phases, compute_accuracy
 from service.offline.calibration_lookup import EMULATED_RIG, RIG_REFERENCE, find_calibration
-from service.offline.process_pool import map_in_processes
+from service.offline.worker_pool import map_in_processes
 from service.version import SOFTWARE_VERSION
 from storage.durable_files import make_synced_folder
 from studies.benchmark.draws import (

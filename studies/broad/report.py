@@ -20,8 +20,7 @@ from studies.benchmark.figures import (
     Goal,
     Quantiles,
 )
-from studies.benchmark.plot import GREY, STYLES
-from studies.benchmark.report import EMULATED, format_table
+from studies.benchmark.report import EMULATED, GREY, STYLES, format_table
 from studies.broad.arrays import CLEAN, CONDITIONS, HEAVY, SCENES, BroadBenchmarkResult
 from studies.broad.figures import (
     ANY_PHASE,

@@ -13,7 +13,7 @@ from service.estimation.fitting.least_squares import (
     compute_mean_curve_half_width_95_n,
 )
 from service.estimation.records import SIGMAS_95
-from service.offline.compare.plot import OUR_COLOUR, REFERENCE_COLOUR, TILE_COLOURS
+from service.offline.compare.report import OUR_COLOUR, REFERENCE_COLOUR, TILE_COLOURS
 from service.offline.figure_output import create_figure, render_png
 from studies.reproduce import trials as paper
 from studies.reproduce.indentation import DomeResult

@@ -30,7 +30,7 @@ from devices.scene.scene_file import load_scene
 from service.estimation.calibration import Calibration
 from service.estimation.domes import DOMES, PAPER_DOME, Dome
 from service.offline.calibration_lookup import EMULATED_RIG, find_calibration, make_rig_scene
-from service.offline.process_pool import map_in_processes
+from service.offline.worker_pool import map_in_processes
 from service.pull import pull_session
 from service.sessions.calibration_file import write_calibration
 from service.version import SOFTWARE_VERSION

@@ -232,8 +232,7 @@ def benchmark_command(
         return
     from service.offline.figure_output import create_figure
     from storage.durable_files import write_atomically
-    from studies.benchmark.plot import plot_benchmark
-    from studies.benchmark.report import format_benchmark_report
+    from studies.benchmark.report import format_benchmark_report, plot_benchmark
     from studies.benchmark.run import BenchmarkOptions, run_benchmark
     from studies.estimators import get_estimator
 

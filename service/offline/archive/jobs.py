@@ -30,7 +30,7 @@ from service.offline.archive.local_copies import (
 from service.offline.archive.locations import SessionLocation, check_utf8, is_remote
 from service.offline.archive.result_store import ChunkStore, ResultNote, ResultStore, hash_files
 from service.offline.archive.tasks import ChunkedTask, SessionTask
-from service.offline.process_pool import Unfinished
+from service.offline.worker_pool import Unfinished
 from service.version import compute_exact_version
 
 log = logging.getLogger("foottile.archive")

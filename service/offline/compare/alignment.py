@@ -27,12 +27,14 @@ from service.offline.compare.block_covariance import (
     compute_phase_covariance,
     estimate_correlation_samples,
 )
-from service.offline.compare.lag_candidates import (
+from service.offline.compare.signals import (
     CorrelationPeak,
+    EvenSignal,
+    ForceSignal,
     LagCandidates,
     find_lag_candidates,
+    low_pass,
 )
-from service.offline.compare.signals import EvenSignal, ForceSignal, low_pass
 
 HUBER_SIGMAS = 1.345
 """Huber's tuning constant: beyond so many standard deviations a residual counts less."""

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 from service.offline.archive.jobs import Job, Outcome, run_jobs
 from service.offline.archive.locations import find_session_locations
 from service.offline.archive.tasks import EstimateTask, SessionTask
-from service.offline.process_pool import map_in_processes
+from service.offline.worker_pool import map_in_processes
 from service.sessions.inputs import SessionInputs
 from service.sessions.sealing import seal_session
 from storage.journal.journal import Journal

@@ -11,11 +11,10 @@ from pathlib import Path
 import pytest
 
 from devices.errors import LinkError, UsageError, WorkerLostError
-from service.offline.archive.dask_cluster import map_on_cluster
 from service.offline.archive.jobs import Job, run_job, run_jobs
 from service.offline.archive.locations import find_session_locations
 from service.offline.archive.result_store import ResultStore
-from service.offline.process_pool import Unfinished
+from service.offline.worker_pool import Unfinished, map_on_cluster
 from tests.service.offline.archive.clusters import Cluster
 from tests.service.offline.archive.workers import (
     assert_each_task_comes_with_its_result,
@@ -102,7 +101,7 @@ def test_a_worker_of_another_version_is_refused(
     cluster: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "service.offline.archive.dask_cluster.compute_exact_version",
+        "service.offline.worker_pool.compute_exact_version",
         lambda: "foottile 9 (ffffffffffff)",
     )
     with pytest.raises(UsageError, match="another version: foottile foottile"):
@@ -110,7 +109,7 @@ def test_a_worker_of_another_version_is_refused(
 
 
 def test_a_missing_scheduler_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.offline.archive.dask_cluster._CONNECT_S", 1.0)
+    monkeypatch.setattr("service.offline.worker_pool._CONNECT_S", 1.0)
     with pytest.raises(LinkError, match="no Dask cluster"):
         list(map_on_cluster(squared, range(3), scheduler_address="tcp://127.0.0.1:9"))
 
@@ -122,7 +121,7 @@ def test_a_task_that_kills_every_worker_is_given_up_alone_and_a_scheduler_that_g
         found = dict(map_on_cluster(killed_at_two, range(5), scheduler_address=own.address))
         assert isinstance(found.pop(2), WorkerLostError)
         assert found == {n: n for n in (0, 1, 3, 4)}
-        monkeypatch.setattr("service.offline.archive.dask_cluster._CONNECT_S", 1.0)
+        monkeypatch.setattr("service.offline.worker_pool._CONNECT_S", 1.0)
         results = map_on_cluster(squared, iter(range(10**9)), scheduler_address=own.address)
         next(results)
         own.end_scheduler()

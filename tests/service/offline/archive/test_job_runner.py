@@ -16,7 +16,7 @@ from service.offline.archive.query import find_sessions, run_query
 from service.offline.archive.result_store import ResultStore
 from service.offline.archive.tasks import ExportTask, VerifyTask
 from service.offline.export import ExportOptions
-from service.offline.process_pool import Unfinished, map_in_processes
+from service.offline.worker_pool import Unfinished, map_in_processes
 from storage.verify.data_folder import find_verdict, verify_path
 from tests.service.offline.archives import IDS, STATIC, contents, long_session, made, ran, recording
 from tests.service.sessions.pieces import calibration

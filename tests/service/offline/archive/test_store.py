@@ -16,7 +16,7 @@ from service.offline.archive.jobs import Job, run_job, run_jobs
 from service.offline.archive.locations import find_session_locations
 from service.offline.archive.query import find_sessions, run_query
 from service.offline.archive.tasks import VerifyTask
-from service.offline.process_pool import Unfinished, map_in_processes
+from service.offline.worker_pool import Unfinished, map_in_processes
 from tests.service.offline.archive.stores import BUCKET, BadWay, Store
 from tests.service.offline.archives import IDS, STATIC, long_session, made, ran
 from tests.service.sessions.pieces import calibration

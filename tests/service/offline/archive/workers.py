@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from service.offline.process_pool import Unfinished
+from service.offline.worker_pool import Unfinished
 
 
 def squared(number: int) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.offline.compare.plot import describe_shown_time
+from service.offline.compare.report import describe_shown_time
 
 
 def test_a_figure_of_some_seconds_says_which_and_of_how_many() -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from devices.errors import WorkerLostError
-from service.offline.process_pool import map_in_processes
+from service.offline.worker_pool import map_in_processes
 from tests.service.offline.archive.workers import (
     assert_each_task_comes_with_its_result,
     counted,
