@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from devices.acquisition import Acquisition
+from devices.array.bus_recovery import GpioRecovery
 from devices.array.startup import prepare_array
 from devices.buses.i2c import open_bus
 from devices.clock import UtcAnchor, VirtualClock
@@ -25,7 +26,6 @@ from devices.emulation.i2c_bus import EmulatedGpioLines
 from devices.emulation.world import World
 from devices.flags import TileFlag
 from devices.frames import FrameBatch
-from devices.recovery import GpioRecovery
 from devices.scene.scene_file import Scene, load_scene, validate_scene
 from tests.builders.witness import Verdict, Witness
 

@@ -40,7 +40,7 @@ from replayed_nodes import DRAIN_S, Played, Sent, played, run_load
 from served import Server, served
 
 from service.estimation import LIVE_LAG_MS
-from service.protocol.codec import SUBPROTOCOL
+from service.protocol.link import SUBPROTOCOL
 
 RATE_HZ = {4: 541.0, 64: 64.0}
 SCREEN_HZ = 60

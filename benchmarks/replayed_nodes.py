@@ -29,9 +29,8 @@ from devices.scene.scene_file import load_scene
 from service.estimation.calibration import Calibration
 from service.node.frame_sender import NodeCallbacks
 from service.node.publisher import Publisher
-from service.node_identity import generate_secret
 from service.offline.calibration_lookup import find_calibration
-from service.protocol.link import PROTOCOL, Hello, NodeStatus
+from service.protocol.link import PROTOCOL, Hello, NodeStatus, generate_secret
 from storage.intervals import EVICTED, Intervals
 from storage.journal.node.retention import RetentionRequests
 from storage.journal.node.stream import NodeStream

@@ -36,8 +36,8 @@ import pyarrow.parquet as pq
 from recording_memory import STREAM_ID, UTC_NS, array, minute
 from side_by_side import in_turns, note, spread, table
 
+from service.api.access import Logins
 from service.api.app import make_app
-from service.api.logins import Logins
 from service.estimation import OFFLINE_LAG_MS
 from service.offline.estimate.preparation import EstimateRequest
 from service.offline.estimate.session import EstimateResult, estimate_session

@@ -22,7 +22,7 @@ ROWS = {
         "import sys; sys.argv = ['foottile', 'domes', '--help']; main()",
         "import typer, numpy, pydantic",
     ),
-    "a server, imported": ("import service.cli.commands.serve, service.api.runner", LIBRARIES),
+    "a server, imported": ("import service.cli.commands.serve, service.api.app", LIBRARIES),
 }
 """What is begun: its code, and code that only imports the libraries it needs."""
 

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     import os
 
     from foottile.asyncio_client import AsyncServer as AsyncServer
-    from foottile.data import SessionData as SessionData
     from foottile.errors import AccessDeniedError as AccessDeniedError
     from foottile.errors import ConflictError as ConflictError
     from foottile.errors import DamagedError as DamagedError
@@ -28,11 +27,12 @@ if TYPE_CHECKING:
     from foottile.errors import NotFoundError as NotFoundError
     from foottile.errors import ServerUnavailableError as ServerUnavailableError
     from foottile.errors import UsageError as UsageError
+    from foottile.live import FrameLoss as FrameLoss
     from foottile.live import LiveStream as LiveStream
-    from foottile.live_protocol import FrameLoss as FrameLoss
     from foottile.server import Server as Server
     from foottile.sessions import Marker as Marker
     from foottile.sessions import Session as Session
+    from foottile.sessions import SessionData as SessionData
 
 _MODULES = {
     "AccessDeniedError": "errors",
@@ -40,7 +40,7 @@ _MODULES = {
     "ConflictError": "errors",
     "DamagedError": "errors",
     "FootTileError": "errors",
-    "FrameLoss": "live_protocol",
+    "FrameLoss": "live",
     "FramesLostWarning": "errors",
     "LiveStream": "live",
     "Marker": "sessions",
@@ -48,7 +48,7 @@ _MODULES = {
     "Server": "server",
     "ServerUnavailableError": "errors",
     "Session": "sessions",
-    "SessionData": "data",
+    "SessionData": "sessions",
     "UsageError": "errors",
 }
 """Module of each public name; imported at first use, because importing Arrow is slow."""

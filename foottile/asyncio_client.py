@@ -16,11 +16,10 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
 from foottile.connection import AsyncCloseable, AsyncWebsocket
-from foottile.data import Clock, SessionData
 from foottile.errors import FootTileError
-from foottile.live_protocol import FrameLoss, LiveRequest, LiveStreamState, Policy
+from foottile.live import FrameLoss, LiveRequest, LiveStreamState, Policy
 from foottile.server import Server
-from foottile.sessions import Marker, Session
+from foottile.sessions import Clock, Marker, Session, SessionData
 
 T = TypeVar("T")
 

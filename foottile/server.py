@@ -11,11 +11,9 @@ from typing import Any
 from urllib.parse import quote
 
 from foottile.connection import Closeable
-from foottile.data import download
 from foottile.http import HttpClient
-from foottile.live import LiveStream
-from foottile.live_protocol import FrameLoss, LiveRequest, Policy
-from foottile.sessions import Session
+from foottile.live import FrameLoss, LiveRequest, LiveStream, Policy
+from foottile.sessions import Session, download
 
 _PAGE = 500
 

@@ -36,8 +36,8 @@ from devices.scene.hardware_sections import (
     TileSection,
 )
 from devices.scene.scene_file import Scene, list_builtin_scenes, load_scene
+from service.api.access import Logins
 from service.api.app import make_app
-from service.api.logins import Logins
 from service.api.settings import Settings
 from service.cli.main import SUMMARIES, load_command
 from service.estimation.calibration import TileCalibration

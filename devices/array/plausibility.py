@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 
-from devices.array.bus_monitor import BusMonitor
+from devices.array.bus_recovery import BusMonitor
 from devices.array.schedules import BusTiming
 from devices.array.tile import Scan, TileHealth, TileIo
 from devices.chips.pressure_chip import Counts

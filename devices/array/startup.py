@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
 
-from devices.array.bus_monitor import RecoveryResult, recover_bus
+from devices.array.bus_recovery import BusRecovery, RecoveryResult, recover_bus
 from devices.array.schedules import BusTiming, ScheduleChoice, choose_schedule, compute_frame_s
 from devices.array.self_test import (
     WireTiming,
@@ -21,7 +21,6 @@ from devices.chips.tca9548a import MuxRouter
 from devices.clock import Clock
 from devices.errors import BusFaultError, SceneError
 from devices.frames import TileInfo
-from devices.recovery import BusRecovery
 from devices.scene.hardware_sections import AnySchedule, ArraySection
 from devices.scene.scene_file import Scene
 

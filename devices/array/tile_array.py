@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from devices.array.bus_monitor import BusMonitor
+from devices.array.bus_recovery import BusMonitor, BusRecovery
 from devices.array.plausibility import ConversionMonitor, PlausibilityCheck
 from devices.array.schedules import (
     SCHEDULES,
@@ -27,7 +27,6 @@ from devices.clock import Clock
 from devices.errors import BusFaultError, NoAcknowledgeError, TileSetupError
 from devices.flags import TileFlag
 from devices.frames import NOT_READ, TileInfo
-from devices.recovery import BusRecovery
 from devices.scene.hardware_sections import ScheduleName
 
 

@@ -13,14 +13,12 @@ import logging
 import resource
 import time
 from collections import Counter
-from typing import Annotated, Protocol
+from typing import Protocol
 
-from pydantic import BaseModel, Field, IPvAnyNetwork
+from service.api.settings import LimitSettings
 
 log = logging.getLogger("foottile.doors")
 
-_Seconds = Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)]
-_Connections = Annotated[int, Field(ge=1, le=100_000)]
 
 RESERVE = 32
 """Places for connections before their first request, however many are busy."""
@@ -28,39 +26,6 @@ OWN_FILES = 96
 """Descriptors that recording needs: journals, logs, locks, and a session being sealed."""
 _FILES_MAX = 65_536
 _LOG_PERIOD_S = 60.0
-_IPV4 = 4
-
-
-class LimitSettings(BaseModel):
-    """Limits for unauthenticated clients, as settings."""
-
-    max_connections: _Connections = 512
-    """Requests and subscribers at once, without nodes; beyond it 503, or 1013 on a websocket."""
-    max_connections_per_address: _Connections = 256
-    """The limit per address. A phone's hotspot is one address, and so is a reverse proxy that is
-    not trusted."""
-    max_nodes: _Connections = 32
-    """Nodes at once."""
-    max_header_bytes: Annotated[int, Field(ge=4096, le=1 << 20)] = 32 << 10
-    """Size limit of request line and headers; beyond it 431."""
-    header_timeout_s: _Seconds = 10.0
-    """Timeout of a request's headers; then 408, or the connection is closed."""
-    body_timeout_s: _Seconds = 20.0
-    """Timeout of a request's body; then 408."""
-    idle_timeout_s: _Seconds = 30.0
-    """Timeout of an idle connection."""
-    trusted_proxy: tuple[IPvAnyNetwork, ...] = ()
-    """Addresses of reverse proxies whose X-Forwarded-For and X-Forwarded-Proto are used."""
-
-    @property
-    def trusted_peers(self) -> list[str]:
-        """Trusted proxies as peer addresses: an IPv6 socket has an IPv4 peer as ::ffff:A.B.C.D."""
-        mapped = [
-            f"::ffff:{proxy.network_address}/{96 + proxy.prefixlen}"
-            for proxy in self.trusted_proxy
-            if proxy.version == _IPV4
-        ]
-        return [*map(str, self.trusted_proxy), *mapped]
 
 
 class Connection(Protocol):

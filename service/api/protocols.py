@@ -32,8 +32,8 @@ from websockets.http11 import Request
 
 from service.api.connection_limits import ConnectionLimiter
 from service.api.problems import problem_response
-from service.protocol.codec import SUBPROTOCOL, LinkCloseCode
-from service.protocol.link import INGEST_PATH
+from service.protocol.codec import LinkCloseCode
+from service.protocol.link import INGEST_PATH, SUBPROTOCOL
 
 log = logging.getLogger("foottile.doors")
 

@@ -27,16 +27,18 @@ from service.node.server_connection import (
     make_ingest_url,
     parse_server_message,
 )
-from service.node_identity import compute_fingerprint, make_proof
-from service.protocol.codec import SUBPROTOCOL, LinkCloseCode, encode_link_message
+from service.protocol.codec import LinkCloseCode, encode_link_message
 from service.protocol.link import (
     LINK_TIMEOUT_S,
     MESSAGE_BYTES_MAX,
     PROTOCOL,
+    SUBPROTOCOL,
     Challenge,
     Identify,
     Proof,
     Welcome,
+    compute_fingerprint,
+    make_proof,
 )
 
 

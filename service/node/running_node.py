@@ -30,13 +30,13 @@ from service.node.acquisition_process import (
 from service.node.frame_sender import NodeCallbacks
 from service.node.local_recording import LocalRecording
 from service.node.publisher import Publisher
-from service.node_identity import generate_secret
 from service.protocol.link import (
     PROTOCOL,
     EarlierStream,
     Hello,
     NodeStatus,
     RetentionMessage,
+    generate_secret,
 )
 from service.rig.emulated_foot import RigOptions
 from storage.durable_files import try_set_aside_and_describe

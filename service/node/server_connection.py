@@ -28,7 +28,6 @@ from foottile.connection import UpgradeRejection, explain_foreign_response, expl
 from foottile.environment import decode_zone
 from service.node.frame_sender import EstablishedLink, FrameSender
 from service.protocol.codec import (
-    SUBPROTOCOL,
     CloseConnection,
     LinkCloseCode,
     decode_link_message,
@@ -39,6 +38,7 @@ from service.protocol.link import (
     LINK_TIMEOUT_S,
     PROBES_PER_MEASUREMENT,
     SERVER_MESSAGES,
+    SUBPROTOCOL,
     Ack,
     Challenge,
     ClockProbe,

@@ -18,6 +18,7 @@ from pathlib import Path
 from devices.errors import (
     CalibrationError,
     DamagedFileError,
+    MissingExtraError,
     StorageError,
     UsageError,
     require_extra,
@@ -26,7 +27,7 @@ from devices.scene.emulation_sections import PartFamily
 from devices.scene.scene_file import Scene, load_scene, validate_scene
 from service.estimation.calibration import PRESETS, UNPROVEN_SUFFIX, Calibration
 from service.estimation.effects import Parameter
-from service.rig.emulated_foot import EmulatedFoot
+from service.rig.emulated_foot import EmulatedFoot, RigOptions
 from service.sessions.calibration_file import (
     make_not_a_calibration_error,
     parse_calibration,
@@ -201,3 +202,35 @@ def replace_tiles(scene: Scene, serials: Sequence[str]) -> Scene:
         for i, serial in enumerate(serials)
     ]
     return validate_scene({**scene.model_dump(), "tile": tiles}, where=f"scene {scene.name}")
+
+
+def find_scene_calibration(
+    options: RigOptions, on_progress: Callable[[str], None]
+) -> tuple[Calibration | None, str | None]:
+    """Return the calibration of a rig's scene, or the reason for its absence.
+
+    Raw frames need none: `on_progress` receives the reason, too.
+    """
+    scene = options.scene
+    if scene.calibration == "none":
+        return None, "the scene names no calibration"
+    if scene.calibration == EMULATED_RIG and not options.is_emulated:
+        # The emulated rig would calibrate an emulated tile of the same serial: plausible and wrong.
+        problem = (
+            "the emulated rig is for emulated tiles only: load the tiles on a real rig, run "
+            "`foottile calibrate`, and name its file in the scene"
+        )
+        on_progress(f"no calibration, so no forces: {problem}")
+        return None, problem
+    try:
+        calibration = find_calibration(
+            scene.calibration,
+            [tile.serial for tile in scene.tile if not tile.reference],
+            parts_seed=options.foot.parts_seed,
+            family=scene.emulation.family,
+            on_progress=on_progress,
+        )
+    except (CalibrationError, MissingExtraError) as error:
+        on_progress(f"no calibration, so no forces: {error}")
+        return None, str(error)
+    return calibration, None

@@ -21,7 +21,6 @@ from service.user_folders import strip_private_folders
 if TYPE_CHECKING:  # a node needs no shapes of pages
     from service.protocol.live import LiveMessage
 
-SUBPROTOCOL = "foottile.v1"
 _REASON_BYTES_MAX = 123
 _CRC_BYTES = 4
 _TEXT_WITH_CRC = re.compile(r'(\{.*),"crc32":"([0-9a-f]{8})"\}', re.DOTALL)

@@ -11,6 +11,7 @@ begin too early.
 
 from __future__ import annotations
 
+import math
 import sys
 import uuid
 from collections import deque
@@ -21,21 +22,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from devices.acquisition import Acquisition
+from devices.array.bus_recovery import BusRecovery, GpioRecovery, open_gpio_recovery
 from devices.array.startup import ReadyArray, prepare_array, reidentify_replaced_tiles
 from devices.buses.i2c import open_bus
 from devices.buses.spi import open_spi
 from devices.chips.dynamixel.driver import open_servo
 from devices.chips.dynamixel.firmwares import COUNTS_PER_TURN
 from devices.chips.dynamixel.position_sources import ThreadedServoSource
-from devices.chips.mcp3208 import Mcp3208
+from devices.chips.mcp3208 import COUNTS_MAX, COUNTS_PER_VREF, Mcp3208
 from devices.clock import Clock, SpinningClock, SystemClock, UtcAnchor
-from devices.errors import FootTileError, I2cError, TileSetupError, UsageError
+from devices.errors import FootTileError, I2cError, SpiError, TileSetupError, UsageError
 from devices.flags import FrameFlag, TileFlag
 from devices.frames import ArrayInfo, FrameBatch, ServoInfo, TileInfo
 from devices.realtime import is_clock_set, set_timer_slack, use_realtime_priority
-from devices.recovery import BusRecovery, GpioRecovery, open_gpio_recovery
-from devices.reference_force import ReferenceForceSensor
-from devices.scene.hardware_sections import EMULATED, ScheduleName, ServoSection
+from devices.scene.hardware_sections import EMULATED, ReferenceSection, ScheduleName, ServoSection
 from devices.scene.scene_file import Scene
 from service.rig.emulated_foot import RigOptions
 from service.version import SOFTWARE_VERSION
@@ -176,6 +176,46 @@ class LoadTrigger:
     def _begin_world(self) -> None:
         self._world.begin_scene_time()
         self.end_ns = self._world.epoch_ns + self._lead_ns
+
+
+class ReferenceForceSensor:
+    """Reference force of a calibration rig: a load cell's amplifier, read through an MCP3208.
+
+    A failed reading is NaN and never an exception. The scene gives the newtons per volt: the scale
+    of the paper's sensor and amplifier is not known (hardware.md 6), so there is no default.
+    """
+
+    def __init__(self, adc: Mcp3208, scene: ReferenceSection) -> None:
+        self.failed_readings = 0
+        """Number of failed readings: no transfer, or no converter."""
+        self.saturated_readings = 0
+        """Number of readings at either end of the converter's range, which are no force."""
+        self.warning = ""
+        """Reason why the last reading gave no force; empty if it gave one."""
+        self._adc = adc
+        self._channel = scene.channel
+        self._zero_v = scene.zero_v
+        self._n_per_v = scene.n_per_v
+        self._volts_per_count = scene.vref_v / COUNTS_PER_VREF
+
+    def read_force_n(self) -> float:
+        """Convert now and return the force in newtons.
+
+        NaN if the reading failed or is at either rail: an open, shorted or overloaded amplifier
+        must never give a plausible force.
+        """
+        try:
+            counts = self._adc.read_counts(self._channel)
+        except SpiError as error:
+            self.failed_readings += 1
+            self.warning = f"no reference force: {error}"
+            return math.nan
+        if counts in (0, COUNTS_MAX):
+            self.saturated_readings += 1
+            self.warning = "no reference force: the amplifier is off, unplugged or overloaded"
+            return math.nan
+        self.warning = ""
+        return (counts * self._volts_per_count - self._zero_v) * self._n_per_v
 
 
 def open_reference_sensor(

@@ -24,9 +24,16 @@ from devices.errors import (
     UnknownError,
     escape_control_chars,
 )
-from service.node_identity import compute_fingerprint, generate_secret, is_proof_valid
 from service.protocol.codec import CloseConnection, LinkCloseCode
-from service.protocol.link import PROTOCOL, Challenge, Hello, Proof
+from service.protocol.link import (
+    PROTOCOL,
+    Challenge,
+    Hello,
+    Proof,
+    compute_fingerprint,
+    generate_secret,
+    is_proof_valid,
+)
 from service.server.node import BOOT_ID_PATTERN, HELLO_NAME, ServerNode
 from storage.documents import read_document
 from storage.durable_files import translate_storage_errors, try_set_aside_and_describe

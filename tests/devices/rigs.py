@@ -10,6 +10,7 @@ from typing import Any, get_args
 import pytest
 from smbus2 import i2c_msg
 
+from devices.array.bus_recovery import BusRecovery
 from devices.array.schedules import BusTiming
 from devices.array.tile import Scan
 from devices.array.tile_array import TileArray
@@ -26,7 +27,6 @@ from devices.emulation.i2c_bus import EmulatedI2cAdapter, FaultyWires
 from devices.emulation.parts import make_rng
 from devices.errors import BusSetupError
 from devices.frames import TileInfo
-from devices.recovery import BusRecovery
 from devices.scene.emulation_sections import BUS_TARGET, FaultKind, PartFault, ReadDuringConversion
 from devices.scene.hardware_sections import ScheduleName
 from tests.builders.arrays import DATA_SHEET_CHIP, make_tile

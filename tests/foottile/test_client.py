@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import foottile
-import foottile.data
+import foottile.sessions
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running, ServeWith
 
@@ -88,7 +88,7 @@ def test_frames_are_read_however_small_the_pieces_are_that_they_come_in(
 ) -> None:
     session = recorded(server, tared)
     whole = pq.read_table(session.download(tmp_path / "trial.parquet"))
-    monkeypatch.setattr(foottile.data, "_CHUNK_BYTES", 100)
+    monkeypatch.setattr(foottile.sessions, "_CHUNK_BYTES", 100)
     table = session.open(whole.column_names).to_arrow()
     assert table.num_rows == session.frame_count
     assert table["seq"].equals(whole["seq"])

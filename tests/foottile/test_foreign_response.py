@@ -8,7 +8,7 @@ import pytest
 
 import foottile
 from foottile.connection import explain_foreign_response
-from foottile.live_protocol import LiveProtocol, LiveRequest
+from foottile.live import LiveProtocol, LiveRequest
 from tests.service.fake_node import FakeNode
 from tests.service.node.publishing import Publishing
 from tests.service.running import Running

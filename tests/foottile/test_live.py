@@ -11,7 +11,7 @@ import pyarrow as pa
 import pytest
 
 import foottile
-from foottile.live_protocol import LiveProtocol, LiveRequest
+from foottile.live import LiveProtocol, LiveRequest
 from tests.service.fake_node import FakeNode, Play
 from tests.service.running import Running
 from tests.waiting import until

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from websockets.exceptions import ConnectionClosed
 
-from service.node_identity import generate_secret
-from service.protocol.link import Challenge, Proof
+from service.protocol.link import Challenge, Proof, generate_secret
 from tests.hostile.attack import Outcome, Play, attack
 from tests.hostile.stage import Served, recording
 from tests.service.fake_node import Earlier, FakeNode

@@ -19,12 +19,12 @@ from websockets.exceptions import ConnectionClosed
 
 from devices.frames import ArrayInfo
 from service.api.protocols import CLIENT_MESSAGE_BYTES_MAX
-from service.node_identity import make_proof
-from service.protocol.codec import SUBPROTOCOL, append_crc, strip_text_crc
+from service.protocol.codec import append_crc, strip_text_crc
 from service.protocol.link import (
     INGEST_PATH,
     MESSAGE_BYTES_MAX,
     PROTOCOL,
+    SUBPROTOCOL,
     Challenge,
     ClockProbe,
     ClockSample,
@@ -35,6 +35,7 @@ from service.protocol.link import (
     NodeStatus,
     Proof,
     StreamSelect,
+    make_proof,
 )
 from service.protocol.live import LIVE_PATH
 from storage.wire import encode_as_messages

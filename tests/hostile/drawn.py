@@ -22,7 +22,7 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
-from service.api.guard import LOGIN_PATH, SAFE_METHODS
+from service.api.access import LOGIN_PATH, SAFE_METHODS
 from tests.hostile.attack import Outcome, Play
 from tests.hostile.stage import Served, traces
 

@@ -18,7 +18,6 @@ from websockets.sync.client import ClientConnection
 from devices.flags import FrameFlag
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
-from service.node_identity import generate_secret, make_proof
 from service.protocol.codec import append_crc, append_text_crc, strip_text_crc
 from service.protocol.link import (
     INGEST_PATH,
@@ -32,6 +31,8 @@ from service.protocol.link import (
     Proof,
     RetentionMessage,
     StreamSelect,
+    generate_secret,
+    make_proof,
 )
 from storage.intervals import Intervals
 from storage.schema import wire_schema

@@ -20,13 +20,12 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from devices.frames import FrameBatch
+from service.api.access import Logins, Role
 from service.api.address import list_urls, open_listening_socket
-from service.api.app import make_app
-from service.api.connection_limits import LimitSettings
-from service.api.logins import Logins, Role
+from service.api.app import make_app, serve_app
 from service.api.routes.login import add_ticket
-from service.api.runner import serve_app
-from service.protocol.codec import SUBPROTOCOL
+from service.api.settings import LimitSettings
+from service.protocol.link import SUBPROTOCOL
 from service.protocol.live import PageMessage
 from service.server.server import Server
 from storage.journal.journal import Journal

@@ -8,8 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.node_identity import compute_fingerprint, generate_secret, is_proof_valid, make_proof
-from service.protocol.link import PROTOCOL, Challenge, Proof
+from service.protocol.link import (
+    PROTOCOL,
+    Challenge,
+    Proof,
+    compute_fingerprint,
+    generate_secret,
+    is_proof_valid,
+    make_proof,
+)
 
 secrets = st.binary(min_size=32, max_size=32).map(bytes.hex)
 names = st.text("abcdefgh0123._-", min_size=1, max_size=64)

@@ -7,7 +7,7 @@ import re
 import pytest
 from playwright.sync_api import Route, expect
 
-from service.node_identity import compute_fingerprint
+from service.protocol.link import compute_fingerprint
 from tests.service.fake_node import FakeNode, Play
 from tests.service.running import closed
 from tests.waiting import until

@@ -6,8 +6,7 @@ from fastapi import APIRouter, Request
 from pydantic import BaseModel, Field
 
 from service.api.routes.common import ServerState, problem_responses
-from service.protocol.codec import SUBPROTOCOL
-from service.protocol.link import INGEST_PATH
+from service.protocol.link import INGEST_PATH, SUBPROTOCOL
 from service.protocol.live import LIVE_PATH, View
 from service.user_folders import PublicText
 from service.version import SOFTWARE_VERSION

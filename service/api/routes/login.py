@@ -9,7 +9,7 @@ from fastapi import APIRouter, Depends, Request, Response
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 from starlette.exceptions import HTTPException
 
-from service.api.logins import LOGIN_S, TICKET_S, Logins, Role, cookie_name
+from service.api.access import LOGIN_S, TICKET_S, Logins, Role, cookie_name
 from service.protocol.live import View
 from service.server_clock import server_utc_ns
 

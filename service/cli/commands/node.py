@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from devices.errors import CalibrationError, MissingExtraError, StorageError, UsageError
+from devices.errors import StorageError, UsageError
 from devices.types import check_user_name
 from service.cli.options import (
     CaOption,
@@ -25,9 +25,7 @@ from service.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from service.estimation.calibration import Calibration
     from service.node.running_node import NodeOptions, NodeOutcome
-    from service.rig.emulated_foot import RigOptions
 
 SERVER = "http://127.0.0.1:8000"
 
@@ -77,6 +75,7 @@ def node_command(
     from foottile.environment import read_token
     from service.node.running_node import NodeOptions
     from service.node.server_connection import make_ingest_url
+    from service.offline.calibration_lookup import find_scene_calibration
     from service.rig.emulated_foot import RigOptions
     from service.user_folders import resolve_user_folder
     from storage.permissions import set_umask_and_create_private_folder
@@ -105,7 +104,7 @@ def node_command(
             raise UsageError(f"--record {record!r} {error}", expected="one line of text") from error
     the_scene = load_adapted_scene(scene, bus=bus, servo=servo)
     rig = RigOptions(the_scene, _choose_name(name), options.make_foot(the_scene))
-    calibration, problem = find_scene_calibration(rig)
+    calibration, problem = find_scene_calibration(rig, remark)
     with suppress(StorageError):  # an unwritable card is reported later
         set_umask_and_create_private_folder(folder)
     outcome = asyncio.run(
@@ -144,35 +143,6 @@ async def _run_node(options: NodeOptions) -> NodeOutcome:
 
     freeze_garbage_collector()
     return await run_node(options, stop=create_stop_event(), report=remark)
-
-
-def find_scene_calibration(options: RigOptions) -> tuple[Calibration | None, str | None]:
-    """Return the scene's calibration, or the reason for its absence: raw frames need none."""
-    from service.offline.calibration_lookup import EMULATED_RIG, find_calibration
-
-    scene = options.scene
-    if scene.calibration == "none":
-        return None, "the scene names no calibration"
-    if scene.calibration == EMULATED_RIG and not options.is_emulated:
-        # The emulated rig would calibrate an emulated tile of the same serial: plausible and wrong.
-        problem = (
-            "the emulated rig is for emulated tiles only: load the tiles on a real rig, run "
-            "`foottile calibrate`, and name its file in the scene"
-        )
-        remark(f"no calibration, so no forces: {problem}")
-        return None, problem
-    try:
-        calibration = find_calibration(
-            scene.calibration,
-            [tile.serial for tile in scene.tile if not tile.reference],
-            parts_seed=options.foot.parts_seed,
-            family=scene.emulation.family,
-            on_progress=remark,
-        )
-    except (CalibrationError, MissingExtraError) as error:
-        remark(f"no calibration, so no forces: {error}")
-        return None, str(error)
-    return calibration, None
 
 
 def _choose_name(name: str | None) -> str:

@@ -16,7 +16,6 @@ from urllib.parse import quote
 import typer
 
 from devices.errors import FootTileError, StateError, require_extra
-from service.cli.commands.node import find_scene_calibration
 from service.cli.commands.sessions import SERVER, ServerOption
 from service.cli.options import (
     SECONDS_MAX,
@@ -46,7 +45,7 @@ from service.cli.tickets import (
 if TYPE_CHECKING:
     import socket
 
-    from service.api.logins import Logins
+    from service.api.access import Logins
     from service.api.settings import Settings
     from service.server.server import Server
 
@@ -134,6 +133,7 @@ def serve_command(
 
 async def _run_server(settings: Settings) -> None:
     from devices.realtime import freeze_garbage_collector
+    from service.api.access import Logins
     from service.api.address import (
         list_own_names,
         list_urls,
@@ -141,9 +141,7 @@ async def _run_server(settings: Settings) -> None:
         open_listening_socket,
         publish_token,
     )
-    from service.api.app import make_app
-    from service.api.logins import Logins
-    from service.api.runner import serve_app
+    from service.api.app import make_app, serve_app
     from service.server.server import Server
     from storage.permissions import set_umask_and_create_private_folder
 
@@ -180,8 +178,8 @@ def print_addresses(
         is_stored: whether the token is in the data folder.
         is_demo: print login links without a terminal, too.
     """
+    from service.api.access import Role
     from service.api.address import TOKEN_NAME
-    from service.api.logins import Role
     from service.api.routes.login import add_ticket
     from service.estimation.compilation import COMPILING_NOTE, is_compiling
 
@@ -234,13 +232,14 @@ def demo_command(
     import uvloop
 
     from service.api.connection_limits import raise_open_files_limit
+    from service.offline.calibration_lookup import find_scene_calibration
     from service.rig.emulated_foot import RigOptions
 
     raise_open_files_limit()
     the_scene = load_adapted_scene(scene, bus=None, servo=None)
     check_emulated(the_scene)
     # Fills the cache for the node.
-    find_scene_calibration(RigOptions(the_scene, NODE, options.make_foot(the_scene)))
+    find_scene_calibration(RigOptions(the_scene, NODE, options.make_foot(the_scene)), remark)
     arguments = [f"--scene={scene}", *options.to_arguments()]
     folder = resolve_data_folder(data)
     if data is None:
@@ -258,13 +257,13 @@ async def _run_demo(
     node_arguments: list[str],
 ) -> None:
     from foottile.environment import read_token
+    from service.api.access import Logins
     from service.api.address import (
         list_urls,
         load_or_create_token,
         open_listening_socket,
         publish_token,
     )
-    from service.api.logins import Logins
     from storage.permissions import set_umask_and_create_private_folder
 
     stop = create_stop_event()
@@ -309,8 +308,7 @@ async def _serve_demo(
     """Run a server while the block runs."""
     from devices.realtime import freeze_garbage_collector
     from service.api.address import list_own_names
-    from service.api.app import make_app
-    from service.api.runner import serve_app
+    from service.api.app import make_app, serve_app
     from service.server.server import Server
 
     server = Server(data)

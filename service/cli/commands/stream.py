@@ -46,7 +46,7 @@ def stream_command(
     stderr.
     """
     import foottile
-    from foottile.live_protocol import POLICIES
+    from foottile.live import POLICIES
 
     if to not in FORMATS:
         raise UsageError(f"--format {to!r}", expected=" or ".join(FORMATS))

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from devices.array.bus_monitor import BusMonitor
+from devices.array.bus_recovery import BusMonitor
 from devices.array.tile import Scan
 from devices.array.tile_array import TileArray
 from devices.buses.device_files import DeviceReopener

@@ -14,6 +14,7 @@ import numpy.typing as npt
 import pytest
 
 from devices.acquisition import Acquisition
+from devices.array.bus_recovery import GpioRecovery
 from devices.array.startup import prepare_array
 from devices.array.tile_array import TileArray
 from devices.buses.i2c import open_bus
@@ -23,7 +24,6 @@ from devices.emulation.i2c_bus import EmulatedGpioLines
 from devices.emulation.world import World
 from devices.flags import FrameFlag, TileFlag
 from devices.frames import NOT_READ, FrameBatch
-from devices.recovery import GpioRecovery
 from devices.scene.emulation_sections import BusFault, FaultKind, MuxFault, TileFault
 from devices.scene.hardware_sections import ScheduleName
 from tests.builders.scenes import make_scene

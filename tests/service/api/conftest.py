@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from service.api.connection_limits import LimitSettings
+from service.api.settings import LimitSettings
 from tests.service.api.access import TOKEN
 from tests.service.api.sealed import Sealed
 from tests.service.fake_node import FakeNode

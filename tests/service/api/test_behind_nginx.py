@@ -17,7 +17,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
-from service.api.connection_limits import LimitSettings
+from service.api.settings import LimitSettings
 from service.protocol.link import INGEST_PATH
 from service.protocol.live import LIVE_PATH
 from tests.service.fake_node import NodeOf

@@ -17,8 +17,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosed
 
-from service.api.connection_limits import OWN_FILES, RESERVE, ConnectionLimiter, LimitSettings
+from service.api.connection_limits import OWN_FILES, RESERVE, ConnectionLimiter
 from service.api.protocols import accept_connections
+from service.api.settings import LimitSettings
 from service.protocol.codec import LinkCloseCode
 from service.protocol.link import INGEST_PATH, PROTOCOL, Identify
 from service.protocol.live import LIVE_PATH

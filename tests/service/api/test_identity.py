@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from service.node_identity import compute_fingerprint
+from service.protocol.link import compute_fingerprint
 from storage.permissions import SECRETS_NAME, read_secrets_or_empty
 from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import Earlier, FakeNode, NodeOf

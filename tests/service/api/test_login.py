@@ -11,7 +11,7 @@ import httpx
 import pytest
 from websockets.exceptions import InvalidStatus
 
-from service.api.logins import LOGINS_MAX, TICKET_S, TICKETS_MAX, Logins, Role, SecretStore
+from service.api.access import LOGINS_MAX, TICKET_S, TICKETS_MAX, Logins, Role, SecretStore
 from service.protocol.link import INGEST_PATH
 from service.protocol.live import LIVE_PATH
 from tests.service.api.access import BEARER, CHANGES, TOKEN

@@ -10,7 +10,7 @@ import httpx
 import pytest
 
 from devices.errors import StorageError
-from service.api.guard import BODY_BYTES_MAX
+from service.api.access import BODY_BYTES_MAX
 from tests.service.api.sealed import Sealed
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running, assert_refused

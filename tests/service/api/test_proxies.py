@@ -9,8 +9,7 @@ import httpx
 import pytest
 from websockets.exceptions import ConnectionClosed
 
-from service.api.connection_limits import LimitSettings
-from service.api.settings import load_settings
+from service.api.settings import LimitSettings, load_settings
 from service.protocol.live import LIVE_PATH
 from tests.service.patient import patient_server
 from tests.service.running import Running, assert_refused

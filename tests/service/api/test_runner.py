@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from websockets.sync.client import connect
 
-import service.api.runner
+import service.api.app
 from service.estimation.compilation import is_compiling
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import ServeWith, receive_live
@@ -25,10 +25,8 @@ def compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A file; another process "compiles" until it exists."""
     path = tmp_path / "compiled"
     wait = f"while not p.Path({str(path)!r}).exists(): t.sleep(0.02)"
-    monkeypatch.setattr(service.api.runner, "load_cached_code", lambda: False)
-    monkeypatch.setattr(
-        service.api.runner, "_COMPILE_CODE", f"import pathlib as p, time as t\n{wait}"
-    )
+    monkeypatch.setattr(service.api.app, "load_cached_code", lambda: False)
+    monkeypatch.setattr(service.api.app, "_COMPILE_CODE", f"import pathlib as p, time as t\n{wait}")
     return path
 
 

@@ -17,7 +17,7 @@ FOOTTILE = str(Path(sys.executable).parent / "foottile")
 ANNOUNCE = """
 import sys
 from pathlib import Path
-from service.api.logins import Logins
+from service.api.access import Logins
 from service.cli import main
 from service.cli.commands.serve import print_addresses
 main.app = lambda: print_addresses(

@@ -12,10 +12,10 @@ import pytest
 import segno
 
 from service.api import address as interfaces
-from service.api.logins import Logins, Role
+from service.api.access import Logins, Role
 from service.cli.commands.serve import print_addresses
 from service.cli.tickets import make_qr_lines, remark_unreachable
-from service.node_identity import compute_fingerprint
+from service.protocol.link import compute_fingerprint
 from tests.service.cli.outcome import Outcome, Run
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import Running, ServeWith, closed

@@ -15,9 +15,7 @@ import service.node.frame_sender
 import service.server
 from devices.errors import UsageError
 from service.node.server_connection import make_ingest_url
-from service.node_identity import compute_fingerprint, make_proof
 from service.protocol.codec import (
-    SUBPROTOCOL,
     LinkCloseCode,
     encode_link_message,
     strip_binary_crc,
@@ -26,6 +24,7 @@ from service.protocol.codec import (
 from service.protocol.link import (
     NODE_MESSAGES,
     PROTOCOL,
+    SUBPROTOCOL,
     Ack,
     Challenge,
     Hello,
@@ -36,6 +35,8 @@ from service.protocol.link import (
     StreamNumbers,
     StreamSelect,
     Welcome,
+    compute_fingerprint,
+    make_proof,
 )
 from storage.intervals import Intervals
 from storage.journal.node.retention import RetentionRequests as NodeWanted

@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 
 from devices.errors import ChangedError, StateError, StorageError
 from service.node.running_node import ServerSecrets
-from service.node_identity import compute_fingerprint, generate_secret, make_proof
 from service.protocol.codec import CloseConnection, LinkCloseCode
-from service.protocol.link import Proof
+from service.protocol.link import Proof, compute_fingerprint, generate_secret, make_proof
 from service.server.nodes import IdentityClaim, NodeIdentities
 from storage.permissions import SECRETS_NAME
 from tests.storage.faulty_disk import NO_SPACE, refusing

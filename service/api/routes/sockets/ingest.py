@@ -14,7 +14,6 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 from devices.errors import LinkError, StorageError, escape_control_chars
 from service.api.protocols import send_message
 from service.protocol.codec import (
-    SUBPROTOCOL,
     CloseConnection,
     LinkCloseCode,
     decode_link_message,
@@ -27,6 +26,7 @@ from service.protocol.link import (
     MESSAGE_BYTES_MAX,
     NODE_MESSAGES,
     PROTOCOL,
+    SUBPROTOCOL,
     Ack,
     ClockProbe,
     ClockSample,

@@ -15,13 +15,13 @@ from devices.errors import UsageError
 from service.api.protocols import SOCKET_EXTENSION, send_message
 from service.api.protocols import LimitedWebSocket as Connection
 from service.protocol.codec import (
-    SUBPROTOCOL,
     CloseConnection,
     LinkCloseCode,
     decode_message,
     encode_message,
     format_close_reason,
 )
+from service.protocol.link import SUBPROTOCOL
 from service.protocol.live import (
     PING,
     FeedGap,

@@ -13,8 +13,8 @@ from devices.chips.mcp3208 import Mcp3208
 from devices.clock import VirtualClock
 from devices.emulation.chips.mcp3208 import EmulatedMcp3208, InputVoltages, make_amplifier
 from devices.emulation.world import World
-from devices.reference_force import ReferenceForceSensor
 from devices.scene.hardware_sections import ReferenceSection
+from service.rig.rig import ReferenceForceSensor
 from tests.builders.scenes import make_scene
 
 SCENE = ReferenceSection(channel=3, zero_v=1.65, n_per_v=100 / 3.3)

@@ -10,9 +10,9 @@ from typing import Any, Self
 
 import pytest
 
+from devices.array.bus_recovery import GpioLines, GpioRecovery, open_gpio_recovery
 from devices.clock import VirtualClock
 from devices.errors import BusSetupError, MissingExtraError
-from devices.recovery import GpioLines, GpioRecovery, open_gpio_recovery
 from devices.scene.hardware_sections import RecoverySection
 
 pytestmark = pytest.mark.process

@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devices.clock import VirtualClock
-from devices.recovery import (
+from devices.array.bus_recovery import (
     RECOVERY_CLOCKS,
     GpioRecovery,
     OpenDrainLine,
     open_gpio_recovery,
 )
+from devices.clock import VirtualClock
 
 FOREVER = 10**9
 
