@@ -16,7 +16,7 @@ from urllib.parse import quote
 import typer
 
 from devices.errors import CalibrationError, UsageError, require_extra
-from service.cli.commands.sessions import SERVER, ServerOption
+from service.cli.commands.sessions import SERVER, ServerOption, find_sealed_file
 from service.cli.options import (
     CaOption,
     JsonOption,
@@ -45,6 +45,7 @@ from storage.sessions.folder import FRAMES_NAME
 if TYPE_CHECKING:
     from foottile.server import Server
     from service.estimation.calibration import Calibration
+    from service.offline.mount_calibration import MountCalibrationOptions
 
 DELAY_MAX_MS = 1000.0
 """Largest delay of a usable reference."""
@@ -76,7 +77,7 @@ def calibrate_live(
         CalibrationError: the weights give no curve.
     """
     import foottile
-    from service.cli.calibration_report import calibration_to_json, make_calibration_tables
+    from service.cli.report import calibration_to_json, make_calibration_tables
     from service.estimation.dead_weights import check_and_label_weights
     from service.sessions.calibration_file import parse_calibration
     from storage.durable_files import write_atomically
@@ -372,7 +373,6 @@ def calibrate_command(
             raise UsageError(
                 "--reference goes with one session, and without --plot and --reference-delay-ms"
             )
-        from service.cli.commands.calibrate_mount import calibrate_mounted_foot
         from service.offline.mount_calibration import MountCalibrationOptions
 
         options = MountCalibrationOptions(
@@ -383,12 +383,12 @@ def calibrate_command(
             reference_gain_sigma=reference_gain_sigma,
             reference=sensor,
         )
-        calibrate_mounted_foot(recordings[0], reference, out, options, as_json=as_json)
+        _calibrate_mounted_foot(recordings[0], reference, out, options, as_json=as_json)
         return
     for_plate = (*stated.values(), rate_hz, lag_range_s)
     if per_tile or shear or reference_gain_sigma or any(each is not None for each in for_plate):
         raise UsageError("these options go with --reference", remedy="Add --reference FILE")
-    from service.cli.calibration_report import calibration_to_json, make_calibration_tables
+    from service.cli.report import calibration_to_json, make_calibration_tables
     from service.estimation.effects import Parameter
     from service.estimation.fitting.effects_fit import DEFAULT_REFERENCE_DELAY
     from service.estimation.fitting.weights_fit import has_weights
@@ -440,3 +440,26 @@ def calibrate_command(
         remark(f"tile {serial} refused: {reason}")
     if calibration.refused:
         raise typer.Exit(3)
+
+
+def _calibrate_mounted_foot(
+    session: Path, reference: Path, out: Path, options: MountCalibrationOptions, *, as_json: bool
+) -> None:
+    """Fit a mounted foot to a force plate."""
+    from service.cli.report import make_mount_json, make_mount_table
+    from service.offline.mount_calibration import calibrate_mount
+    from service.sessions.calibration_file import write_calibration
+
+    source = find_sealed_file(str(session), None)
+    path = resolve_output_path(out, source, reference)
+    with show_progress(f"calibrating {session.name} against {reference.name}"):
+        found = calibrate_mount(source, reference, options, name=path.stem)
+    write_calibration(path, found.calibration)
+    if as_json:
+        print_json(make_mount_json(found))
+    else:
+        stdout.print(make_mount_table(found))
+    if options.reference_gain_sigma == 0.0:
+        remark("the plate's gain is assumed exact; --reference-gain-sigma states its uncertainty")
+    for note in found.comparison.notes:
+        remark(note)

@@ -25,6 +25,7 @@ from service.cli.options import (
     JsonOption,
     echo,
     echo_lines,
+    open_result_folder,
     parse_pair,
     print_json,
     remark,
@@ -44,7 +45,6 @@ from service.cli.reference_options import (
     make_reference_options,
     parse_named_values,
 )
-from service.cli.report import open_result_folder
 
 if TYPE_CHECKING:
     from service.offline.archive.jobs import Job, OutcomeCounts

@@ -22,7 +22,6 @@ from service.cli.options import (
     resolve_output_path,
     show_progress,
 )
-from service.cli.report import make_findings_json, print_findings
 from service.estimation import OFFLINE_LAG_MS
 
 if TYPE_CHECKING:
@@ -123,6 +122,8 @@ def simulate_command(
 
 
 def _make_json(result: SimulationResult, path: Path) -> dict[str, object]:
+    from service.cli.report import make_findings_json
+
     pressed = result.indentation_trace
     return {
         "out": path,
@@ -141,6 +142,8 @@ def _make_json(result: SimulationResult, path: Path) -> dict[str, object]:
 
 
 def _print_result(result: SimulationResult, path: Path) -> None:
+    from service.cli.report import print_findings
+
     size = path.stat().st_size
     echo(
         f"{path}: {result.frame_count} frames in {result.seconds:.3f} s of virtual time, "

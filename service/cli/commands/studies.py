@@ -19,11 +19,11 @@ from service.cli.options import (
     check_emulated,
     echo,
     echo_lines,
+    open_result_folder,
     print_json,
     remark,
     show_progress,
 )
-from service.cli.report import open_result_folder
 from service.json_output import to_json_text
 
 ARRAYS, QUICK_ARRAYS = 200, 3
