@@ -27,8 +27,7 @@ from service.api import problems
 from service.api.access import AccessGuard, Logins
 from service.api.connection_limits import ConnectionLimiter, open_files_max
 from service.api.protocols import LimitedConfig, LimitedHttp, LimitedWebSocket, accept_connections
-from service.api.routes import calibrations, common, index, login, nodes, weighings
-from service.api.routes.downloads import data, zips
+from service.api.routes import calibrations, common, downloads, index, login, nodes, weighings
 from service.api.routes.recordings import comparisons, integrity, overview, sessions, stances, takes
 from service.api.routes.sockets.ingest import serve_node
 from service.api.routes.sockets.live import serve_live
@@ -178,11 +177,11 @@ def _make_api_routes() -> tuple[BaseRoute, ...]:
         nodes.router,
         calibrations.router,
         weighings.router,
-        zips.router,  # before the route with a session's id
+        downloads.zip_router,  # before the route with a session's id
         sessions.router,
         takes.router,
         sessions.trash_router,
-        data.router,
+        downloads.router,
         takes.data_router,
         index.formats_router,
         integrity.router,

@@ -11,8 +11,8 @@ from itertools import count
 import httpx
 import pytest
 
-import service.api.routes.downloads.zips as zips
 from service.api.app import make_app
+from service.api.routes import downloads
 from storage.formats.writers.registry import FORMATS
 from tests.service.api.sealed import Sealed
 from tests.service.fake_node import FakeNode
@@ -177,7 +177,7 @@ def test_head_ends_the_encoder(sealed: Sealed, monkeypatch: pytest.MonkeyPatch) 
         finally:
             ended[0] = True
 
-    monkeypatch.setattr(zips, "stream_zip", encode_endlessly)
+    monkeypatch.setattr(downloads, "stream_zip", encode_endlessly)
     answer = request(sealed.running, f"/api/v1/sessions/zip?ids={sealed.id}", "HEAD")
     assert answer.headers["content-type"] == "application/zip"
     until(lambda: ended[0])
@@ -241,7 +241,7 @@ def test_a_broken_answer_to_http_1_0_is_a_reset(
         yield b"x" * 65536
         raise RuntimeError("a part of this test")
 
-    monkeypatch.setattr(zips, "stream_zip", encode_and_fail)
+    monkeypatch.setattr(downloads, "stream_zip", encode_and_fail)
     with pytest.raises(ConnectionResetError):
         request_1_0(sealed.running, f"/api/v1/sessions/zip?ids={sealed.id}")
 

@@ -17,10 +17,10 @@ import httpx
 import pytest
 
 import foottile
-import service.api.routes.downloads.zips
+import service.api.routes.downloads
 from devices.errors import StorageError
 from service.api.routes.common import file_response
-from service.api.routes.downloads.zips import ZippedSession, stream_zip
+from service.api.routes.downloads import ZippedSession, stream_zip
 from service.pull import pull_take_export
 from service.sessions.sealing import rebuild_damaged_session_json
 from storage.formats.slice import Slice
@@ -435,7 +435,7 @@ def test_a_zip_of_a_session_deleted_meanwhile_does_not_open(
     two_sealed: list[Recording], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     running = two_sealed[0].running
-    put = service.api.routes.downloads.zips._put
+    put = service.api.routes.downloads._put
 
     def delete_and_put(*arguments: Any) -> Any:
         if arguments[2].parent.name == two_sealed[1].id:
@@ -443,7 +443,7 @@ def test_a_zip_of_a_session_deleted_meanwhile_does_not_open(
                 assert http.delete(two_sealed[1].url).status_code == 204
         return put(*arguments)
 
-    monkeypatch.setattr(service.api.routes.downloads.zips, "_put", delete_and_put)
+    monkeypatch.setattr(service.api.routes.downloads, "_put", delete_and_put)
     content = read_until_cut(running, two_sealed[0].id, two_sealed[1].id)
     assert len(content) > 1000  # the first one had gone out
     with pytest.raises(zipfile.BadZipFile):

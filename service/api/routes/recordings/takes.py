@@ -20,7 +20,7 @@ from service.api.routes.common import (
     make_idempotency_record,
     problem_responses,
 )
-from service.api.routes.downloads.exports import (
+from service.api.routes.exports import (
     Chunks,
     TakeDataQuery,
     compute_export_etag,

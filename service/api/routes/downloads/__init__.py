@@ -1,1 +1,0 @@
-"""Downloads: in any format, a slice, a take, several sessions."""
