@@ -1,4 +1,4 @@
-"""Injected time: a monotonic clock that never steps, and the anchor that maps it to UTC.
+"""Time: injected monotonic clocks, the anchor that maps one to UTC, and a server's UTC.
 
 The node uses `SystemClock`. `VirtualClock` advances only when the emulated bus adds bit times or a
 sleep jumps ahead, so that a session runs bit-exactly and faster than real time.
@@ -92,3 +92,21 @@ class UtcAnchor:
     def from_readings(cls, t_mono_ns: int, t_ns: int, *, clock_set: bool) -> UtcAnchor:
         """Build an anchor from one simultaneous reading of both clocks."""
         return cls(offset_ns=t_ns - t_mono_ns, clock_set=clock_set)
+
+
+def _read_boottime_ns() -> int:
+    # Unlike CLOCK_MONOTONIC it continues during suspend.
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+
+_UTC_OFFSET_NS = time.time_ns() - _read_boottime_ns()
+
+
+def server_utc_ns() -> int:
+    """Return a server's UTC in nanoseconds since 1970: read once, then continued without steps.
+
+    It times the begin and end of sessions, and is the reference for nodes' clocks. If NTP sets the
+    machine's date while the server runs, intervals stay correct; the new date applies from the next
+    start.
+    """
+    return _UTC_OFFSET_NS + _read_boottime_ns()

@@ -16,7 +16,7 @@ from typing import Literal, Protocol, get_args
 import numpy as np
 
 from devices.arrays import Floats, Times
-from devices.chips.dynamixel.firmwares import COUNTS_PER_TURN
+from devices.chips.dynamixel.protocol import COUNTS_PER_TURN
 from devices.clock import Clock
 from devices.emulation.chips import mpl115a2
 from devices.emulation.chips.dynamixel import EmulatedServo

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
-from devices.chips.dynamixel.firmwares import FIRMWARES
+from devices.chips.dynamixel.protocol import FIRMWARES
 from devices.chips.pressure_chips import PRESSURE_CHIPS
 from devices.chips.tca9548a import ADDRESSES, CHANNELS
 from devices.types import Identifier

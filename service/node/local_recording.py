@@ -12,9 +12,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from devices.clock import server_utc_ns
 from devices.errors import FootTileError, StorageError
 from service.estimation.calibration import Calibration
-from service.server_clock import server_utc_ns
 from service.sessions.lifecycle import (
     NodeChange,
     Resume,

@@ -27,8 +27,8 @@ from devices.array.startup import ReadyArray, prepare_array, reidentify_replaced
 from devices.buses.i2c import open_bus
 from devices.buses.spi import open_spi
 from devices.chips.dynamixel.driver import open_servo
-from devices.chips.dynamixel.firmwares import COUNTS_PER_TURN
 from devices.chips.dynamixel.position_sources import ThreadedServoSource
+from devices.chips.dynamixel.protocol import COUNTS_PER_TURN
 from devices.chips.mcp3208 import COUNTS_MAX, COUNTS_PER_VREF, Mcp3208
 from devices.clock import Clock, SpinningClock, SystemClock, UtcAnchor
 from devices.errors import FootTileError, I2cError, SpiError, TileSetupError, UsageError

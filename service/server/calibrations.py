@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from devices.clock import server_utc_ns
 from devices.errors import (
     CalibrationError,
     FileFormatError,
@@ -33,7 +34,6 @@ from devices.errors import (
 )
 from service.estimation.calibration import Calibration
 from service.server.session_store import SessionStore
-from service.server_clock import server_utc_ns
 from service.sessions.calibration_file import encode_calibration, parse_calibration
 from storage.durable_files import (
     make_synced_folder,

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
+from devices.clock import server_utc_ns
 from devices.errors import (
     DamagedFileError,
     FileFormatError,
@@ -25,7 +26,6 @@ from devices.frames import ArrayInfo, FrameBatch
 from service.protocol.link import STREAM_ID_PATTERN, Hello, StreamNumbers
 from service.server.estimates.node_estimator import EstimatedBatch, NodeEstimator
 from service.server.streams import ServerStream
-from service.server_clock import server_utc_ns
 from service.sessions.parts import NodeFacts, NodeReport, SessionStream
 from service.sessions.tares import RecordedTare
 from storage.clock.log import ClockOffset

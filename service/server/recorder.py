@@ -14,13 +14,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
+from devices.clock import server_utc_ns
 from devices.errors import DamagedFramesError, FootTileError, StateError, StorageError
 from service.estimation.compilation import is_compiling
 from service.protocol.link import ClockSample, RetentionMessage, StreamNumbers
 from service.server.node import ServerNode
 from service.server.nodes import NodeRegistry
 from service.server.session_store import SessionStore, check_revision, user_fields_revision
-from service.server_clock import server_utc_ns
 from service.sessions.inputs import SessionInputs, make_inputs
 from service.sessions.lifecycle import (
     Abandon,

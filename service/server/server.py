@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
+from devices.clock import server_utc_ns
 from devices.errors import FootTileError, StorageError
 from service.protocol.codec import LinkCloseCode
 from service.protocol.link import RetentionMessage
@@ -31,7 +32,6 @@ from service.server.session_store import SessionStore, Trash, delete_and_count_b
 from service.server.streams import ServerStream
 from service.server.takes import TakeRecorder
 from service.server.weighings import Weighings
-from service.server_clock import server_utc_ns
 from service.sessions.overview import ComparisonSeriesCache
 from service.sessions.preview import SessionPreviews
 from service.user_folders import register_private_folder

@@ -14,6 +14,7 @@ from bisect import bisect_left, insort
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
+from devices.clock import server_utc_ns
 from devices.errors import (
     ChangedError,
     StateError,
@@ -22,7 +23,6 @@ from devices.errors import (
     UsageError,
     escape_control_chars,
 )
-from service.server_clock import server_utc_ns
 from service.sessions.lifecycle import Edit, apply_event
 from service.sessions.sealing import rebuild_damaged_session_json
 from storage.durable_files import translate_storage_errors

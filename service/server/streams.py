@@ -5,7 +5,7 @@ of losses and the stream's end. `sync` writes it.
 
 The upper bounds of a running stream's frames (`StreamLimit`) follow from hello, in which a node
 states its clock and its next number, and from the server's clock, which counts suspend and never
-steps (`service.server_clock`). A node's clock gains no more on it than `DISCIPLINE_RATE_LIMIT`; it
+steps (`devices.clock`). A node's clock gains no more on it than `DISCIPLINE_RATE_LIMIT`; it
 may fall behind, where the node was suspended. So neither a date that was set nor an offset that the
 node measured changes them, and frames of the past are never beyond them.
 """

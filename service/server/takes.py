@@ -12,11 +12,11 @@ from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
+from devices.clock import server_utc_ns
 from devices.errors import FootTileError, StateError, UnknownError
 from service.server.nodes import NodeRegistry
 from service.server.recorder import Recorder
 from service.server.session_store import SessionStore
-from service.server_clock import server_utc_ns
 from storage.sessions.folder import IdempotencyRecord, Session
 
 _ERRORS_KEPT = 1000

@@ -29,10 +29,10 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any, Literal, NamedTuple
 
+from devices.clock import server_utc_ns
 from devices.errors import StateError
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration
-from service.server_clock import server_utc_ns
 from service.sessions.parts import (
     NodeFacts,
     close_at_likely_end,

@@ -15,10 +15,9 @@ from service.estimation.fitting.least_squares import (
 from service.estimation.records import SIGMAS_95
 from service.offline.compare.report import OUR_COLOUR, REFERENCE_COLOUR, TILE_COLOURS
 from service.offline.figure_output import create_figure, render_png
-from studies.reproduce import trials as paper
-from studies.reproduce.indentation import DomeResult
+from studies.reproduce import experiments as paper
+from studies.reproduce.experiments import MUD, PRESSURE_PLATE, DomeResult
 from studies.reproduce.result import ExperimentResult, Reproduction, TrialResult
-from studies.reproduce.trials import MUD, PRESSURE_PLATE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
-from studies.reproduce import trials as paper
+from studies.reproduce import experiments as paper
+from studies.reproduce.experiments import MUD, POPPY, POPPY_RIM, ROLLING
 from studies.reproduce.result import (
     REPORTED_FIGURES,
     ExperimentResult,
@@ -13,7 +14,6 @@ from studies.reproduce.result import (
     Reproduction,
     TrialResult,
 )
-from studies.reproduce.trials import MUD, POPPY, POPPY_RIM, ROLLING
 
 ONE_FOOT = (
     "One foot is real and the other emulated: the paper's errors are those of cast domes on a "

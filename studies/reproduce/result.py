@@ -31,8 +31,12 @@ from service.offline.comparison import CompareOptions, Comparison, compare_sessi
 from service.rig.emulated_foot import make_injected_path
 from storage.formats.reference import ReferenceOptions
 from storage.sessions.reader import SealedFileReader
-from studies.reproduce.indentation import DomeResult, pool_repeatability
-from studies.reproduce.trials import FORCE_PLATE, ExperimentSetup
+from studies.reproduce.experiments import (
+    FORCE_PLATE,
+    DomeResult,
+    ExperimentSetup,
+    pool_repeatability,
+)
 
 _STEP_S = 1e-3
 _LOADED_N = 0.5

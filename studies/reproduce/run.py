@@ -36,13 +36,20 @@ from service.sessions.calibration_file import write_calibration
 from service.version import SOFTWARE_VERSION
 from storage.durable_files import make_synced_folder, write_atomically
 from storage.sessions.folder import FRAMES_NAME
-from studies.reproduce.indentation import (
+from studies.reproduce.experiments import (
+    ROLLING,
+    SETUPS,
+    TRIALS,
     DomeResult,
+    ExperimentSetup,
+    TrialPlan,
     calibrate_tile,
+    compose_scene_toml,
     evaluate_dome,
     indent_tile,
     make_dome_scene,
     merge_calibrations,
+    plan_trials,
 )
 from studies.reproduce.result import (
     ExperimentResult,
@@ -50,15 +57,6 @@ from studies.reproduce.result import (
     TrialResult,
     compute_not_borne_n,
     evaluate_trial,
-)
-from studies.reproduce.trials import (
-    ROLLING,
-    SETUPS,
-    TRIALS,
-    ExperimentSetup,
-    TrialPlan,
-    compose_scene_toml,
-    plan_trials,
 )
 
 _SERVER_START_TIMEOUT_S = 120.0

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devices.clock import SystemClock, UtcAnchor, VirtualClock
+from devices.clock import SystemClock, UtcAnchor, VirtualClock, server_utc_ns
 
 instants = st.integers(-(2**62), 2**62)
 
@@ -62,3 +64,24 @@ def test_an_anchor_converts_the_time_of_one_clock_to_the_other(t_mono_ns: int, t
     anchor = UtcAnchor.from_readings(t_mono_ns, t_ns, clock_set=False)
     assert t_mono_ns + anchor.offset_ns == t_ns
     assert not anchor.clock_set
+
+
+HOUR_NS = 3_600_000_000_000
+
+
+def test_it_is_the_date_of_this_machine() -> None:
+    assert abs(server_utc_ns() - time.time_ns()) < HOUR_NS
+
+
+@pytest.mark.parametrize("step_ns", [HOUR_NS, -HOUR_NS])
+def test_it_does_not_follow_a_step_of_the_machines_clock(
+    monkeypatch: pytest.MonkeyPatch, step_ns: int
+) -> None:
+    before_ns, real = server_utc_ns(), time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: real() + step_ns)
+    assert 0 <= server_utc_ns() - before_ns < 60_000_000_000
+
+
+def test_it_never_goes_back() -> None:
+    readings = [server_utc_ns() for _ in range(1000)]
+    assert readings == sorted(readings)

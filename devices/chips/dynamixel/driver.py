@@ -23,8 +23,15 @@ from devices.buses.serial_line import (
     find_stable_path,
     open_serial_line,
 )
-from devices.chips.dynamixel.firmwares import FIRMWARES, CountRange, Register, find_model
-from devices.chips.dynamixel.protocol import PacketDecoder, ServoAnswer, compute_wire_time_ns
+from devices.chips.dynamixel.protocol import (
+    FIRMWARES,
+    CountRange,
+    PacketDecoder,
+    Register,
+    ServoAnswer,
+    compute_wire_time_ns,
+    find_model,
+)
 from devices.clock import Clock
 from devices.errors import (
     ServoError,

@@ -24,7 +24,7 @@ from types import TracebackType
 from typing import Self
 
 from devices.chips.dynamixel.driver import DynamixelServo, PositionReading
-from devices.chips.dynamixel.firmwares import COUNTS_PER_TURN, CountRange
+from devices.chips.dynamixel.protocol import COUNTS_PER_TURN, CountRange
 from devices.clock import Clock
 from devices.errors import ServoError, ServoSetupError
 from devices.frames import NO_SERVO_COUNTS

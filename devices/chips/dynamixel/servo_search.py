@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from devices.buses.serial_line import open_serial_line
 from devices.chips.dynamixel.driver import DynamixelServo
-from devices.chips.dynamixel.firmwares import FIRMWARES, find_model
+from devices.chips.dynamixel.protocol import FIRMWARES, find_model
 from devices.clock import Clock
 from devices.errors import ServoPacketError, ServoStatusError, ServoTimeoutError
 

@@ -32,10 +32,11 @@ from pathlib import Path
 from typing import ClassVar, Self
 
 from devices.chips.dynamixel.driver import TICK_PERIOD
-from devices.chips.dynamixel.firmwares import COUNTS_PER_TURN, FIRMWARES
 from devices.chips.dynamixel.protocol import (
     ALERT,
     BROADCAST_ID,
+    COUNTS_PER_TURN,
+    FIRMWARES,
     ErrorFlag,
     Instruction,
     Packet,

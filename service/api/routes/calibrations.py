@@ -9,6 +9,7 @@ from fastapi import APIRouter, Header, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
 
+from devices.clock import server_utc_ns
 from devices.errors import CalibrationError, FootTileError, UsageError
 from devices.types import check_user_name
 from service.api.routes.common import (
@@ -25,7 +26,6 @@ from service.server.broadcast.views import Page, make_calibration_view
 from service.server.calibrations import JOB_SESSIONS_MAX, CalibrationJob, CalibrationSummary
 from service.server.node import ServerNode
 from service.server.session_store import check_revision
-from service.server_clock import server_utc_ns
 from service.sessions.calibration_file import encode_calibration, parse_calibration
 from service.sessions.pipeline import EstimateOptions, EstimateStream
 from service.user_folders import PublicText

@@ -9,9 +9,9 @@ from fastapi import APIRouter, Depends, Request, Response
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 from starlette.exceptions import HTTPException
 
+from devices.clock import server_utc_ns
 from service.api.access import LOGIN_S, TICKET_S, Logins, Role, cookie_name
 from service.protocol.live import View
-from service.server_clock import server_utc_ns
 
 router = APIRouter(tags=["login"])
 

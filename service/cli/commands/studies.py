@@ -318,10 +318,10 @@ def reproduce_command(
     """
     from service.offline.figure_output import create_figure
     from storage.durable_files import write_atomically
+    from studies.reproduce.experiments import TRIALS
     from studies.reproduce.figures import draw_figures
     from studies.reproduce.report import format_reproduction_report
     from studies.reproduce.run import QUICK_TRIALS, ReproduceOptions, run_reproduction
-    from studies.reproduce.trials import TRIALS
 
     create_figure(1.0, 1.0)  # reports a missing package early
     options = ReproduceOptions(

@@ -14,6 +14,7 @@ from typing import Protocol
 
 from websockets.frames import Frame, Opcode
 
+from devices.clock import server_utc_ns
 from service.protocol.codec import CloseConnection, LinkCloseCode, encode_message
 from service.protocol.live import PageMessage, SessionProgress
 from service.server.broadcast.summary import (
@@ -25,7 +26,6 @@ from service.server.broadcast.summary import (
 )
 from service.server.estimates.node_estimator import EstimatedBatch
 from service.server.node import ServerNode
-from service.server_clock import server_utc_ns
 
 RATES_HZ = (1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 60.0)
 """Update rates; a requested rate is rounded down."""

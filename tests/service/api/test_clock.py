@@ -15,8 +15,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+import devices.clock
 import foottile
-from service import server_clock
 from service.pull import pull_export, pull_session
 from storage.clock.log import ClockLog
 from storage.formats.load_trace import read_load_to_emulate
@@ -199,7 +199,7 @@ def test_a_date_set_on_the_server_is_a_step_of_the_session(
     node.send(50)
     node.taken_in()
     node.leave()
-    monkeypatch.setattr(server_clock, "_OFFSET_NS", server_clock._OFFSET_NS + HOUR_NS)
+    monkeypatch.setattr(devices.clock, "_UTC_OFFSET_NS", devices.clock._UTC_OFFSET_NS + HOUR_NS)
     node.greet()
     send_sample(node, HOUR_NS)
     (stream,) = session.clock()["streams"]

@@ -16,12 +16,12 @@ from service.offline.compare.block_covariance import UncertainValue
 from service.offline.simulation import SimulationOptions, run_simulation
 from service.rig.emulated_foot import EmulatedFoot, PlateFiles
 from service.sessions.pipeline import EstimateOptions
+from studies.reproduce.experiments import POPPY, ROLLING, ExperimentSetup
 from studies.reproduce.result import (
     InjectedValueCheck,
     TrialResult,
     evaluate_trial,
 )
-from studies.reproduce.trials import POPPY, ROLLING, ExperimentSetup
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from service.estimation.domes import DOMES, PAPER_DOME
 from service.estimation.fitting.rig.indentation import Strokes
-from studies.reproduce.indentation import (
+from studies.reproduce.experiments import (
     OVERLOAD_FACTOR,
     compute_repeatability,
     evaluate_dome,

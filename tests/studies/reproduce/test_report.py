@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from studies.reproduce import trials as paper
+from studies.reproduce import experiments as paper
 from studies.reproduce.figures import draw_figures
 from studies.reproduce.report import ONE_FOOT, format_reproduction_report
 from studies.reproduce.result import Reproduction

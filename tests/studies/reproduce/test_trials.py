@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from devices.scene.scene_file import load_scene
-from studies.reproduce.result import compute_not_borne_n
-from studies.reproduce.trials import (
+from studies.reproduce.experiments import (
     POPPY,
     POPPY_RIM,
     SETUPS,
@@ -16,6 +15,7 @@ from studies.reproduce.trials import (
     compose_scene_toml,
     plan_trials,
 )
+from studies.reproduce.result import compute_not_borne_n
 
 
 @pytest.mark.parametrize("setup", SETUPS, ids=lambda setup: setup.name)

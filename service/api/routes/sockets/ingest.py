@@ -11,6 +11,7 @@ from typing import TypeVar
 
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
+from devices.clock import server_utc_ns
 from devices.errors import LinkError, StorageError, escape_control_chars
 from service.api.protocols import send_message
 from service.protocol.codec import (
@@ -42,7 +43,6 @@ from service.server.node import ServerNode
 from service.server.nodes import IdentityClaim, ProvenOrFirstContact, is_valid_node_name
 from service.server.server import NodeLink, Server
 from service.server.streams import ServerStream
-from service.server_clock import server_utc_ns
 
 log = logging.getLogger("foottile.ingest")
 

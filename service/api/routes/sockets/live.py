@@ -11,6 +11,7 @@ from typing import TypeVar
 from pydantic import ValidationError
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from devices.clock import server_utc_ns
 from devices.errors import UsageError
 from service.api.protocols import SOCKET_EXTENSION, send_message
 from service.api.protocols import LimitedWebSocket as Connection
@@ -47,7 +48,6 @@ from service.server.live_feed.reader import FeedReader, check_stream_and_get_req
 from service.server.node import ServerNode
 from service.server.server import Server
 from service.server.session_store import start_key
-from service.server_clock import server_utc_ns
 from service.version import SOFTWARE_VERSION
 
 _Query = TypeVar("_Query", PageQuery, FeedQuery)
