@@ -25,7 +25,7 @@ from devices.array.startup import choose_scene_schedule, compute_bus_timing
 from devices.buses.device_files import find_programs_using
 from devices.buses.i2c import I2cBus, RetryingBus
 from devices.buses.serial_line import check_latency_timer, find_stable_path, read_latency_timer_ms
-from devices.chips.dynamixel.servo_search import BAUDRATES, FoundServo, find_servos
+from devices.chips.dynamixel.servo_setup import BAUDRATES, FoundServo, find_servos
 from devices.chips.pressure_chip import Registers
 from devices.chips.pressure_chips import get_chip
 from devices.clock import Clock

@@ -22,8 +22,8 @@ from devices.acquisition import Acquisition
 from devices.array.schedules import ScheduleChoice
 from devices.array.startup import prepare_array
 from devices.buses.i2c import open_bus
-from devices.chips.dynamixel.driver import open_servo
 from devices.chips.dynamixel.position_sources import VirtualTimeServoSource
+from devices.chips.dynamixel.servo_setup import open_servo
 from devices.clock import UtcAnchor, VirtualClock
 from devices.emulation.ground.load_trace import TileLoad
 from devices.emulation.world import World

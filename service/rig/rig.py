@@ -26,9 +26,9 @@ from devices.array.bus_recovery import BusRecovery, GpioRecovery, open_gpio_reco
 from devices.array.startup import ReadyArray, prepare_array, reidentify_replaced_tiles
 from devices.buses.i2c import open_bus
 from devices.buses.spi import open_spi
-from devices.chips.dynamixel.driver import open_servo
 from devices.chips.dynamixel.position_sources import ThreadedServoSource
 from devices.chips.dynamixel.protocol import COUNTS_PER_TURN
+from devices.chips.dynamixel.servo_setup import open_servo
 from devices.chips.mcp3208 import COUNTS_MAX, COUNTS_PER_VREF, Mcp3208
 from devices.clock import Clock, SpinningClock, SystemClock, UtcAnchor
 from devices.errors import FootTileError, I2cError, SpiError, TileSetupError, UsageError
@@ -431,7 +431,7 @@ class Rig:
         pressed = options.foot.compute_tile_load(scene)
         clock: Clock = self._line_clock
         if options.is_emulated:
-            from devices.emulation.driver_clock import DriverClock, WireClock
+            from devices.clock import DriverClock, WireClock
 
             self._clock = driver = DriverClock(self._clock)
             clock = WireClock(driver, self._line_clock)

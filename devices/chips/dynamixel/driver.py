@@ -19,9 +19,6 @@ from devices.buses.serial_line import (
     PORT_ERRORS,
     SEND_TIMEOUT_ERROR,
     SerialPort,
-    check_latency_timer,
-    find_stable_path,
-    open_serial_line,
 )
 from devices.chips.dynamixel.protocol import (
     FIRMWARES,
@@ -403,86 +400,3 @@ class DynamixelServo:
             raise self._make_packet_error(
                 f"an answer of {len(status.data)} bytes", f"{n_data} bytes"
             )
-
-
-def open_servo(
-    port: str | Callable[[], str],
-    *,
-    baudrate: int,
-    clock: Clock,
-    servo_id: int = 1,
-    timeout_s: float = 0.1,
-    port_timeout_s: float | None = None,
-    model: str = "MX-64",
-    protocol: int = 2,
-    allows_missing_port: bool = False,
-) -> DynamixelServo:
-    """Open the servo at `port` (such as /dev/ttyUSB0) and check its model.
-
-    A silent servo is opened as well, since it may start later: silence and a slow adapter are
-    `remarks` of the result. A port that fails later is reopened by its path, or by udev's link to
-    its adapter.
-
-    The default `timeout_s`, in seconds, is ample for the slowest case: 9600 baud (30 ms), the
-    longest return delay (0.5 ms) and an FTDI's default latency timer (16 ms).
-
-    Args:
-        port: path, or a function that returns it at each attempt (an emulated servo's).
-        baudrate: baud rate of the line.
-        clock: virtual or real clock.
-        servo_id: id of the servo.
-        timeout_s: timeout of an answer, by the clock.
-        port_timeout_s: read timeout of the port, in real time: more than `timeout_s` on a virtual
-            clock, where a busy machine must not look like silence. None: `timeout_s`.
-        model: "MX-28" or "MX-64".
-        protocol: 1 or 2.
-        allows_missing_port: a missing port is a remark, and is opened as soon as it exists.
-
-    Raises:
-        ServoLostError: the port is missing, not permitted, or used by another program.
-        ServoSetupError: another model or firmware than `model` and `protocol` answers.
-    """
-    path = port if isinstance(port, str) else port()
-
-    def reopen() -> SerialPort:
-        nonlocal path
-        if not isinstance(port, str):
-            path = port()
-        line = open_serial_line(
-            path, baudrate, timeout_s if port_timeout_s is None else port_timeout_s
-        )
-        path = find_stable_path(path)
-        return line
-
-    remarks: list[str] = []
-    line: SerialPort | None = None
-    try:
-        line = reopen()
-    except ServoLostError as error:
-        if not allows_missing_port:
-            raise
-        remarks.append(f"the servo is not there yet: {error}")
-    servo = DynamixelServo(
-        line,
-        clock,
-        servo_id=servo_id,
-        baudrate=baudrate,
-        timeout_s=timeout_s,
-        protocol=protocol,
-        model=model,
-        reopen=reopen,
-    )
-    if line is not None:
-        if slow := check_latency_timer(path):
-            remarks.append(slow)
-        try:
-            servo.check_model(model)
-            with contextlib.suppress(ServoTimeoutError, ServoPacketError):
-                servo.check_uptime()
-        except ServoSetupError:
-            servo.close()
-            raise
-        except ServoError as error:
-            remarks.append(str(error))
-    servo.opening_warnings = tuple(remarks)
-    return servo

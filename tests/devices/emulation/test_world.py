@@ -13,7 +13,7 @@ import pytest
 from devices.array.tile import Scan
 from devices.array.tile_array import TileArray
 from devices.buses.i2c import open_bus
-from devices.chips.dynamixel.driver import open_servo
+from devices.chips.dynamixel.servo_setup import open_servo
 from devices.chips.pressure_chips import Compensation
 from devices.clock import VirtualClock
 from devices.emulation.chips.mpl115a2 import draw_chip

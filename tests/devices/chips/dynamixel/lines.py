@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from devices.chips.dynamixel.driver import DynamixelServo, open_servo
+from devices.chips.dynamixel.driver import DynamixelServo
+from devices.chips.dynamixel.servo_setup import open_servo
 from devices.clock import VirtualClock
 from devices.emulation.fault_timing import FaultTiming
 from tests.builders.servo import FaultyServo

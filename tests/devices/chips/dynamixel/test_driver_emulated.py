@@ -9,8 +9,7 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from devices.chips.dynamixel.driver import open_servo
-from devices.chips.dynamixel.servo_search import FoundServo, find_servos
+from devices.chips.dynamixel.servo_setup import FoundServo, find_servos, open_servo
 from devices.clock import SystemClock, VirtualClock
 from devices.emulation.chips.dynamixel import FIRMWARE_VERSION
 from devices.errors import ServoPacketError, ServoSetupError, ServoTimeoutError

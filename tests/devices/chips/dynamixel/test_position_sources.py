@@ -14,13 +14,14 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from devices.acquisition import ServoSource
-from devices.chips.dynamixel.driver import PositionReading, open_servo
+from devices.chips.dynamixel.driver import PositionReading
 from devices.chips.dynamixel.position_sources import (
     ThreadedServoSource,
     TurnUnwrapper,
     VirtualTimeServoSource,
 )
 from devices.chips.dynamixel.protocol import CountRange, Instruction, Packet
+from devices.chips.dynamixel.servo_setup import open_servo
 from devices.clock import SystemClock, VirtualClock
 from devices.emulation.fault_timing import FaultTiming
 from devices.errors import (
