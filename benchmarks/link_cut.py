@@ -4,12 +4,15 @@ Server and node run as processes of their own, with a proxy between them that le
 for a while and then everything again, or only so many bytes a second. Measured: how long after the
 link's return the page has a frame that was taken after it, and how long until the server has the
 last frame of the backlog. The backlog's bytes over the link's spare bandwidth is what no sender can
-be quicker than; it stands beside. A session is recorded all the while, and has to be complete.
+be quicker than; it stands beside. A session is recorded all the while, and has to be complete, and so
+does what a client of every frame receives. The server's CPU time is that from the link's return
+until the client has the last late frame.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import platform
 import subprocess
@@ -20,7 +23,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from served import COMMAND, api_of, served
+from served import COMMAND, Server, api_of, served
 from websockets.sync.client import connect
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -34,11 +37,12 @@ RATES = (None, 400_000.0, 100_000.0)
 def main() -> None:
     parser = argparse.ArgumentParser(description="A link that goes away and comes back.")
     parser.add_argument("--seconds", type=float, default=60.0, help="length of each cut")
+    parser.add_argument("--rate", type=float, help="only the silent link of so many bytes a second")
     parser.add_argument("--out", type=Path, help="write a report in markdown")
     arguments = parser.parse_args()
     rows = []
-    for how in ("silent", "reset"):
-        for rate in RATES:
+    for how in ("silent", "reset") if arguments.rate is None else ("silent",):
+        for rate in RATES if arguments.rate is None else (arguments.rate,):
             rows.append(cut(how, rate, arguments.seconds))
             print(rows[-1], flush=True)
     text = report(rows, arguments.seconds)
@@ -64,15 +68,16 @@ def cut(how: str, rate: float | None, seconds: float) -> dict[str, Any]:
             stderr=subprocess.DEVNULL,
         )
         try:
-            return measure(server.url, proxy, how, rate, seconds, Path(folder))
+            return measure(server, proxy, how, rate, seconds, Path(folder))
         finally:
             node.terminate()
             node.wait(20)
 
 
 def measure(
-    url: str, proxy: Proxy, how: str, rate: float | None, seconds: float, folder: Path
+    server: Server, proxy: Proxy, how: str, rate: float | None, seconds: float, folder: Path
 ) -> dict[str, Any]:
+    url = server.url
     with api_of(url) as api:
 
         def node() -> dict[str, Any]:
@@ -83,6 +88,13 @@ def measure(
             time.sleep(0.1)
         time.sleep(2.0)
         session = api.post("/sessions", json={"node": "foot", "name": "cut"}).json()
+        told = folder / "frames.csv"
+        with told.open("w") as file:
+            client = subprocess.Popen(
+                [*COMMAND, "stream", "foot", "--columns=seq,grf_n", f"--server={url}"], stdout=file
+            )
+        while last_seq_of(told) is None:
+            time.sleep(0.1)
         time.sleep(2.0)
         with connect(url.replace("http", "ws") + "/api/v1/live", compression=None) as live:
             (proxy.black_hole if how == "silent" else proxy.cut)()
@@ -92,7 +104,7 @@ def measure(
                     live.recv(timeout=max(0.0, end_s - time.monotonic()))
                 except TimeoutError:
                     break
-            back_ns, back_s = time.time_ns(), time.monotonic()
+            back_ns, back_s, cpu_s = time.time_ns(), time.monotonic(), server.cpu_s
             proxy.mend()
             while True:
                 message = json.loads(live.recv(timeout=30.0))
@@ -111,6 +123,12 @@ def measure(
                 break
             time.sleep(0.05)
         backlog_s = time.monotonic() - back_s
+        while (last_seq_of(told) or 0) < missing_from and time.monotonic() - back_s < 600.0:
+            time.sleep(0.05)
+        cpu_s = server.cpu_s - cpu_s
+        client.terminate()
+        client.wait(20)
+        numbers = [int(line.split(",")[0]) for line in told.read_text().splitlines()[1:-1]]
         written = sum(path.stat().st_size for path in folder.glob("node/journal/*/*/*.arrows"))
         frame_bytes = written / node()["last_seq"]
         spare = None if rate is None else rate - frames_hz * frame_bytes
@@ -130,7 +148,17 @@ def measure(
             "state": sealed["state"],
             "complete": sealed["complete"],
             "frames": sealed["frames"],
+            "client_misses": sum(b != a + 1 for a, b in itertools.pairwise(numbers)),
+            "cpu_s": cpu_s,
         }
+
+
+def last_seq_of(told: Path) -> int | None:
+    """The newest number in the client's table, which may end within a line."""
+    with told.open("rb") as file:
+        file.seek(max(0, told.stat().st_size - 200))
+        lines = file.read().decode().splitlines()[1:-1]
+    return int(lines[-1].split(",")[0]) if lines else None
 
 
 def report(rows: list[dict[str, Any]], seconds: float) -> str:
@@ -151,8 +179,8 @@ def report(rows: list[dict[str, Any]], seconds: float) -> str:
         "what the link has to spare.",
         "",
         "| link | bytes/s | live picture back, s | backlog, frames | complete after, s | least, s "
-        "| session |",
-        "|---|--:|--:|--:|--:|--:|---|",
+        "| session | gaps of the client | server's CPU, s |",
+        "|---|--:|--:|--:|--:|--:|---|--:|--:|",
     ]
     for row in rows:
         rate = "unlimited" if row["rate"] is None else f"{row['rate']:,.0f}"
@@ -161,7 +189,7 @@ def report(rows: list[dict[str, Any]], seconds: float) -> str:
         lines.append(
             f"| {row['how']} | {rate} | {row['picture_s']:.2f} | {row['backlog_frames']} | "
             f"{row['backlog_s']:.1f} | {least} | {row['state']}, {complete}, {row['frames']} "
-            "frames |"
+            f"frames | {row['client_misses']} | {row['cpu_s']:.1f} |"
         )
     return "\n".join(lines) + "\n"
 
