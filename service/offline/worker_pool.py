@@ -74,7 +74,7 @@ def map_in_processes(
                 pass
             yield task, result
         return
-    pool = _Pool(work, process_count, initializer)
+    pool = _Pool(work, initializer)
     left, again = iter(tasks), deque[tuple[Task, int]]()
     under_way: dict[Any, tuple[_Worker, Task, int]] = {}
     try:
@@ -146,7 +146,6 @@ class _Pool(Generic[Task, Result]):
     def __init__(
         self,
         work: Callable[[Task], Result | Unfinished],
-        jobs: int,
         begin: Callable[[], None] | None,
     ) -> None:
         self.idle: list[_Worker] = []

@@ -286,7 +286,7 @@ class Rig:
         # Other threads, and the emulated wires, must not spin on the loop's core.
         self._line_clock = SystemClock()
         self._lead: LoadTrigger | None = None
-        world = self._make_world(options, stack)
+        world = self._make_world(options)
         self._bus = open_bus(scene.array.bus, world.i2c_adapter if world is not None else None)
         stack.callback(self._bus.close)
         self._recovery = open_scene_recovery(scene, self._clock, world)
@@ -423,7 +423,7 @@ class Rig:
         self._begin_stream(self._estimate_max_rate_hz(self._ready), is_reidentified=True)
         return True
 
-    def _make_world(self, options: RigOptions, stack: ExitStack) -> World | None:
+    def _make_world(self, options: RigOptions) -> World | None:
         scene = options.scene
         if not options.is_emulated and (scene.servo is None or scene.servo.port != EMULATED):
             return None

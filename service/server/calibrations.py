@@ -1,4 +1,4 @@
-"""Calibrations of a server, uploaded or fitted here, and the jobs that fit them.
+"""Calibrations of a server, uploaded or fitted here: their jobs, and their assignment to nodes.
 
 An id is the hash of the content, so a calibration never changes: other content is another
 calibration. Nodes and sessions copy the one they use, so a calibration may be deleted at any time.
@@ -23,19 +23,24 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from pydantic import BaseModel, ConfigDict
+
 from devices.clock import server_utc_ns
 from devices.errors import (
     CalibrationError,
     FileFormatError,
     FootTileError,
     StateError,
+    StorageError,
     UnknownError,
     UsageError,
 )
 from service.estimation.calibration import Calibration
 from service.server.session_store import SessionStore
 from service.sessions.calibration_file import encode_calibration, parse_calibration
+from storage.documents import read_document, write_document
 from storage.durable_files import (
+    ASIDE_SUFFIX,
     make_synced_folder,
     read_small_file,
     sync_folder,
@@ -49,6 +54,7 @@ CALIBRATIONS_MAX = 1000
 CONTENT_BYTES_MAX = 1 << 20
 """Size limit, that of a message of the link: a node cannot send a longer one either."""
 CALIBRATION_ID = re.compile(r"[0-9a-f]{16}")
+_ASSIGN_AGAIN = "assign a calibration again, or unassign it"
 
 
 @dataclass(frozen=True)
@@ -400,3 +406,69 @@ class CalibrationJobs:
 
 def _read_result(out: Path) -> Calibration:
     return parse_calibration(read_small_file(out), where=str(out))
+
+
+@dataclass(frozen=True)
+class AssignedCalibration:
+    """Assigned calibration, and the time of the assignment, server's UTC."""
+
+    calibration: Calibration
+    t_ns: int
+
+
+class _Assignment(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    t_ns: int
+    calibration: Calibration | None
+    """None: the assignment was removed."""
+
+
+class CalibrationAssignment:
+    """Assignment for one node.
+
+    Args:
+        path: file of the assignment.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.current: AssignedCalibration | None = None
+        """None: the node's own calibration is used, unless `problem` is set."""
+        self.problem: str | None = None
+        """Reason why the assignment is unknown; None: it is known, or there is none."""
+        try:
+            found = read_document(path, _Assignment)
+            if found.calibration is not None:
+                self.current = AssignedCalibration(found.calibration, found.t_ns)
+        except FileNotFoundError:
+            if any(path.parent.glob(path.name + ASIDE_SUFFIX + "*")):
+                self.problem = f"the calibration that was assigned is lost: {_ASSIGN_AGAIN}"
+        except FileFormatError as error:
+            aside = try_set_aside_and_describe(path, error)
+            self.problem = f"the calibration that was assigned is lost ({aside}): {_ASSIGN_AGAIN}"
+        except StorageError as error:
+            self.problem = f"the calibration that was assigned cannot be read: {error}"
+
+    def store_assignment(self, calibration: Calibration, t_ns: int) -> None:
+        """Store a calibration as the assigned one, in place of the present one.
+
+        Raises:
+            StorageError: it cannot be stored; the assignment is unchanged.
+        """
+        self._store(_Assignment(t_ns=t_ns, calibration=calibration))
+        self.current, self.problem = AssignedCalibration(calibration, t_ns), None
+
+    def remove_assignment(self, t_ns: int) -> None:
+        """Remove the assignment, on the disk too: the node's own calibration is used again.
+
+        Raises:
+            StorageError: that cannot be stored; the assignment is unchanged.
+        """
+        self._store(_Assignment(t_ns=t_ns, calibration=None))
+        self.current, self.problem = None, None
+
+    def _store(self, assignment: _Assignment) -> None:
+        with translate_storage_errors(self._path):
+            make_synced_folder(self._path.parent)
+        write_document(self._path, assignment)

@@ -298,9 +298,7 @@ def _fit_around_peak(
                 f"{used.sum()} samples, {1e3 * width_s:.3g} ms apart, without a gap near them",
                 expected=f"at least {MIN_SAMPLES}, as of one stance at 100 Hz",
             )
-        fit = _fit_window(
-            own.force_n[::every][used], theirs, t_s[used], samples[used], to_s[used], lag_s
-        )
+        fit = _fit_window(own.force_n[::every][used], theirs, t_s[used], samples[used], to_s[used])
         lag_s, drift = (
             float(fit.parameters[_LAG]),
             float(fit.parameters[_DRIFT] / fit.half_duration_s),
@@ -310,7 +308,7 @@ def _fit_around_peak(
 
 
 def _fit_window(
-    own_n: Floats, theirs: EvenSignal, t_s: Floats, samples: Ints, to_s: Floats, lag_s: float
+    own_n: Floats, theirs: EvenSignal, t_s: Floats, samples: Ints, to_s: Floats
 ) -> _Fit:
     at_s, half_s = 0.5 * float(t_s[0] + t_s[-1]), 0.5 * float(t_s[-1] - t_s[0])
     spline = CubicSpline(theirs.t_s, theirs.force_n)

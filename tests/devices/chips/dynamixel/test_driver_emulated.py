@@ -194,7 +194,7 @@ def test_a_servo_that_is_silent_at_first_is_read_once_it_answers(protocol: int) 
 
 
 def test_a_slow_adapter_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
-    check = "devices.chips.dynamixel.driver.check_latency_timer"
+    check = "devices.chips.dynamixel.servo_setup.check_latency_timer"
     monkeypatch.setattr(check, lambda port: f"{port} is slow")
     with emulated() as (servo, driver, _):
         assert driver.opening_warnings == (f"{servo.port} is slow",)
