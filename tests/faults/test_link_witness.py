@@ -41,17 +41,6 @@ def test_messages_are_found_however_the_bytes_come(
     assert [m for piece in pieces for m in messages.feed(piece)] == [(BINARY, p) for p in payloads]
 
 
-def test_a_message_in_pieces_with_a_ping_between_them_is_one() -> None:
-    data = (
-        HEAD
-        + frame(Opcode.TEXT, b"he", is_last=False)
-        + frame(Opcode.PING, b"?")
-        + frame(Opcode.CONT, b"llo")
-        + frame(Opcode.CLOSE)
-    )
-    assert list(Messages().feed(data)) == [(TEXT, b"hello")]
-
-
 def frames(first: int, count: int, stream_id: str) -> bytes:
     """A message of frames with their number as the first tile's count."""
     seq = np.arange(first, first + count)
