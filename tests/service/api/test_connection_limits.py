@@ -249,16 +249,6 @@ def test_a_subscriber_beyond_the_limit_is_closed_and_a_request_is_503(strict: Ru
     until(lambda: strict.http.get("/health").status_code == 200)
 
 
-def test_a_node_has_a_place_beside_all_others(strict: Running, node_of: NodeOf) -> None:
-    with ExitStack() as stack:
-        subscribe(stack, strict)
-        for _ in range(2 * RESERVE):
-            stack.enter_context(dial(strict))
-        node = node_of(strict)
-        node.connect()
-        node.deliver(50)
-
-
 def test_nodes_beyond_the_limit_are_closed(serve_with: ServeWith, node_of: NodeOf) -> None:
     running = serve_with(bounds=LimitSettings(max_nodes=2))
     nodes = [node_of(running, f"leg{number}") for number in range(6)]

@@ -73,16 +73,6 @@ def test_a_stream_id_is_no_proof(
     assert_same_bits(running.held(tared.stream_id).slice_rows(90, 140), sent)
 
 
-def test_an_overheard_proof_is_refused(node: FakeNode, stranger: FakeNode) -> None:
-    node.connect()
-    node.leave()
-    overheard = node.proof(node.open_and_identify())
-    stranger.open_and_identify()
-    stranger.socket.send(overheard.model_dump_json())
-    stranger.socket.send(stranger.hello().model_dump_json())
-    assert closed(stranger.socket)[0] == 4013
-
-
 def test_a_machine_without_a_secret_displaces_no_other(node: FakeNode, stranger: FakeNode) -> None:
     node.secret = stranger.secret = None
     node.connect()

@@ -5,20 +5,13 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-import os
-import re
-import shutil
-import signal
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import pytest
 from starlette.websockets import WebSocket
-from websockets.exceptions import ConnectionClosed
 
 import service.api.routes.sockets.ingest
 import service.server.server
@@ -27,10 +20,8 @@ from devices.frames import FrameBatch
 from service.server.estimates.live_estimator import LiveEstimator
 from service.server.node import ServerNode
 from storage.intervals import Intervals
-from storage.journal.journal import Journal
 from tests.builders.frames import assert_same_bits
-from tests.service.fake_node import FakeNode, NodeOf, Play
-from tests.service.process import Start
+from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import Running, closed, receive_live
 from tests.storage.faulty_disk import failing_if, refusing
 from tests.waiting import PATIENCE_S, until
@@ -86,41 +77,6 @@ def test_a_server_that_stops_closes_connections_and_journals(
     if first < 20:
         node.send_again(node.sent[-1].slice_rows(first, 20))
     node.deliver(10)
-
-
-def test_a_killed_server_has_every_acknowledged_frame(
-    running: Running, node_of: NodeOf, foottile: Start, tmp_path: Path
-) -> None:
-    data = tmp_path / "killed"
-    process = foottile("serve", "--port", 0, "--data", data)
-    line = process.said("FootTile is at ")
-    port = re.search(r"127\.0\.0\.1:(\d+)/", line)
-    assert port is not None, line
-    running.stop()
-    running.port = int(port[1])
-    node = node_of(running)
-    node.connect()
-    with Play(node):
-        while node.acked.number_count < 400:
-            node.receive("ack")
-        os.kill(process.pid, signal.SIGKILL)
-        with suppress(ConnectionClosed):
-            while node.receive("ack", timeout_s=5.0):
-                pass
-    assert process.ended(5.0) == -signal.SIGKILL
-    copy = tmp_path / "copy"
-    shutil.copytree(data / "journal" / "bench" / node.stream_id, copy)
-    journal = Journal.open_existing_and_recover(copy)
-    assert not (node.acked - journal.stored)
-    last = journal.stored.last
-    assert last is not None
-    found = FrameBatch.concatenate(list(journal.read_frames(0, last)))
-    assert_same_bits(found, node.all_sent().slice_rows(0, last + 1))
-    # A new process requests only what this one had not stored.
-    running.port = 0
-    running.data = data
-    running.start()
-    assert node.connect() == [(last + 1, None)]
 
 
 def test_a_probe_has_the_servers_clock_and_the_api_the_nodes_counts(

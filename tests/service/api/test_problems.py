@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,10 +14,14 @@ from devices.errors import StorageError
 from service.api.access import BODY_BYTES_MAX
 from tests.service.api.sealed import Sealed
 from tests.service.fake_node import FakeNode
-from tests.service.running import Running, assert_refused
+from tests.service.running import Running
 from tests.storage.faulty_disk import refusing
 
 UNKNOWN = "/sessions/20200101T000000Z-000000"
+UNKNOWN_IDS = (
+    *("nobody", "20200101T000000Z-000000", "0" * 12, "x" * 5000, "%ff", "..%5c.."),
+    *("%2e%2e", "%2e%2e%2f%2e%2e%2fetc%2fpasswd", "20200101T000000Z-000000%00", "x%0a"),
+)
 JSON = {"Content-Type": "application/json"}
 
 
@@ -48,6 +53,7 @@ def start(value: bytes) -> bytes:
         *[("POST", "/sessions", body, 422) for body in (b"", b"{", b"[]", b"{}")],
         *[("POST", "/sessions", start(name), 422) for name in (b'""', b'"   "', b"5")],
         ("POST", "/sessions", start(b'"x","surprise":1'), 422),
+        ("POST", "/sessions", start(b'"x"'), 404),
         *[
             ("POST", "/sessions", start(b'"x","pre_roll_s":' + value), 422)
             for value in (b"-1", b"601", b"NaN", b"1e400", b"true", b'"1"', b"[1]", b"null")
@@ -80,6 +86,29 @@ def test_an_error_is_a_problem(
     assert_problem(answer, status, "/api/v1" + path.split("?", maxsplit=1)[0])
 
 
+def test_no_route_finds_an_unknown_id(shared: Running) -> None:
+    bodies: dict[str, dict[str, Any]] = {
+        "accept-replacement": {"fingerprint": "0000-0000-0000-0000"},
+        "calibration": {"id": "0" * 16},
+        "markers": {"label": "x"},
+        "weighing": {"tiles": ["T01"], "weights": ["10 N"]},
+    }
+    asked = 0
+    for path, methods in shared.http.get("/openapi.json").json()["paths"].items():
+        for method in methods if "{" in path else ():
+            query = {"format": "mcap"} if path.endswith("/data") else {}
+            is_sent = method in ("post", "put", "patch")
+            body = bodies.get(path.rsplit("/", 1)[-1], {}) if is_sent else None
+            for unknown in UNKNOWN_IDS:
+                url = shared.url + re.sub(r"\{\w+\}", unknown, path)
+                answer = shared.http.request(method, url, params=query, json=body)
+                status = 400 if unknown.endswith(("%00", "%0a")) else 404
+                assert answer.status_code == status, (method, url, answer.text)
+                assert answer.headers["content-type"] == "application/problem+json"
+                asked += 1
+    assert asked > 200
+
+
 @pytest.mark.parametrize(
     "kind", ["text/plain", "application/x-www-form-urlencoded", "multipart/form-data", ""]
 )
@@ -108,21 +137,6 @@ def test_a_body_in_too_many_chunks_is_a_problem(shared: Running) -> None:
     answer = shared.http.post("/sessions", content=chunks(), headers=JSON)
     assert_problem(answer, 413, "/api/v1/sessions")
     assert shared.http.get("/health").status_code == 200
-
-
-@pytest.mark.parametrize(
-    ("method", "path", "body"),
-    [
-        ("POST", "/sessions", {"node": "nobody", "name": "x"}),
-        *[("GET", f"/nodes/nobody{rest}", None) for rest in ("", "/scene", "/tares", "/history")],
-        ("POST", "/nodes/nobody/tare", {}),
-        ("DELETE", "/nodes/nobody/tares/1", None),
-    ],
-)
-def test_an_unknown_node_is_not_found(
-    shared: Running, method: str, path: str, body: object
-) -> None:
-    assert_refused(shared.http.request(method, path, json=body), 404, "'nobody'")
 
 
 def test_a_bug_and_a_full_disk_are_problems(

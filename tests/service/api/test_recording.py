@@ -10,7 +10,6 @@ import pytest
 
 import service.api.routes.recordings.sessions
 import service.server.recorder
-from devices.frames import FrameBatch
 from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import FakeNode, NodeOf, Play
 from tests.service.running import Running, assert_refused, content_of
@@ -110,24 +109,6 @@ def test_a_session_waits_for_a_gap_until_it_is_lost(tared: FakeNode, is_evicted:
         assert_same_bits(session.frames(), tared.all_sent().slice_rows(70, 200))
 
 
-def test_a_restarted_node_begins_a_second_part(tared: FakeNode) -> None:
-    session = tared.record()
-    first = tared.deliver(100, 10.0)
-    first_stream_id = tared.stream_id
-    tared.restart()
-    assert tared.connect() == [(0, None)]
-    second = tared.deliver(60, 10.0)
-    sealed = tared.finish(session)
-    assert sealed["complete"] == "lossy"
-    assert [part["stream_id"] for part in sealed["parts"]] == [first_stream_id, tared.stream_id]
-    assert_same_bits(session.frames(), FrameBatch.concatenate([first, second]))
-    np.testing.assert_array_equal(session.column("part"), [0] * 100 + [1] * 60)
-    ledger = session.ledger()
-    assert [part["recorded"] for part in ledger["parts"]] == [100, 60]
-    assert ledger["parts"][0]["max_lost_tail_frames"] >= 1
-    assert ledger["lossy"] is True
-
-
 def test_a_node_with_other_tiles_begins_another_session(
     running: Running, tared: FakeNode, node_of: NodeOf
 ) -> None:
@@ -179,20 +160,6 @@ def test_a_pre_roll_begins_before_the_start(tared: FakeNode) -> None:
     tared.deliver(50)
     assert tared.finish(session)["complete"] is True
     assert_same_bits(session.frames(), tared.all_sent().slice_rows(first, 620))
-
-
-def test_a_session_ends_by_the_servers_clock(tared: FakeNode) -> None:
-    hour_ns = 3_600_000_000_000
-    tared.restart()
-    tared.utc_offset_ns -= hour_ns
-    tared.connect()
-    tared.say_clock(hour_ns)
-    tared.deliver(20)
-    session = tared.record()
-    tared.deliver(30)
-    session.stop()
-    tared.send(10, now=True)
-    assert session.sealed()["frames"] == 30
 
 
 # --- repeated requests: with the same key they are one recording ----------------------------------

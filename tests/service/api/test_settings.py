@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 import pytest
@@ -23,28 +22,6 @@ def test_an_empty_variable_is_not_set(name: str, monkeypatch: pytest.MonkeyPatch
     for empty in ("", "\r", '""'):
         monkeypatch.setenv(f"FOOTTILE_{name}", empty)
         assert load_settings(None) == usual
-
-
-def test_quotes_and_line_ends_of_an_env_file_are_removed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setenv("FOOTTILE_TOKEN", '"0123456789abcdef"\r')
-    monkeypatch.setenv("FOOTTILE_PORT", "8123\r")
-    monkeypatch.setenv("FOOTTILE_PRIVATE", "true\r")
-    monkeypatch.setenv("FOOTTILE_DATA", "'/srv/foot tile'")
-    settings = load_settings(None)
-    assert settings.token == "0123456789abcdef"  # noqa: S105  # of this test
-    assert (settings.port, settings.private) == (8123, True)
-    assert settings.data == Path("/srv/foot tile")
-
-
-def test_the_port_that_kubernetes_sets_is_ignored(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setenv("FOOTTILE_PORT", "tcp://10.0.0.1:8000")
-    with caplog.at_level(logging.WARNING, "foottile.environment"):
-        assert load_settings(None).port == 8000
-    assert "Kubernetes" in caplog.text
 
 
 @pytest.mark.parametrize("value", ["robot.local,lab", "robot.local lab", '["robot.local", "lab"]'])

@@ -192,21 +192,6 @@ def test_sessions_are_listed_by_take(running: Running, feet: dict[str, FakeNode]
 
 
 @pytest.mark.parametrize(
-    "take_id", ["x", "0" * 12, "..", "%2e%2e", "0" * 300, "20200101T000000Z-000000"]
-)
-def test_an_unknown_take_is_not_found(shared: Running, take_id: str) -> None:
-    for method, path, body in (
-        ("GET", "", None),
-        ("GET", "/data?format=mcap", None),
-        ("POST", "/stop", None),
-        ("POST", "/markers", {"label": "x"}),
-    ):
-        answer = shared.http.request(method, f"/takes/{take_id}{path}", json=body)
-        is_index = answer.url.path == "/api/v1"  # a client makes that of two dots
-        assert answer.status_code in (404, 405) or is_index, (method, path)
-
-
-@pytest.mark.parametrize(
     "body",
     [
         *({}, {"name": ""}, {"name": "x", "nodes": []}, {"name": "x", "nodes": "left"}),
