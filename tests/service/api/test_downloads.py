@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import threading
 from base64 import b64encode
 from collections.abc import Iterator, Sequence
@@ -12,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
 from storage.formats.export import Export
@@ -108,19 +106,6 @@ def test_if_range_and_if_none_match_name_the_file(sealed: Sealed) -> None:
         assert answer.status_code == (304 if is_known else 200), tags
         assert answer.headers["etag"] == right
         assert answer.content == (b"" if is_known else sealed.content)
-
-
-@pytest.mark.parametrize("to", ["parquet", "arrow", "csv"])
-def test_a_slice_has_the_requested_rows_and_columns(sealed: Sealed, to: str) -> None:
-    whole = pq.read_table(io.BytesIO(sealed.content))
-    answer = sealed.export(format=to, start_s=0.1, end_s=0.2, columns="seq,force_n, pressure_raw_1")
-    found = read_table(answer, to)
-    assert found.column_names == ["seq", "force_n_0", "force_n_1", "pressure_raw_1"]
-    assert found["seq"].to_pylist() == list(range(70 + 50, 70 + 100))
-    for name in found.column_names:
-        np.testing.assert_allclose(found[name], whole[name][50:100], rtol=1e-6, err_msg=name)
-    assert answer.headers["etag"].startswith('"')
-    assert answer.headers["accept-ranges"] == "none"
 
 
 def test_different_data_have_different_tags(sealed: Sealed) -> None:

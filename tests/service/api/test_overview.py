@@ -56,20 +56,6 @@ def hopped(shared_tared: FakeNode) -> Recording:
     return session
 
 
-def test_no_zoom_hides_a_peak(hopped: Recording) -> None:
-    true = read_frames(hopped, "grf_n", "force_n")
-    for points, frames_in_bin in ((1, 64), (20, 64), (100, 4), (1400, 1), (8000, 1)):
-        overview = get(hopped, points=points)
-        columns = overview["columns"]
-        assert overview["frames_in_bin"] == frames_in_bin, points
-        assert sum(columns["frames"]) == 1400, points
-        assert len(columns["frames"]) >= min(points, 1400)
-        highest_n = max(value for value in columns["grf_n_max"] if value is not None)
-        assert highest_n == pytest.approx(float(np.nanmax(true["grf_n"])), abs=1e-5), points
-        lowest_n = min(columns["force_n_1_min"])
-        assert lowest_n == pytest.approx(float(true["force_n"][:, 1].min()), abs=1e-5), points
-
-
 def test_bins_of_the_full_zoom_are_the_frames(hopped: Recording) -> None:
     true = read_frames(hopped, "t_ns", "grf_n", "grf_sigma_n", "contact")
     overview = get(hopped, points=8000, start_s=0.5, end_s=0.7)
