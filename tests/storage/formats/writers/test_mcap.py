@@ -155,13 +155,6 @@ def test_any_pieces_give_the_same_messages(options: FormatOptions) -> None:
     assert one == messages(written(options, every=7)) == messages(written(options, every=ROWS))
 
 
-def test_frames_of_a_slice_have_the_chosen_columns() -> None:
-    part = Slice(0.02, 0.04, ("force_n_1", "grf_n"))
-    said = foxglove(written(part=part))["/left/frames"]
-    assert [message.log_time for message, _ in said] == frames().t_ns[10:20].tolist()
-    assert [f.name for f in said[0][1].DESCRIPTOR.fields] == ["force_n_1", "grf_n"]
-
-
 def test_metadata_have_clock_serials_and_markers() -> None:
     (record,) = make_reader(io.BytesIO(written())).iter_metadata()
     assert "node's clock" in record.metadata["log_time"]

@@ -120,15 +120,6 @@ def test_clock_offsets_lead_each_part_to_the_servers_time() -> None:
     assert len(raw[second]["time_stamps"]) == ROWS - 30
 
 
-def test_only_what_was_asked_for_is_in_it() -> None:
-    streams, _ = read(written(Slice(0.02, 0.04, ("grf_n", "force_n_1"))))
-    assert labels(streams["left frames"]) == ["grf_n", "force_n_1"]
-    assert len(streams["left frames"]["time_stamps"]) == 10
-    assert "left counters" not in streams
-    gap, _ = read(written(Slice(0.051, 0.0515)))
-    assert len(gap["left frames"]["time_stamps"]) == 0
-
-
 def test_a_pause_of_years_adds_one_clock_offset(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("storage.formats.writers.xdf._OFFSET_EVERY_NS", 20_000_000)
     batch = frames()
