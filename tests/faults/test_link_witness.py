@@ -20,10 +20,8 @@ HEAD = b"GET /api/v1/ingest HTTP/1.1\r\nUpgrade: websocket\r\n\r\n"
 TEXT, BINARY = 1, 2
 
 
-def frame(
-    opcode: Opcode, payload: bytes = b"", *, masked: bool = True, is_last: bool = True
-) -> bytes:
-    return Frame(opcode, payload, fin=is_last).serialize(mask=masked)
+def frame(opcode: Opcode, payload: bytes = b"", *, masked: bool = True) -> bytes:
+    return Frame(opcode, payload).serialize(mask=masked)
 
 
 @pytest.mark.parametrize("masked", [True, False])
