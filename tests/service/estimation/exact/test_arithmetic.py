@@ -44,6 +44,7 @@ TILES = [
         coefficients=(0.0, 13.25, 1.0 / 3.0, 4.7),
         p_offset_kpa=9.37,
         p_scale_kpa=9.37,
+        f_offset_n=1.5,
         range_kpa=(0.0, 18.74),
         covariance=((4e-3, 1e-3, -2e-3), (1e-3, 2e-3, 0.0), (-2e-3, 0.0, 3e-3)),
         relative_misfit=0.017,
