@@ -26,14 +26,6 @@ def walk(seconds: float) -> tuple[np.ndarray, np.ndarray]:
     return t_s, steps * (15.0 + 5.0 * np.sin(t_s))
 
 
-def test_a_reference_is_what_was_injected_but_for_its_noise(bench: ModuleType) -> None:
-    t_s, force_n = walk(10.0)
-    reference, true = bench.referred(np.random.default_rng(3), t_s, force_n)
-    at_s = true.at_s + (reference.t_s - true.at_s - true.lag_s) / (1.0 + 1e-6 * true.drift_ppm)
-    clean_n = true.offset_n + np.interp(at_s, t_s, force_n) / true.scale
-    assert np.median(np.abs(reference.force_n - clean_n)) < 0.4
-
-
 def test_a_row_has_the_part_of_draws_whose_intervals_have_the_truth(
     bench: ModuleType, tmp_path: Path
 ) -> None:

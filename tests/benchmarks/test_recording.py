@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -39,13 +38,6 @@ def test_every_section_gives_a_table(recording: ModuleType, tmp_path: Path, name
     assert not any("nan" in line for line in lines)
 
 
-def test_a_walk_that_is_not_there_is_said_to_be_missing(
-    recording: ModuleType, tmp_path: Path
-) -> None:
-    lines = recording.sizes(tiny(recording, tmp_path / "nowhere"), tmp_path)
-    assert any("a person's walk: not measured" in line for line in lines)
-
-
 def test_every_job_of_keeping_frames_is_measured_second_by_second(
     recording: ModuleType, tmp_path: Path
 ) -> None:
@@ -71,14 +63,6 @@ def test_a_long_journal_is_built_opened_read_and_sealed_whole(
     assert {step.frames for step in steps} == {round(3.6 * data.FULL_RATE_HZ)}
 
 
-def test_sections_are_replaced_in_the_page_and_the_rest_of_it_stays(recording: ModuleType) -> None:
-    page = recording._replaced("# Title\n", "sizes", ["old"])
-    page = recording._replaced(page + "\nby hand\n", "sizes", ["new"])
-    assert "old" not in page
-    assert page.startswith("# Title\n")
-    assert page.index("new") < page.index("by hand")
-
-
 def test_the_code_of_the_bound_takes_what_such_numbers_must_take(recording: ModuleType) -> None:
     code_bits = part("entropy").code_bits
     rng = np.random.default_rng(0)
@@ -90,18 +74,3 @@ def test_the_code_of_the_bound_takes_what_such_numbers_must_take(recording: Modu
     sigma = 20.0  # of Gaussian noise: log2(sigma sqrt(2 pi e)) bits
     taken = code_bits(np.rint(rng.normal(0.0, sigma, n)).astype(np.int64)) / n
     assert 6.37 - 0.05 < taken < 6.37 + 0.1
-
-
-def test_the_bound_of_a_smooth_load_under_noise_is_little_more_than_the_noise(
-    recording: ModuleType,
-) -> None:
-    data = part("data")
-    frames = data.lengthened(data.emulated(4, 1.5), 30.0).frames
-    n = len(frames)
-    slow = 400.0 + 100.0 * np.sin(np.arange(n)[:, None] / 500.0 + np.arange(4))
-    noise = np.random.default_rng(0).normal(0.0, 2.6, (n, 4))
-    counts = np.rint(slow + noise).astype(np.uint16)
-    bound = part("entropy").bytes_per_frame(replace(frames, pressure_raw=counts))
-    noise_bits = np.log2(2.6 * np.sqrt(2.0 * np.pi * np.e))
-    assert noise_bits < bound["pressure_raw"] * 8 / 4 < noise_bits + 0.3
-    assert bound["t_ns"] < 0.05  # t_mono_ns says it already
