@@ -124,7 +124,7 @@ def test_missing_keys_have_the_defaults_of_the_design() -> None:
     assert bare.array.conversion_ms is bare.array.wait_ms is None  # drawn, and measured
     assert bare.emulation.gas is bare.emulation.rubber is bare.emulation.hysteresis is True
     assert bare.recovery is not None
-    assert bare.recovery.reset_line is bare.servo is scene().recovery is None
+    assert (bare.recovery.reset_line, bare.servo, scene().recovery) == (None, None, None)
     assert (bare.rate_hz, bare.calibration) == (0, "emulated-rig")
     assert (bare.ground.kind, bare.fault) == ("none", ())
 
