@@ -17,6 +17,7 @@ from typing import Any
 
 import uvicorn
 from fastapi import APIRouter, FastAPI, Request, Response
+from fastapi.routing import APIRoute
 from starlette.exceptions import HTTPException
 from starlette.routing import BaseRoute
 from starlette.websockets import WebSocket
@@ -156,6 +157,7 @@ def _make_api_routes() -> tuple[BaseRoute, ...]:
     """
     api = APIRouter(
         prefix=API,
+        generate_unique_id_function=_make_operation_id,
         responses=common.problem_responses(
             _400="Invalid HTTP/1.1, or a body that is not UTF-8.",
             _401="The token or a login is needed: for a change, and on a private server for "
@@ -168,9 +170,7 @@ def _make_api_routes() -> tuple[BaseRoute, ...]:
             _503="Too many connections, or the data folder is not in its place.",
         ),
     )
-    api.add_api_route(
-        "", index.get_index, operation_id="listRoutes", summary="All routes", tags=["server"]
-    )
+    api.add_api_route("", index.list_routes, summary="All routes", tags=["server"])
     for router in (
         index.router,
         login.router,
@@ -193,6 +193,12 @@ def _make_api_routes() -> tuple[BaseRoute, ...]:
     routes = APIRouter()
     routes.include_router(api)
     return tuple(routes.routes)
+
+
+def _make_operation_id(route: APIRoute) -> str:
+    """Return the name of a route's function in camel case: it must stay, programs use it."""
+    first, *others = route.name.split("_")
+    return first + "".join(other.title() for other in others)
 
 
 def _add_security_scheme(app: FastAPI) -> None:

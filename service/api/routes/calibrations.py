@@ -171,7 +171,7 @@ InUse = Annotated[
 ]
 
 
-@router.get("/calibrations", operation_id="listCalibrations", summary="Calibrations")
+@router.get("/calibrations", summary="Calibrations")
 async def list_calibrations(server: ServerState) -> Page[CalibrationSummaryView]:
     """Return the calibrations on the server, the newest recordings first."""
     return Page(
@@ -184,7 +184,6 @@ async def list_calibrations(server: ServerState) -> Page[CalibrationSummaryView]
 
 @router.post(
     "/calibrations",
-    operation_id="uploadCalibration",
     summary="Upload a calibration",
     status_code=HTTPStatus.CREATED,
     responses={
@@ -216,7 +215,7 @@ async def upload_calibration(
     return CalibrationSummaryView.from_summary(summary)
 
 
-@router.get("/calibrations/jobs", operation_id="listCalibrationJobs", summary="Fits")
+@router.get("/calibrations/jobs", summary="Fits")
 async def list_calibration_jobs(server: ServerState) -> Page[FitView]:
     """Return the last jobs since the server was started, newest first."""
     return Page(
@@ -226,7 +225,6 @@ async def list_calibration_jobs(server: ServerState) -> Page[FitView]:
 
 @router.post(
     "/calibrations/jobs",
-    operation_id="startCalibrationJob",
     summary="Fit a calibration",
     status_code=HTTPStatus.ACCEPTED,
     responses=problem_responses(
@@ -251,7 +249,6 @@ async def start_calibration_job(body: StartFit, server: ServerState, response: R
 
 @router.get(
     "/calibrations/jobs/{job_id}",
-    operation_id="getCalibrationJob",
     summary="Fit progress",
     responses=problem_responses(_404="No such fit."),
 )
@@ -262,7 +259,6 @@ async def get_calibration_job(job_id: str, server: ServerState) -> FitView:
 
 @router.delete(
     "/calibrations/jobs/{job_id}",
-    operation_id="cancelCalibrationJob",
     summary="Cancel a fit",
     responses=problem_responses(_404="No such fit."),
 )
@@ -273,7 +269,6 @@ async def cancel_calibration_job(job_id: str, server: ServerState) -> FitView:
 
 @router.get(
     "/calibrations/{calibration_id}",
-    operation_id="getCalibration",
     summary="Download a calibration",
     response_class=Response,
     responses={
@@ -290,7 +285,6 @@ async def get_calibration(calibration_id: str, request: Request, server: ServerS
 
 @router.delete(
     "/calibrations/{calibration_id}",
-    operation_id="deleteCalibration",
     summary="Delete a calibration",
     status_code=HTTPStatus.NO_CONTENT,
     response_model=None,
@@ -303,7 +297,6 @@ async def delete_calibration(calibration_id: str, server: ServerState) -> None:
 
 @router.get(
     "/nodes/{node}/calibration",
-    operation_id="getNodeCalibration",
     summary="A node's calibration",
     responses=_NO_NODE,
 )
@@ -314,7 +307,6 @@ async def get_node_calibration(node: str, server: ServerState) -> NodeCalibratio
 
 @router.put(
     "/nodes/{node}/calibration",
-    operation_id="assignCalibration",
     summary="Assign a calibration",
     responses={
         **problem_responses(
@@ -345,7 +337,6 @@ async def assign_calibration(
 
 @router.delete(
     "/nodes/{node}/calibration",
-    operation_id="unassignCalibration",
     summary="Unassign a calibration",
     responses={
         **_NO_NODE,

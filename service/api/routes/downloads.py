@@ -72,7 +72,6 @@ MEDIA_TYPES = [each.media_type for each in FORMATS.values()]
 
 @router.get(
     "/{session_id}/data",
-    operation_id="getData",
     summary="Download",
     response_class=Response,
     responses={
@@ -294,7 +293,6 @@ IDS_MAX = 1000
 
 @zip_router.get(
     "/zip",
-    operation_id="zipSessions",
     summary="Download several as one zip file",
     response_class=Response,
     responses={
@@ -306,7 +304,7 @@ IDS_MAX = 1000
         ),
     },
 )
-async def get_zip(
+async def zip_sessions(
     ids: Annotated[
         str,
         Query(max_length=24 * IDS_MAX, description=f"With commas between; {IDS_MAX} at most."),

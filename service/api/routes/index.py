@@ -40,7 +40,7 @@ class IndexView(View):
     routes: list[RouteView]
 
 
-async def get_index(request: Request) -> IndexView:
+async def list_routes(request: Request) -> IndexView:
     """Return every route with its address and summary."""
     app = request.app
     return IndexView(
@@ -92,7 +92,7 @@ class Version(View):
     protocol: str = SUBPROTOCOL
 
 
-@router.get("/health", operation_id="getHealth", summary="Liveness")
+@router.get("/health", summary="Liveness")
 async def get_health(server: ServerState) -> Health:
     """Return the state of the process, with the damage found at its start."""
     return Health(status="ok", problems=server.file_problems)
@@ -100,7 +100,6 @@ async def get_health(server: ServerState) -> Health:
 
 @router.get(
     "/ready",
-    operation_id="getReady",
     summary="Readiness",
     responses=problem_responses(_507="The data folder cannot be written."),
 )
@@ -114,7 +113,7 @@ def get_ready(server: ServerState) -> Ready:
     )
 
 
-@router.get("/version", operation_id="getVersion", summary="Version")
+@router.get("/version", summary="Version")
 async def get_version() -> Version:
     """Return the versions of software, API and link protocol."""
     return Version(software=SOFTWARE_VERSION)
@@ -146,7 +145,7 @@ class FormatsView(BaseModel):
     items: list[FormatView]
 
 
-@formats_router.get("", operation_id="listFormats", summary="Formats of downloads")
+@formats_router.get("", summary="Formats of downloads")
 def list_formats() -> FormatsView:
     """Return the formats in the order of menus."""
     formats_ = FORMATS.values()

@@ -74,7 +74,7 @@ def _logins(request: Request) -> Logins:
 LoginsState = Annotated[Logins, Depends(_logins)]
 
 
-@router.get("/login", operation_id="getLogin", summary="Current permissions")
+@router.get("/login", summary="Current permissions")
 async def get_login(request: Request, logins: LoginsState) -> LoginView:
     """Return the permissions by the cookie or the token of this request."""
     credentials = logins.check_credentials(request)
@@ -83,9 +83,7 @@ async def get_login(request: Request, logins: LoginsState) -> LoginView:
     )
 
 
-@router.post(
-    "/login", operation_id="logIn", summary="Exchange a ticket, or the token, for a cookie"
-)
+@router.post("/login", summary="Exchange a ticket, or the token, for a cookie")
 async def log_in(
     body: LogIn, request: Request, response: Response, logins: LoginsState
 ) -> LoginView:
@@ -114,7 +112,6 @@ async def log_in(
 
 @router.delete(
     "/login",
-    operation_id="logOut",
     summary="Log out",
     status_code=HTTPStatus.NO_CONTENT,
     response_model=None,
@@ -129,11 +126,10 @@ async def log_out(request: Request, response: Response, logins: LoginsState) -> 
 
 @router.post(
     "/tickets",
-    operation_id="createInvite",
     summary="Create a one-time login",
     status_code=HTTPStatus.CREATED,
 )
-async def create_ticket(body: NewTicket, request: Request, logins: LoginsState) -> TicketView:
+async def create_invite(body: NewTicket, request: Request, logins: LoginsState) -> TicketView:
     """Create a ticket, valid once and for five minutes. Needs the token; a login is not enough."""
     ticket = logins.tickets.create(_ROLES[body.role])
     urls = request.app.state.find_urls() or (str(request.base_url).rstrip("/"),)

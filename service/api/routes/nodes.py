@@ -113,21 +113,19 @@ def _check_tare_in_force(node: ServerNode, if_match: str | None) -> None:
     check_revision(parse_if_match(if_match), in_force, f"the tare of {node.name!r}")
 
 
-@router.get("", operation_id="listNodes", summary="All nodes")
+@router.get("", summary="All nodes")
 async def list_nodes(server: ServerState) -> Page[NodeView]:
     """Return connected and remembered nodes."""
     return Page(items=[server.make_node_view(node) for node in server.nodes])
 
 
-@router.get("/{node}", operation_id="getNode", summary="One node", responses=_UNKNOWN)
+@router.get("/{node}", summary="One node", responses=_UNKNOWN)
 async def get_node(node: str, server: ServerState) -> NodeView:
     """Return array, calibration, tare, clock and counts of a node."""
     return server.make_node_view(server.nodes.get(node))
 
 
-@router.get(
-    "/{node}/scene", operation_id="getScene", summary="The node's scene", responses=_UNKNOWN
-)
+@router.get("/{node}/scene", summary="The node's scene", responses=_UNKNOWN)
 async def get_scene(node: str, server: ServerState) -> dict[str, Any]:
     """Return the content of the node's scene file, with defaults."""
     return server.nodes.get(node).hello.scene
@@ -135,7 +133,6 @@ async def get_scene(node: str, server: ServerState) -> dict[str, Any]:
 
 @router.get(
     "/{node}/history",
-    operation_id="getHistory",
     summary="History of the last minute",
     responses=_UNKNOWN,
 )
@@ -184,7 +181,6 @@ def _round_four_digits(values: list[float]) -> list[float | None]:
 
 @router.post(
     "/{node}/tare",
-    operation_id="tareNode",
     summary="Tare",
     status_code=HTTPStatus.CREATED,
     responses={
@@ -214,9 +210,7 @@ async def tare_node(
     return make_tare_view(recorded)
 
 
-@router.get(
-    "/{node}/tares", operation_id="listTares", summary="History of tares", responses=_UNKNOWN
-)
+@router.get("/{node}/tares", summary="History of tares", responses=_UNKNOWN)
 async def list_tares(node: str, server: ServerState) -> TaresPage:
     """Return the tares, newest first; the first valid one of the present tiles is in force."""
     the_node = server.nodes.get(node)
@@ -228,7 +222,6 @@ async def list_tares(node: str, server: ServerState) -> TaresPage:
 
 @router.delete(
     "/{node}/tares/{tare_id}",
-    operation_id="undoTare",
     summary="Undo a tare",
     status_code=HTTPStatus.NO_CONTENT,
     response_model=None,
@@ -251,7 +244,6 @@ async def undo_tare(node: str, tare_id: str, server: ServerState, if_match: InFo
 
 @router.post(
     "/{node}/accept-replacement",
-    operation_id="acceptReplacement",
     summary="Accept another machine under the name of a node",
     status_code=HTTPStatus.NO_CONTENT,
     response_model=None,

@@ -267,7 +267,6 @@ class NodeWeighingView(View):
 
 @router.get(
     "",
-    operation_id="getWeighing",
     summary="Guided calibration of a node",
     responses=problem_responses(_404="No such node."),
 )
@@ -282,7 +281,6 @@ async def get_weighing(node: str, server: ServerState) -> NodeWeighingView:
 
 @router.post(
     "",
-    operation_id="startWeighing",
     summary="Start a guided calibration",
     status_code=HTTPStatus.CREATED,
     responses={
@@ -294,7 +292,7 @@ async def get_weighing(node: str, server: ServerState) -> NodeWeighingView:
         **FULL,
     },
 )
-async def start(node: str, body: StartWeighing, server: ServerState) -> WeighingView:
+async def start_weighing(node: str, body: StartWeighing, server: ServerState) -> WeighingView:
     """Record, follow the pressure of each tile, mark each weight, and fit: one per node at a time.
 
     It continues when the client that started it disconnects, and ends by itself when the node
@@ -306,11 +304,10 @@ async def start(node: str, body: StartWeighing, server: ServerState) -> Weighing
 
 @router.post(
     "/repeat",
-    operation_id="repeatWeight",
     summary="Repeat a weight",
     responses={**_NONE, **problem_responses(_409="It has ended."), **_OTHER, **FULL},
 )
-async def repeat(node: str, server: ServerState, if_match: ThisOne = None) -> WeighingView:
+async def repeat_weight(node: str, server: ServerState, if_match: ThisOne = None) -> WeighingView:
     """Go back to the weight that is held, or else to the last one on this tile."""
     the_node = server.nodes.get(node)
     return WeighingView.of(
@@ -320,12 +317,11 @@ async def repeat(node: str, server: ServerState, if_match: ThisOne = None) -> We
 
 @router.delete(
     "",
-    operation_id="endWeighing",
     summary="Cancel or close a guided calibration",
     status_code=HTTPStatus.NO_CONTENT,
     response_model=None,
     responses={**_NONE, **_OTHER},
 )
-async def end(node: str, server: ServerState, if_match: ThisOne = None) -> None:
+async def end_weighing(node: str, server: ServerState, if_match: ThisOne = None) -> None:
     """Cancel a running calibration without a fit, or close an ended one; its recording stays."""
     await server.weighings.cancel_or_remove_weighing(node, parse_if_match(if_match))

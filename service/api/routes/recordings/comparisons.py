@@ -86,7 +86,6 @@ class SeriesView(BaseModel):
 
 @router.get(
     "/{session_id}/comparisons",
-    operation_id="listComparisons",
     summary="Comparisons",
     responses=problem_responses(_404="No such session.", _409="Its files are damaged."),
 )
@@ -98,7 +97,6 @@ async def list_comparisons(session_id: str, server: ServerState) -> ComparisonsV
 
 @router.get(
     "/{session_id}/comparisons/{name}",
-    operation_id="getComparison",
     summary="A comparison",
     responses=_PROBLEMS,
 )
@@ -112,12 +110,11 @@ async def get_comparison(session_id: str, name: str, server: ServerState) -> Rep
 
 @router.get(
     "/{session_id}/comparisons/{name}/series",
-    operation_id="getComparisonSeries",
     summary="The reference at any zoom",
     response_model=SeriesView,
     responses=_PROBLEMS,
 )
-async def get_series(
+async def get_comparison_series(
     session_id: str, name: str, query: Annotated[SeriesQuery, Query()], server: ServerState
 ) -> Response:
     """Return minimum and maximum of the reference, and of ours minus it, aligned in time."""

@@ -64,7 +64,6 @@ class ArrayView(View):
 
 @router.get(
     "/{session_id}/tiles",
-    operation_id="listTiles",
     summary="Tiles",
     responses=problem_responses(
         _404="No such session, or nothing was recorded.", _409="It is damaged."
@@ -146,7 +145,6 @@ _PARQUET = PARQUET.media_type
 
 @router.get(
     "/{session_id}/clock",
-    operation_id="getClock",
     summary="Clocks",
     response_model=ClockSummary,
     responses={
@@ -200,7 +198,6 @@ class VerificationView(Ledger):
 
 @router.get(
     "/{session_id}/verification",
-    operation_id="getVerification",
     summary="Verify files",
     response_model=VerificationView,
     responses=problem_responses(
@@ -208,7 +205,7 @@ class VerificationView(Ledger):
         _409="The session is not sealed.",
     ),
 )
-async def verify_session_files(session_id: str, server: ServerState) -> dict[str, Any]:
+async def get_verification(session_id: str, server: ServerState) -> dict[str, Any]:
     """Read all files of a sealed session, and compare them with one another and their hashes.
 
     Errors are in `problems`; no file is changed. A million frames take about a second; requests run

@@ -84,7 +84,6 @@ class OverviewView(BaseModel):
 
 @router.get(
     "/{session_id}/timeseries",
-    operation_id="getTimeseries",
     summary="Time series at any zoom",
     response_model=OverviewView,
     responses={

@@ -120,7 +120,6 @@ class ChangeMarker(_Body):
 
 @router.post(
     "",
-    operation_id="startSession",
     summary="Start recording",
     status_code=HTTPStatus.CREATED,
     responses={
@@ -164,7 +163,6 @@ async def start_session(
 
 @router.post(
     "/{session_id}/stop",
-    operation_id="stopSession",
     summary="Stop recording",
     responses={**_UNKNOWN, **FULL},
 )
@@ -185,7 +183,6 @@ async def stop_session(session_id: str, server: ServerState) -> SessionView:
 
 @router.post(
     "/{session_id}/abandon-missing",
-    operation_id="abandonMissing",
     summary="Seal without what is missing",
     responses={**_UNKNOWN, **problem_responses(_409="It is not pending."), **FULL},
 )
@@ -199,7 +196,7 @@ async def abandon_missing(session_id: str, server: ServerState) -> SessionView:
     return make_session_view(session, server.recorder)
 
 
-@router.get("", operation_id="listSessions", summary="Sessions, newest first")
+@router.get("", summary="Sessions, newest first")
 async def list_sessions(
     server: ServerState,
     cursor: Annotated[str | None, Query(description="Cursor of the previous page.")] = None,
@@ -265,7 +262,6 @@ async def list_sessions(
 
 @router.get(
     "/{session_id}",
-    operation_id="getSession",
     summary="One session",
     responses=_UNKNOWN,
 )
@@ -276,7 +272,6 @@ async def get_session(session_id: str, server: ServerState) -> SessionView:
 
 @router.patch(
     "/{session_id}",
-    operation_id="changeSession",
     summary="Rename or annotate",
     responses={**_UNKNOWN, **CHANGED, **FULL},
 )
@@ -293,7 +288,6 @@ async def change_session(
 
 @router.delete(
     "/{session_id}",
-    operation_id="deleteSession",
     summary="Move to the trash",
     status_code=HTTPStatus.NO_CONTENT,
     response_model=None,
@@ -315,7 +309,6 @@ async def delete_session(session_id: str, server: ServerState, if_match: IfMatch
 
 @router.post(
     "/{session_id}/markers",
-    operation_id="addMarker",
     summary="Add a marker",
     status_code=HTTPStatus.CREATED,
     responses={**_UNKNOWN, **FULL},
@@ -328,7 +321,6 @@ async def add_marker(session_id: str, body: AddMarker, server: ServerState) -> M
 
 @router.patch(
     "/{session_id}/markers/{marker_id}",
-    operation_id="changeMarker",
     summary="Rename or move a marker",
     responses={**_NO_EVENT, **CHANGED, **FULL},
 )
@@ -349,7 +341,6 @@ async def change_marker(
 
 @router.delete(
     "/{session_id}/markers/{marker_id}",
-    operation_id="deleteMarker",
     summary="Delete a marker",
     status_code=HTTPStatus.NO_CONTENT,
     response_model=None,
@@ -364,7 +355,6 @@ async def delete_marker(
 
 @router.get(
     "/{session_id}/markers",
-    operation_id="listMarkers",
     summary="Markers",
     response_model=Page[MarkerView],
     responses={
@@ -393,7 +383,7 @@ async def list_markers(
     return Page(items=[make_marker_view(event) for event in marked])
 
 
-@router.get("/{session_id}/ledger", operation_id="getLedger", summary="Ledger", responses=_UNKNOWN)
+@router.get("/{session_id}/ledger", summary="Ledger", responses=_UNKNOWN)
 async def get_ledger(session_id: str, server: ServerState) -> Ledger:
     """Return the fate of every frame: recorded, lost for a reason, or still with the node."""
     return server.recorder.get_ledger(session_id)
@@ -415,7 +405,7 @@ class Emptied(View):
     bytes: int = Field(description="Size of all their files.")
 
 
-@trash_router.get("", operation_id="listTrash", summary="Deleted sessions, newest first")
+@trash_router.get("", summary="Deleted sessions, newest first")
 async def list_trash(server: ServerState) -> Page[SessionView]:
     """Return deleted sessions, newest first; each can be restored."""
     deleted = server.sessions.trash.list_sessions()
@@ -424,7 +414,6 @@ async def list_trash(server: ServerState) -> Page[SessionView]:
 
 @trash_router.post(
     "/{session_id}/restore",
-    operation_id="restoreSession",
     summary="Restore a session",
     responses=problem_responses(_404="No such session in the trash.", _507="The disk is full."),
 )
@@ -435,7 +424,6 @@ async def restore_session(session_id: str, server: ServerState) -> SessionView:
 
 @trash_router.delete(
     "",
-    operation_id="emptyTrash",
     summary="Empty the trash",
     responses=problem_responses(_507="The data folder cannot be written."),
 )

@@ -60,7 +60,6 @@ class StanceView(BaseModel):
 
 @router.get(
     "/{session_id}/stances",
-    operation_id="getStances",
     summary="Stances",
     response_model=list[StanceView],
     responses={
@@ -141,7 +140,6 @@ class OverlayView(BaseModel):
 
 @router.get(
     "/{session_id}/stances/overlay",
-    operation_id="getStancesOverlay",
     summary="Overlay of stances",
     response_model=OverlayView,
     responses={
@@ -152,7 +150,7 @@ class OverlayView(BaseModel):
         ),
     },
 )
-async def get_stance_overlay(
+async def get_stances_overlay(
     session_id: str,
     query: Annotated[OverlayQuery, Query()],
     request: Request,

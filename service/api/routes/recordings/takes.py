@@ -76,7 +76,6 @@ class TakeView(View):
 
 @router.post(
     "",
-    operation_id="startTake",
     summary="Record several nodes together",
     status_code=HTTPStatus.CREATED,
     responses=problem_responses(
@@ -106,7 +105,7 @@ async def start_take(
     return TakeView.from_take(take, server)
 
 
-@router.get("/{take_id}", operation_id="getTake", summary="One take", responses=_UNKNOWN)
+@router.get("/{take_id}", summary="One take", responses=_UNKNOWN)
 async def get_take(take_id: str, server: ServerState) -> TakeView:
     """Return the present sessions of a take, without those in the trash."""
     return TakeView.from_take(server.takes.get_take(take_id), server)
@@ -114,7 +113,6 @@ async def get_take(take_id: str, server: ServerState) -> TakeView:
 
 @router.post(
     "/{take_id}/stop",
-    operation_id="stopTake",
     summary="Stop all of a take",
     responses={**_UNKNOWN, **_FAILED},
 )
@@ -138,7 +136,6 @@ async def stop_take(take_id: str, server: ServerState) -> TakeView:
 
 @router.post(
     "/{take_id}/markers",
-    operation_id="markTake",
     summary="Add a marker to all of a take",
     status_code=HTTPStatus.CREATED,
     responses={**_UNKNOWN, **_OVER},
@@ -163,7 +160,6 @@ data_router = APIRouter(prefix="/takes", tags=["data"])
 
 @data_router.get(
     "/{take_id}/data",
-    operation_id="getTakeData",
     summary="Download all of a take as one file",
     response_class=Response,
     responses={
