@@ -27,7 +27,10 @@ class View(BaseModel):
     """Base of answers and live messages; unknown values are null, never NaN."""
 
     model_config = ConfigDict(
-        frozen=True, allow_inf_nan=False, json_schema_serialization_defaults_required=True
+        frozen=True,
+        allow_inf_nan=False,
+        from_attributes=True,
+        json_schema_serialization_defaults_required=True,
     )
 
 

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from devices.clock import server_utc_ns
 from devices.errors import (
@@ -36,6 +36,7 @@ from devices.errors import (
     UsageError,
 )
 from service.estimation.calibration import Calibration
+from service.protocol.live import View
 from service.server.session_store import SessionStore
 from service.sessions.calibration_file import encode_calibration, parse_calibration
 from storage.documents import read_document, write_document
@@ -57,34 +58,33 @@ CALIBRATION_ID = re.compile(r"[0-9a-f]{16}")
 _ASSIGN_AGAIN = "assign a calibration again, or unassign it"
 
 
-@dataclass(frozen=True)
-class CalibrationSummary:
-    """Facts of a calibration that are kept in memory."""
+class CalibrationSummaryView(View):
+    """Summary of a calibration."""
 
-    id: str
+    id: str = Field(description="Hash of its content.", examples=["983bbbe1624bad0b"])
     name: str
-    reference: str
-    date: str
-    serials: tuple[str, ...]
-    refused: tuple[str, ...]
-    has_assumed_scale: bool
-    """True if the scale of any tile is an assumption."""
-    has_mount_gains: bool
-    """True if a force plate has shown how its tiles are mounted."""
+    reference: str = Field(description="Force sensor of its scale.")
+    date: str = Field(description="Date of the recordings, ISO 8601.")
+    serials: list[str] = Field(description="Tiles with a curve; `*`: any tile.")
+    refused: list[str] = Field(
+        description="Tiles without a curve, although recorded; the file has the reasons."
+    )
+    absolute_scale: Literal["measured", "assumed"]
+    mounted: bool = Field(description="True: a force plate has shown how its tiles are mounted.")
 
     @classmethod
-    def from_calibration(cls, calibration: Calibration) -> CalibrationSummary:
+    def from_calibration(cls, calibration: Calibration) -> CalibrationSummaryView:
         """Return the summary of a calibration."""
-        serials = tuple(tile.serial for tile in calibration.tiles)
+        serials = [tile.serial for tile in calibration.tiles]
         return cls(
             id=calibration.id,
             name=calibration.name,
             reference=calibration.reference,
             date=calibration.date,
             serials=serials,
-            refused=tuple(calibration.refused),
-            has_assumed_scale=calibration.has_assumed_scale(serials),
-            has_mount_gains=calibration.mounted is not None,
+            refused=list(calibration.refused),
+            absolute_scale="assumed" if calibration.has_assumed_scale(serials) else "measured",
+            mounted=calibration.mounted is not None,
         )
 
 
@@ -100,7 +100,7 @@ class CalibrationStore:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._summaries: dict[str, CalibrationSummary] = {}
+        self._summaries: dict[str, CalibrationSummaryView] = {}
         self.problems: list[str] = []
         with translate_storage_errors(folder):
             paths = sorted(folder.glob("*.json"))
@@ -114,9 +114,9 @@ class CalibrationStore:
             except FootTileError as error:
                 self.problems.append(f"a calibration is left out: {error}")
             else:
-                self._summaries[path.stem] = CalibrationSummary.from_calibration(calibration)
+                self._summaries[path.stem] = CalibrationSummaryView.from_calibration(calibration)
 
-    def list_all(self) -> list[CalibrationSummary]:
+    def list_all(self) -> list[CalibrationSummaryView]:
         """Return the summaries of all calibrations, the newest recordings first."""
         return sorted(self._summaries.values(), key=lambda kept: (kept.date, kept.id), reverse=True)
 
@@ -140,14 +140,14 @@ class CalibrationStore:
                 f"calibration {calibration_id} is damaged: {error}", remedy="Upload it again"
             ) from error
 
-    def save(self, calibration: Calibration) -> CalibrationSummary:
+    def save(self, calibration: Calibration) -> CalibrationSummaryView:
         """Save a calibration atomically; the same content twice is one calibration.
 
         Raises:
             StateError: the store is full.
             StorageError: it cannot be written.
         """
-        summary = CalibrationSummary.from_calibration(calibration)
+        summary = CalibrationSummaryView.from_calibration(calibration)
         if summary.id not in self._summaries and len(self._summaries) >= CALIBRATIONS_MAX:
             raise StateError(
                 f"this server keeps {len(self._summaries)} calibrations already",
@@ -220,7 +220,7 @@ class CalibrationJob:
     started_t_ns: int
     state: JobState = "running"
     ended_t_ns: int | None = None
-    log_lines: deque[str] = field(default_factory=lambda: deque(maxlen=_LOG_LINES_KEPT))
+    log: deque[str] = field(default_factory=lambda: deque(maxlen=_LOG_LINES_KEPT))
     """Log of the job up to now, a line per tile."""
     calibration_id: str | None = None
     problem: str | None = None
@@ -387,7 +387,7 @@ class CalibrationJobs:
                 process.kill()
                 await process.wait()
         if code not in (0, _EXIT_TILE_REFUSED):
-            last = fit.log_lines[-1] if fit.log_lines else f"the process ended with {code}"
+            last = fit.log[-1] if fit.log else f"the process ended with {code}"
             raise StateError(last.removeprefix("foottile: "))
 
     @staticmethod
@@ -397,11 +397,9 @@ class CalibrationJobs:
         while piece := await process.stderr.read(_LINE_BYTES):
             *lines, rest = (rest + piece).split(b"\n")
             rest = rest[-_LINE_BYTES:]
-            fit.log_lines.extend(
-                line.decode(errors="replace")[:1000] for line in lines if line.strip()
-            )
+            fit.log.extend(line.decode(errors="replace")[:1000] for line in lines if line.strip())
         if rest.strip():
-            fit.log_lines.append(rest.decode(errors="replace")[:1000])
+            fit.log.append(rest.decode(errors="replace")[:1000])
 
 
 def _read_result(out: Path) -> Calibration:

@@ -23,7 +23,7 @@ from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
 from service.protocol.live import CalibrationSource, CalibrationView, View
 from service.server.broadcast.views import Page, make_calibration_view
-from service.server.calibrations import JOB_SESSIONS_MAX, CalibrationJob, CalibrationSummary
+from service.server.calibrations import JOB_SESSIONS_MAX, CalibrationSummaryView
 from service.server.node import ServerNode
 from service.server.session_store import check_revision
 from service.sessions.calibration_file import encode_calibration, parse_calibration
@@ -43,35 +43,6 @@ Line = Annotated[
     AfterValidator(check_user_name),
 ]
 SessionId = Annotated[str, StringConstraints(max_length=100)]
-
-
-class CalibrationSummaryView(View):
-    """Summary of a calibration."""
-
-    id: str = Field(description="Hash of its content.", examples=["983bbbe1624bad0b"])
-    name: str
-    reference: str = Field(description="Force sensor of its scale.")
-    date: str = Field(description="Date of the recordings, ISO 8601.")
-    serials: list[str] = Field(description="Tiles with a curve; `*`: any tile.")
-    refused: list[str] = Field(
-        description="Tiles without a curve, although recorded; the file has the reasons."
-    )
-    absolute_scale: Literal["measured", "assumed"]
-    mounted: bool = Field(description="True: a force plate has shown how its tiles are mounted.")
-
-    @classmethod
-    def from_summary(cls, summary: CalibrationSummary) -> CalibrationSummaryView:
-        """Return the view of a summary."""
-        return cls(
-            id=summary.id,
-            name=summary.name,
-            reference=summary.reference,
-            date=summary.date,
-            serials=list(summary.serials),
-            refused=list(summary.refused),
-            absolute_scale="assumed" if summary.has_assumed_scale else "measured",
-            mounted=summary.has_mount_gains,
-        )
 
 
 class StartFit(BaseModel):
@@ -105,21 +76,6 @@ class FitView(View):
     log: list[PublicText] = Field(description="Log of the job, a line per tile.")
     calibration_id: str | None = Field(description="Id of the calibration, once it is done.")
     problem: PublicText | None = Field(description="Reason of a failure.")
-
-    @classmethod
-    def from_job(cls, job: CalibrationJob) -> FitView:
-        """Return the present state of a job."""
-        return cls(
-            id=job.id,
-            name=job.name,
-            sessions=list(job.sessions),
-            state=job.state,
-            started_t_ns=job.started_t_ns,
-            ended_t_ns=job.ended_t_ns,
-            log=list(job.log_lines),
-            calibration_id=job.calibration_id,
-            problem=job.problem,
-        )
 
 
 class AssignCalibration(BaseModel):
@@ -174,12 +130,7 @@ InUse = Annotated[
 @router.get("/calibrations", summary="Calibrations")
 async def list_calibrations(server: ServerState) -> Page[CalibrationSummaryView]:
     """Return the calibrations on the server, the newest recordings first."""
-    return Page(
-        items=[
-            CalibrationSummaryView.from_summary(summary)
-            for summary in server.calibrations.list_all()
-        ]
-    )
+    return Page(items=server.calibrations.list_all())
 
 
 @router.post(
@@ -212,14 +163,16 @@ async def upload_calibration(
     calibration = await run_in_threadpool(_parse_body, await request.body())
     summary = server.calibrations.save(calibration)
     response.headers["Location"] = f"/api/v1/calibrations/{summary.id}"
-    return CalibrationSummaryView.from_summary(summary)
+    return summary
 
 
 @router.get("/calibrations/jobs", summary="Fits")
 async def list_calibration_jobs(server: ServerState) -> Page[FitView]:
     """Return the last jobs since the server was started, newest first."""
     return Page(
-        items=[FitView.from_job(fit) for fit in server.calibration_jobs.list_jobs_newest_first()]
+        items=[
+            FitView.model_validate(fit) for fit in server.calibration_jobs.list_jobs_newest_first()
+        ]
     )
 
 
@@ -244,7 +197,7 @@ async def start_calibration_job(body: StartFit, server: ServerState, response: R
         options["reference_delay_sigma_ms"] = repr(body.reference_delay_sigma_ms)
     fit = server.calibration_jobs.start_job(body.name, body.sessions, options)
     response.headers["Location"] = f"/api/v1/calibrations/jobs/{fit.id}"
-    return FitView.from_job(fit)
+    return FitView.model_validate(fit)
 
 
 @router.get(
@@ -254,7 +207,7 @@ async def start_calibration_job(body: StartFit, server: ServerState, response: R
 )
 async def get_calibration_job(job_id: str, server: ServerState) -> FitView:
     """Return a job's progress, and the id of the calibration once it is done."""
-    return FitView.from_job(server.calibration_jobs.get_job(job_id))
+    return FitView.model_validate(server.calibration_jobs.get_job(job_id))
 
 
 @router.delete(
@@ -264,7 +217,7 @@ async def get_calibration_job(job_id: str, server: ServerState) -> FitView:
 )
 async def cancel_calibration_job(job_id: str, server: ServerState) -> FitView:
     """Cancel a running job without a result; an ended one is unchanged."""
-    return FitView.from_job(await server.calibration_jobs.cancel_job(job_id))
+    return FitView.model_validate(await server.calibration_jobs.cancel_job(job_id))
 
 
 @router.get(

@@ -16,7 +16,7 @@ from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.dead_weights import TOLERANCE_PERCENT, check_and_label_weights
 from service.protocol.live import View
 from service.server.node import ServerNode
-from service.server.weighing import Method, Repeatability
+from service.server.weighing import Method
 from service.server.weighings import NodeWeighing, WeighingPlan, WeighingState
 from service.user_folders import PublicText
 
@@ -87,11 +87,6 @@ class RepeatabilityView(View):
     mean_kpa: float
     spread_kpa: float = Field(description="Standard deviation of quarter seconds.")
     settle_kpa: float = Field(description="Newest quarter second less the first.")
-
-    @classmethod
-    def of(cls, found: Repeatability) -> RepeatabilityView:
-        """Make the view of a measured step."""
-        return cls(**vars(found))
 
 
 class TilePassView(View):
@@ -229,12 +224,7 @@ class WeighingView(View):
         return cls(
             session_id=weighing.session_id,
             state=weighing.state,
-            tiles=[
-                TilePassView(
-                    serial=each.serial, held=[RepeatabilityView.of(held) for held in each.held]
-                )
-                for each in weighing.passes
-            ],
+            tiles=[TilePassView.model_validate(each) for each in weighing.passes],
             weights=list(plan.weights),
             method=plan.method,
             reference=plan.reference,
@@ -250,7 +240,7 @@ class WeighingView(View):
             else round(recent_kpa[-1] - rest_kpa, 3),
             recent_kpa=recent_kpa,
             rest_kpa=rest_kpa,
-            repeatability=None if seen is None else RepeatabilityView.of(seen),
+            repeatability=None if seen is None else RepeatabilityView.model_validate(seen),
             result=None if found is None else WeighingResultView.of(found, node),
         )
 

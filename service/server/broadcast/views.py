@@ -174,12 +174,7 @@ def make_node_view(
         auto_tare=keeper.auto_tare_state,
         drift=make_drift_view(node),
         storage_problem=node.storage_problem,
-        clock=None
-        if node.clock_offset is None
-        else ClockView(
-            server_minus_node_ns=node.clock_offset.server_minus_node_ns,
-            uncertainty_ns=node.clock_offset.uncertainty_ns,
-        ),
+        clock=None if node.clock_offset is None else ClockView.model_validate(node.clock_offset),
         clock_set=info.clock_set,
         lost=lost,
         warnings=[*node.warnings, *node.refused_ahead_frames_warnings],
@@ -190,9 +185,7 @@ def make_node_view(
         recording=[session.id for session in recorder.list_recording(node.name)],
         replacement=None
         if replacement is None
-        else ReplacementView(  # without the secret
-            **{name: getattr(replacement, name) for name in ReplacementView.model_fields}
-        ),
+        else ReplacementView.model_validate(replacement),  # without the secret
     )
 
 
