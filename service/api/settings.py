@@ -1,7 +1,7 @@
 """Settings of a server: names, defaults and meanings in one table.
 
 A value comes from the command line, else from an environment variable `FOOTTILE_NAME`, else from
-the TOML file named with --config, else from the default.
+the TOML file named with --config, else from the default. Docstrings are the help of options.
 """
 
 from __future__ import annotations
@@ -26,10 +26,12 @@ _IPV4 = 4
 class LimitSettings(BaseModel):
     """Limits for unauthenticated clients, as settings."""
 
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
     max_connections: _Connections = 512
     """Requests and subscribers at once, without nodes; beyond it 503, or 1013 on a websocket."""
     max_connections_per_address: _Connections = 256
-    """The limit per address. A phone's hotspot is one address, and so is a reverse proxy that is
+    """The same per address. A phone's hotspot is one address, and so is a reverse proxy that is
     not trusted."""
     max_nodes: _Connections = 32
     """Nodes at once."""
@@ -42,7 +44,8 @@ class LimitSettings(BaseModel):
     idle_timeout_s: _Seconds = 30.0
     """Timeout of an idle connection."""
     trusted_proxy: tuple[IPvAnyNetwork, ...] = ()
-    """Addresses of reverse proxies whose X-Forwarded-For and X-Forwarded-Proto are used."""
+    """Address of a reverse proxy whose X-Forwarded-For and X-Forwarded-Proto are used
+    (repeatable)."""
 
     @property
     def trusted_peers(self) -> list[str]:
@@ -69,13 +72,13 @@ class Settings(LimitSettings):
     token: Annotated[str, Field(pattern=r"^[!-~]{8,200}$")] | None = None
     """Token required for changes; generated and stored in the data folder if none is given."""
     private: bool = False
-    """True: reading needs a login or the token, too."""
+    """Login or token required for reading, too."""
     allow_host: tuple[str, ...] = ()
-    """Names of the server in addition to its addresses and this machine's own names."""
+    """Further name of the server, beside its addresses and the machine's names (repeatable)."""
     advertise: str | None = None
-    """Address or name shown to people, as that of a reverse proxy; None: the addresses found."""
+    """Address or name shown to people, as that of a reverse proxy; else the addresses found."""
     no_quantize: bool = False
-    """True: estimates in recorded sessions are not rounded."""
+    """Estimates as computed in recorded sessions, their noise not rounded off."""
 
     @field_validator("data", mode="before")
     @classmethod

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
 import os
 import shlex
 import sys
@@ -10,12 +11,14 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import ExitStack, asynccontextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_origin
 from urllib.parse import quote
 
 import typer
 
 from devices.errors import FootTileError, StateError, require_extra
+from service.api.connection_limits import raise_open_files_limit
+from service.api.settings import LimitSettings, Settings, load_settings
 from service.cli.commands.sessions import SERVER, ServerOption
 from service.cli.options import (
     SECONDS_MAX,
@@ -26,6 +29,7 @@ from service.cli.options import (
     check_emulated,
     create_stop_event,
     echo,
+    expand_options,
     load_adapted_scene,
     print_json,
     remark,
@@ -46,56 +50,40 @@ if TYPE_CHECKING:
     import socket
 
     from service.api.access import Logins
-    from service.api.settings import Settings
     from service.server.server import Server
 
 
-def _make_limit(text: str) -> Any:
-    return typer.Option(help=text, rich_help_panel="Limits for unauthenticated clients")
+def _add_setting_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Replace the parameter `options` of a command by an option for each setting.
+
+    The token is none: a list of processes would show it.
+    """
+    parameters = []
+    limits = LimitSettings.model_fields
+    for name, field in sorted(Settings.model_fields.items(), key=lambda item: item[0] in limits):
+        kind: Any = field.annotation if field.annotation in (bool, int, float, Path) else str
+        if get_origin(field.annotation) is tuple:
+            kind = list[str]
+        default = None if field.default_factory else field.default
+        help_text = f"{field.description}{f' Default: {default}.' if default else ''}"
+        option = typer.Option(f"--{name.replace('_', '-')}", help=help_text)
+        parameters.append(
+            inspect.Parameter(
+                *(name, inspect.Parameter.KEYWORD_ONLY),
+                default=None,
+                annotation=Annotated[kind | None, option],
+            )
+        )
+    shown = [parameter for parameter in parameters if parameter.name != "token"]
+    # A list that is not given may be empty.
+    return expand_options(command, shown, lambda given: {k: v for k, v in given.items() if v != []})
 
 
 @require_extra("server", "`foottile serve`")
+@_add_setting_options
 def serve_command(
-    host: Annotated[
-        str | None, typer.Option(help="Address to listen on; default 127.0.0.1: this machine only.")
-    ] = None,
-    port: Annotated[int | None, typer.Option(help="TCP port; default 8000; 0: any.")] = None,
-    data: Annotated[Path | None, typer.Option(help="Folder for sessions and journals.")] = None,
+    options: dict[str, Any],
     config: Annotated[Path | None, typer.Option(help="TOML file with settings.")] = None,
-    allow_host: Annotated[
-        list[str] | None,
-        typer.Option(help="Further host name of the server (repeatable)."),
-    ] = None,
-    advertise: AdvertiseOption = None,
-    private: Annotated[
-        bool | None,
-        typer.Option("--private", help="Require a login for reading; default: for changes only."),
-    ] = None,
-    no_quantize: Annotated[
-        bool | None,
-        typer.Option(
-            "--no-quantize",
-            help="Seal sessions with estimates as computed: do not round off their noise.",
-        ),
-    ] = None,
-    trusted_proxy: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="ADDRESS",
-            help="Reverse proxy with trusted X-Forwarded-For and X-Forwarded-Proto (repeatable); "
-            "default: none.",
-        ),
-    ] = None,
-    max_connections: Annotated[int | None, _make_limit("Open connections; 512.")] = None,
-    max_connections_per_address: Annotated[
-        int | None,
-        _make_limit("Open connections per address; 256."),
-    ] = None,
-    max_nodes: Annotated[int | None, _make_limit("Connected nodes; 32.")] = None,
-    max_header_bytes: Annotated[int | None, _make_limit("Headers of a request; 32768.")] = None,
-    header_timeout_s: Annotated[float | None, _make_limit("Timeout of headers; 10.")] = None,
-    body_timeout_s: Annotated[float | None, _make_limit("Timeout of a body; 20.")] = None,
-    idle_timeout_s: Annotated[float | None, _make_limit("Timeout between requests; 30.")] = None,
 ) -> None:
     """Run the server: live view, recording, REST API.
 
@@ -106,27 +94,7 @@ def serve_command(
     """
     import uvloop
 
-    from service.api.connection_limits import raise_open_files_limit
-    from service.api.settings import load_settings
-
-    settings = load_settings(
-        config,
-        host=host,
-        port=port,
-        data=data,
-        allow_host=tuple(allow_host or ()) or None,
-        advertise=advertise,
-        private=private,
-        no_quantize=no_quantize,
-        trusted_proxy=tuple(trusted_proxy or ()) or None,
-        max_connections=max_connections,
-        max_connections_per_address=max_connections_per_address,
-        max_nodes=max_nodes,
-        max_header_bytes=max_header_bytes,
-        header_timeout_s=header_timeout_s,
-        body_timeout_s=body_timeout_s,
-        idle_timeout_s=idle_timeout_s,
-    )
+    settings = load_settings(config, **options)
     raise_open_files_limit()
     uvloop.run(_run_server(settings))
 
@@ -231,7 +199,6 @@ def demo_command(
     """
     import uvloop
 
-    from service.api.connection_limits import raise_open_files_limit
     from service.offline.calibration_lookup import find_scene_calibration
     from service.rig.emulated_foot import RigOptions
 
