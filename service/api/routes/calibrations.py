@@ -14,6 +14,8 @@ from devices.errors import CalibrationError, FootTileError, UsageError
 from devices.types import check_user_name
 from service.api.routes.common import (
     FULL,
+    NO_CONTENT,
+    UNCHANGED,
     ServerState,
     has_matching_etag,
     parse_if_match,
@@ -137,14 +139,12 @@ async def list_calibrations(server: ServerState) -> Page[CalibrationSummaryView]
     "/calibrations",
     summary="Upload a calibration",
     status_code=HTTPStatus.CREATED,
-    responses={
-        **problem_responses(
-            _409="The limit of calibrations is reached.",
-            _413="It is longer than 1 MiB.",
-            _422="No calibration, an unknown field, or a wrong hash.",
-        ),
-        **FULL,
-    },
+    responses=problem_responses(
+        FULL,
+        _409="The limit of calibrations is reached.",
+        _413="It is longer than 1 MiB.",
+        _422="No calibration, an unknown field, or a wrong hash.",
+    ),
     openapi_extra={
         "requestBody": {
             "required": True,
@@ -224,11 +224,11 @@ async def cancel_calibration_job(job_id: str, server: ServerState) -> FitView:
     "/calibrations/{calibration_id}",
     summary="Download a calibration",
     response_class=Response,
-    responses={
-        200: {"description": "The file.", "content": {"application/json": {}}},
-        304: {"description": "Unchanged."},
-        **_UNKNOWN,
-    },
+    responses=problem_responses(
+        {200: {"description": "The file.", "content": {"application/json": {}}}},
+        UNCHANGED,
+        _UNKNOWN,
+    ),
 )
 async def get_calibration(calibration_id: str, request: Request, server: ServerState) -> Response:
     """Return the file as every command of `foottile` reads it; its id is its entity tag."""
@@ -239,20 +239,15 @@ async def get_calibration(calibration_id: str, request: Request, server: ServerS
 @router.delete(
     "/calibrations/{calibration_id}",
     summary="Delete a calibration",
-    status_code=HTTPStatus.NO_CONTENT,
-    response_model=None,
-    responses={**problem_responses(_404="No such calibration."), **FULL},
+    **NO_CONTENT,
+    responses=problem_responses(FULL, _404="No such calibration."),
 )
 async def delete_calibration(calibration_id: str, server: ServerState) -> None:
     """Delete a calibration; sessions and nodes that use it have a copy."""
     server.calibrations.delete_leaving_copies_in_use(calibration_id)
 
 
-@router.get(
-    "/nodes/{node}/calibration",
-    summary="A node's calibration",
-    responses=_NO_NODE,
-)
+@router.get("/nodes/{node}/calibration", summary="A node's calibration", responses=_NO_NODE)
 async def get_node_calibration(node: str, server: ServerState) -> NodeCalibrationView:
     """Return the calibration in use, and its origin."""
     return NodeCalibrationView.from_node(server.nodes.get(node))
@@ -261,15 +256,13 @@ async def get_node_calibration(node: str, server: ServerState) -> NodeCalibratio
 @router.put(
     "/nodes/{node}/calibration",
     summary="Assign a calibration",
-    responses={
-        **problem_responses(
-            _404="No such node or calibration.",
-            _409="The calibration's file is damaged.",
-            _412="Another calibration is in use than If-Match names.",
-            _422="Invalid body, or it does not fit the node's tiles.",
-        ),
-        **FULL,
-    },
+    responses=problem_responses(
+        FULL,
+        _404="No such node or calibration.",
+        _409="The calibration's file is damaged.",
+        _412="Another calibration is in use than If-Match names.",
+        _422="Invalid body, or it does not fit the node's tiles.",
+    ),
 )
 async def assign_calibration(
     node: str, body: AssignCalibration, server: ServerState, if_match: InUse = None
@@ -291,11 +284,9 @@ async def assign_calibration(
 @router.delete(
     "/nodes/{node}/calibration",
     summary="Unassign a calibration",
-    responses={
-        **_NO_NODE,
-        **problem_responses(_412="Another calibration is in use than If-Match names."),
-        **FULL,
-    },
+    responses=problem_responses(
+        _NO_NODE, FULL, _412="Another calibration is in use than If-Match names."
+    ),
 )
 async def unassign_calibration(
     node: str, server: ServerState, if_match: InUse = None

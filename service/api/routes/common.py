@@ -20,14 +20,21 @@ from storage.formats.writers.tables import PARQUET
 from storage.sessions.folder import IdempotencyRecord, Session
 
 _SCHEMA = {"content": {MEDIA_TYPE: {"schema": Problem.model_json_schema()}}}
+Responses = dict[int | str, dict[str, Any]]
 
 
-def problem_responses(**meanings: str) -> dict[int | str, dict[str, Any]]:
-    """Return OpenAPI entries of a route's problems: `problem_responses(_404="No such node.")`."""
-    return {
+def problem_responses(*shared: Responses, **meanings: str) -> Responses:
+    """Return OpenAPI entries of a route: `problem_responses(FULL, _404="No such node.")`.
+
+    Args:
+        shared: entries of several routes, or of answers without a problem.
+        meanings: problems by status; each replaces a shared one.
+    """
+    own: Responses = {
         int(status.removeprefix("_")): {"description": meaning, **_SCHEMA}
         for status, meaning in meanings.items()
     }
+    return {status: entry for each in (*shared, own) for status, entry in each.items()}
 
 
 def require_file(path: Path) -> Path:
@@ -99,6 +106,9 @@ def has_matching_etag(request: Request, tag: str) -> bool:
 ServerState = Annotated[Server, Depends(_server)]
 
 CHANGED = problem_responses(_412="It was changed meanwhile: its revision is not that in If-Match.")
+UNCHANGED: Responses = {304: {"description": "Unchanged."}}
+NO_CONTENT: dict[str, Any] = {"status_code": 204, "response_model": None}
+"""Options of a route that answers with a status only."""
 FULL = problem_responses(_507="The data folder cannot be written.")
 
 IfMatch = Annotated[

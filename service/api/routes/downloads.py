@@ -26,6 +26,7 @@ from starlette.datastructures import MutableHeaders
 from devices.errors import DamagedFileError, StateError, StorageError, UnknownError, UsageError
 from service.api.problems import problem_response
 from service.api.routes.common import (
+    UNCHANGED,
     ServerState,
     file_response,
     has_matching_etag,
@@ -74,26 +75,23 @@ MEDIA_TYPES = [each.media_type for each in FORMATS.values()]
     "/{session_id}/data",
     summary="Download",
     response_class=Response,
-    responses={
-        200: {
-            "description": "The data.",
-            "content": {media_type.split(";")[0]: {} for media_type in MEDIA_TYPES},
+    responses=problem_responses(
+        {
+            200: {
+                "description": "The data.",
+                "content": {media_type.split(";")[0]: {} for media_type in MEDIA_TYPES},
+            },
+            206: {"description": "A range of the stored file."},
         },
-        206: {"description": "A range of the stored file."},
-        304: {"description": "Unchanged."},
-        **problem_responses(
-            _404="No such session, or nothing was recorded.",
-            _409="This format needs a sealed session.",
-            _416="The range is outside the file.",
-            _422="No such format or column, or a slice outside the session.",
-        ),
-    },
+        UNCHANGED,
+        _404="No such session, or nothing was recorded.",
+        _409="This format needs a sealed session.",
+        _416="The range is outside the file.",
+        _422="No such format or column, or a slice outside the session.",
+    ),
 )
 async def get_data(
-    session_id: str,
-    query: Annotated[DataQuery, Query()],
-    request: Request,
-    server: ServerState,
+    session_id: str, query: Annotated[DataQuery, Query()], request: Request, server: ServerState
 ) -> Response:
     """Return a session in a selected format; `GET /formats` lists them.
 
@@ -295,19 +293,21 @@ IDS_MAX = 1000
     "/zip",
     summary="Download several as one zip file",
     response_class=Response,
-    responses={
-        200: {"description": "The files of each, in a folder.", "content": {"application/zip": {}}},
-        **problem_responses(
-            _404="No such session.",
-            _409="One is not sealed yet, or its files are damaged.",
-            _422="No ids, or too many.",
-        ),
-    },
+    responses=problem_responses(
+        {
+            200: {
+                "description": "The files of each, in a folder.",
+                "content": {"application/zip": {}},
+            }
+        },
+        _404="No such session.",
+        _409="One is not sealed yet, or its files are damaged.",
+        _422="No ids, or too many.",
+    ),
 )
 async def zip_sessions(
     ids: Annotated[
-        str,
-        Query(max_length=24 * IDS_MAX, description=f"With commas between; {IDS_MAX} at most."),
+        str, Query(max_length=24 * IDS_MAX, description=f"With commas between; {IDS_MAX} at most.")
     ],
     server: ServerState,
 ) -> StreamingResponse:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from fastapi import APIRouter, Request
 from pydantic import BaseModel, Field
 
-from service.api.routes.common import ServerState, problem_responses
+from service.api.routes.common import FULL, ServerState
 from service.protocol.link import INGEST_PATH, SUBPROTOCOL
 from service.protocol.live import LIVE_PATH, View
 from service.user_folders import PublicText
@@ -20,8 +20,7 @@ class RouteView(View):
 
     method: str = Field(examples=["GET"])
     href: str = Field(
-        description="Path; replace the names in braces.",
-        examples=["/api/v1/sessions/{session_id}"],
+        description="Path; replace the names in braces.", examples=["/api/v1/sessions/{session_id}"]
     )
     operation: str = Field(
         description="Its `operationId` in the OpenAPI document.", examples=["getSession"]
@@ -98,11 +97,7 @@ async def get_health(server: ServerState) -> Health:
     return Health(status="ok", problems=server.file_problems)
 
 
-@router.get(
-    "/ready",
-    summary="Readiness",
-    responses=problem_responses(_507="The data folder cannot be written."),
-)
+@router.get("/ready", summary="Readiness", responses=FULL)
 def get_ready(server: ServerState) -> Ready:
     """Write a test file to the data folder, and count nodes and subscribers."""
     server.check_writable()

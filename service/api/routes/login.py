@@ -11,6 +11,7 @@ from starlette.exceptions import HTTPException
 
 from devices.clock import server_utc_ns
 from service.api.access import LOGIN_S, TICKET_S, Logins, Role, cookie_name
+from service.api.routes.common import NO_CONTENT
 from service.protocol.live import View
 
 router = APIRouter(tags=["login"])
@@ -110,12 +111,7 @@ async def log_in(
     return _make_view(logins, right, LOGIN_S)
 
 
-@router.delete(
-    "/login",
-    summary="Log out",
-    status_code=HTTPStatus.NO_CONTENT,
-    response_model=None,
-)
+@router.delete("/login", summary="Log out", **NO_CONTENT)
 async def log_out(request: Request, response: Response, logins: LoginsState) -> None:
     """Invalidate the cookie of this request."""
     cookie = logins.read_cookie(request)
@@ -124,11 +120,7 @@ async def log_out(request: Request, response: Response, logins: LoginsState) -> 
         response.delete_cookie(cookie_name(request), httponly=True, samesite="strict")
 
 
-@router.post(
-    "/tickets",
-    summary="Create a one-time login",
-    status_code=HTTPStatus.CREATED,
-)
+@router.post("/tickets", summary="Create a one-time login", status_code=HTTPStatus.CREATED)
 async def create_invite(body: NewTicket, request: Request, logins: LoginsState) -> TicketView:
     """Create a ticket, valid once and for five minutes. Needs the token; a login is not enough."""
     ticket = logins.tickets.create(_ROLES[body.role])

@@ -10,7 +10,7 @@ from fastapi import APIRouter, Header, Query
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from devices.types import check_user_name
-from service.api.routes.common import ServerState, parse_if_match, problem_responses
+from service.api.routes.common import NO_CONTENT, ServerState, parse_if_match, problem_responses
 from service.protocol.live import NodeView, TareView, View
 from service.server.broadcast.summary import SECONDS_MAX, TILE_QUANTITIES, ForceSpan, round_values
 from service.server.broadcast.views import Page, TaresPage, make_drift_view, make_tare_view
@@ -131,11 +131,7 @@ async def get_scene(node: str, server: ServerState) -> dict[str, Any]:
     return server.nodes.get(node).hello.scene
 
 
-@router.get(
-    "/{node}/history",
-    summary="History of the last minute",
-    responses=_UNKNOWN,
-)
+@router.get("/{node}/history", summary="History of the last minute", responses=_UNKNOWN)
 async def get_history(
     node: str, query: Annotated[RecentQuery, Query()], server: ServerState
 ) -> RecentView:
@@ -183,20 +179,15 @@ def _round_four_digits(values: list[float]) -> list[float | None]:
     "/{node}/tare",
     summary="Tare",
     status_code=HTTPStatus.CREATED,
-    responses={
-        **_UNKNOWN,
-        **problem_responses(
-            _409="The foot is loaded or moves, or the node is not connected.",
-            _412="Another tare is in force than If-Match names.",
-            _507="Disk full.",
-        ),
-    },
+    responses=problem_responses(
+        _UNKNOWN,
+        _409="The foot is loaded or moves, or the node is not connected.",
+        _412="Another tare is in force than If-Match names.",
+        _507="Disk full.",
+    ),
 )
 async def tare_node(
-    node: str,
-    server: ServerState,
-    request: TareRequest | None = None,
-    if_match: InForce = None,
+    node: str, server: ServerState, request: TareRequest | None = None, if_match: InForce = None
 ) -> TareView:
     """Use the newest unloaded quarter of a second of the last ten seconds as the baseline.
 
@@ -223,8 +214,7 @@ async def list_tares(node: str, server: ServerState) -> TaresPage:
 @router.delete(
     "/{node}/tares/{tare_id}",
     summary="Undo a tare",
-    status_code=HTTPStatus.NO_CONTENT,
-    response_model=None,
+    **NO_CONTENT,
     responses=problem_responses(
         _404="No such node, or no such tare that is not undone.",
         _412="Another tare is in force than If-Match names.",
@@ -245,16 +235,13 @@ async def undo_tare(node: str, tare_id: str, server: ServerState, if_match: InFo
 @router.post(
     "/{node}/accept-replacement",
     summary="Accept another machine under the name of a node",
-    status_code=HTTPStatus.NO_CONTENT,
-    response_model=None,
-    responses={
-        **_UNKNOWN,
-        **problem_responses(
-            _409="No machine was refused under this name.",
-            _412="Another machine was refused last.",
-            _507="Disk full.",
-        ),
-    },
+    **NO_CONTENT,
+    responses=problem_responses(
+        _UNKNOWN,
+        _409="No machine was refused under this name.",
+        _412="Another machine was refused last.",
+        _507="Disk full.",
+    ),
 )
 async def accept_replacement(
     node: str, request: AcceptReplacementRequest, server: ServerState

@@ -11,7 +11,13 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 from devices.errors import UsageError
 from service.api.routes.calibrations import Line, check_fits
-from service.api.routes.common import FULL, ServerState, parse_if_match, problem_responses
+from service.api.routes.common import (
+    FULL,
+    NO_CONTENT,
+    ServerState,
+    parse_if_match,
+    problem_responses,
+)
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.dead_weights import TOLERANCE_PERCENT, check_and_label_weights
 from service.protocol.live import View
@@ -256,9 +262,7 @@ class NodeWeighingView(View):
 
 
 @router.get(
-    "",
-    summary="Guided calibration of a node",
-    responses=problem_responses(_404="No such node."),
+    "", summary="Guided calibration of a node", responses=problem_responses(_404="No such node.")
 )
 async def get_weighing(node: str, server: ServerState) -> NodeWeighingView:
     """Return the state of the guided calibration; poll it while one is under way."""
@@ -273,14 +277,12 @@ async def get_weighing(node: str, server: ServerState) -> NodeWeighingView:
     "",
     summary="Start a guided calibration",
     status_code=HTTPStatus.CREATED,
-    responses={
-        **problem_responses(
-            _404="No such node.",
-            _409="One is under way on this node, or the node cannot be recorded now.",
-            _422="A weight is none, they are too few, or there is no such tile.",
-        ),
-        **FULL,
-    },
+    responses=problem_responses(
+        FULL,
+        _404="No such node.",
+        _409="One is under way on this node, or the node cannot be recorded now.",
+        _422="A weight is none, they are too few, or there is no such tile.",
+    ),
 )
 async def start_weighing(node: str, body: StartWeighing, server: ServerState) -> WeighingView:
     """Record, follow the pressure of each tile, mark each weight, and fit: one per node at a time.
@@ -295,7 +297,7 @@ async def start_weighing(node: str, body: StartWeighing, server: ServerState) ->
 @router.post(
     "/repeat",
     summary="Repeat a weight",
-    responses={**_NONE, **problem_responses(_409="It has ended."), **_OTHER, **FULL},
+    responses=problem_responses(_NONE, _OTHER, FULL, _409="It has ended."),
 )
 async def repeat_weight(node: str, server: ServerState, if_match: ThisOne = None) -> WeighingView:
     """Go back to the weight that is held, or else to the last one on this tile."""
@@ -308,9 +310,8 @@ async def repeat_weight(node: str, server: ServerState, if_match: ThisOne = None
 @router.delete(
     "",
     summary="Cancel or close a guided calibration",
-    status_code=HTTPStatus.NO_CONTENT,
-    response_model=None,
-    responses={**_NONE, **_OTHER},
+    **NO_CONTENT,
+    responses=problem_responses(_NONE, _OTHER),
 )
 async def end_weighing(node: str, server: ServerState, if_match: ThisOne = None) -> None:
     """Cancel a running calibration without a fit, or close an ended one; its recording stays."""

@@ -95,11 +95,7 @@ async def list_comparisons(session_id: str, server: ServerState) -> ComparisonsV
     return ComparisonsView(items=await run_in_threadpool(_list_comparisons, session, server))
 
 
-@router.get(
-    "/{session_id}/comparisons/{name}",
-    summary="A comparison",
-    responses=_PROBLEMS,
-)
+@router.get("/{session_id}/comparisons/{name}", summary="A comparison", responses=_PROBLEMS)
 async def get_comparison(session_id: str, name: str, server: ServerState) -> ReportView:
     """Return alignment, figures with their intervals, trials and limits."""
     session = server.sessions.get_session(session_id)

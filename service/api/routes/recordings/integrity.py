@@ -147,13 +147,11 @@ _PARQUET = PARQUET.media_type
     "/{session_id}/clock",
     summary="Clocks",
     response_model=ClockSummary,
-    responses={
-        200: {"description": "Summary, or the stored table.", "content": {_PARQUET: {}}},
-        **problem_responses(
-            _404="No such session, or its clock table is missing.",
-            _409="The table is written when the session is sealed.",
-        ),
-    },
+    responses=problem_responses(
+        {200: {"description": "Summary, or the stored table.", "content": {_PARQUET: {}}}},
+        _404="No such session, or its clock table is missing.",
+        _409="The table is written when the session is sealed.",
+    ),
 )
 async def get_clock(
     session_id: str,
@@ -200,10 +198,7 @@ class VerificationView(Ledger):
     "/{session_id}/verification",
     summary="Verify files",
     response_model=VerificationView,
-    responses=problem_responses(
-        _404="No such session.",
-        _409="The session is not sealed.",
-    ),
+    responses=problem_responses(_404="No such session.", _409="The session is not sealed."),
 )
 async def get_verification(session_id: str, server: ServerState) -> dict[str, Any]:
     """Read all files of a sealed session, and compare them with one another and their hashes.

@@ -14,6 +14,7 @@ from pydantic import BaseModel, Field
 
 from devices.errors import UnknownError, UsageError
 from service.api.routes.common import (
+    UNCHANGED,
     SecondsQuery,
     ServerState,
     has_matching_etag,
@@ -86,15 +87,13 @@ class OverviewView(BaseModel):
     "/{session_id}/timeseries",
     summary="Time series at any zoom",
     response_model=OverviewView,
-    responses={
-        200: {"description": "Bins, in the order of the frames.", "content": {ARROW_STREAM: {}}},
-        304: {"description": "Unchanged."},
-        **problem_responses(
-            _404="No such session, or nothing was recorded.",
-            _409="No frames yet, or damaged ones.",
-            _422="No such column, or a slice that ends before it begins.",
-        ),
-    },
+    responses=problem_responses(
+        {200: {"description": "Bins, in the order of the frames.", "content": {ARROW_STREAM: {}}}},
+        UNCHANGED,
+        _404="No such session, or nothing was recorded.",
+        _409="No frames yet, or damaged ones.",
+        _422="No such column, or a slice that ends before it begins.",
+    ),
 )
 async def get_timeseries(
     session_id: str,

@@ -14,6 +14,7 @@ from devices.types import check_user_name, check_user_text
 from service.api.routes.common import (
     CHANGED,
     FULL,
+    NO_CONTENT,
     IdempotencyKey,
     IfMatch,
     ServerState,
@@ -122,15 +123,13 @@ class ChangeMarker(_Body):
     "",
     summary="Start recording",
     status_code=HTTPStatus.CREATED,
-    responses={
-        **problem_responses(
-            _404="No such node.",
-            _409="The node is not connected, or far behind; or the session of this key is in "
-            "the trash.",
-            _422="Invalid body, or the Idempotency-Key came with another request.",
-        ),
-        **FULL,
-    },
+    responses=problem_responses(
+        FULL,
+        _404="No such node.",
+        _409="The node is not connected, or far behind; or the session of this key is in "
+        "the trash.",
+        _422="Invalid body, or the Idempotency-Key came with another request.",
+    ),
 )
 async def start_session(
     body: StartSession,
@@ -162,9 +161,7 @@ async def start_session(
 
 
 @router.post(
-    "/{session_id}/stop",
-    summary="Stop recording",
-    responses={**_UNKNOWN, **FULL},
+    "/{session_id}/stop", summary="Stop recording", responses=problem_responses(_UNKNOWN, FULL)
 )
 async def stop_session(session_id: str, server: ServerState) -> SessionView:
     """Stop a session now and seal it; answers when it is sealed, or after five seconds.
@@ -184,7 +181,7 @@ async def stop_session(session_id: str, server: ServerState) -> SessionView:
 @router.post(
     "/{session_id}/abandon-missing",
     summary="Seal without what is missing",
-    responses={**_UNKNOWN, **problem_responses(_409="It is not pending."), **FULL},
+    responses=problem_responses(_UNKNOWN, FULL, _409="It is not pending."),
 )
 async def abandon_missing(session_id: str, server: ServerState) -> SessionView:
     """Seal a pending session without its missing frames, because its node never comes back.
@@ -260,11 +257,7 @@ async def list_sessions(
     )
 
 
-@router.get(
-    "/{session_id}",
-    summary="One session",
-    responses=_UNKNOWN,
-)
+@router.get("/{session_id}", summary="One session", responses=_UNKNOWN)
 async def get_session(session_id: str, server: ServerState) -> SessionView:
     """Return the present state of a session."""
     return make_session_view(server.sessions.get_session(session_id), server.recorder)
@@ -273,7 +266,7 @@ async def get_session(session_id: str, server: ServerState) -> SessionView:
 @router.patch(
     "/{session_id}",
     summary="Rename or annotate",
-    responses={**_UNKNOWN, **CHANGED, **FULL},
+    responses=problem_responses(_UNKNOWN, CHANGED, FULL),
 )
 async def change_session(
     session_id: str, body: ChangeSession, server: ServerState, if_match: IfMatch = None
@@ -289,14 +282,8 @@ async def change_session(
 @router.delete(
     "/{session_id}",
     summary="Move to the trash",
-    status_code=HTTPStatus.NO_CONTENT,
-    response_model=None,
-    responses={
-        **_UNKNOWN,
-        **problem_responses(_409="It is being recorded, or sealed."),
-        **CHANGED,
-        **FULL,
-    },
+    **NO_CONTENT,
+    responses=problem_responses(_UNKNOWN, CHANGED, FULL, _409="It is being recorded, or sealed."),
 )
 async def delete_session(session_id: str, server: ServerState, if_match: IfMatch = None) -> None:
     """Move a session to the trash, where it can be restored.
@@ -311,7 +298,7 @@ async def delete_session(session_id: str, server: ServerState, if_match: IfMatch
     "/{session_id}/markers",
     summary="Add a marker",
     status_code=HTTPStatus.CREATED,
-    responses={**_UNKNOWN, **FULL},
+    responses=problem_responses(_UNKNOWN, FULL),
 )
 async def add_marker(session_id: str, body: AddMarker, server: ServerState) -> MarkerView:
     """Add a marker, now or at a given time."""
@@ -322,7 +309,7 @@ async def add_marker(session_id: str, body: AddMarker, server: ServerState) -> M
 @router.patch(
     "/{session_id}/markers/{marker_id}",
     summary="Rename or move a marker",
-    responses={**_NO_EVENT, **CHANGED, **FULL},
+    responses=problem_responses(_NO_EVENT, CHANGED, FULL),
 )
 async def change_marker(
     session_id: str,
@@ -342,9 +329,8 @@ async def change_marker(
 @router.delete(
     "/{session_id}/markers/{marker_id}",
     summary="Delete a marker",
-    status_code=HTTPStatus.NO_CONTENT,
-    response_model=None,
-    responses={**_NO_EVENT, **CHANGED, **FULL},
+    **NO_CONTENT,
+    responses=problem_responses(_NO_EVENT, CHANGED, FULL),
 )
 async def delete_marker(
     session_id: str, marker_id: str, server: ServerState, if_match: IfMatch = None
@@ -357,16 +343,11 @@ async def delete_marker(
     "/{session_id}/markers",
     summary="Markers",
     response_model=Page[MarkerView],
-    responses={
-        200: {
-            "description": "List, or the stored table.",
-            "content": {PARQUET.media_type: {}},
-        },
-        **problem_responses(
-            _404="No such session, or its table is missing.",
-            _409="The table is written when the session is sealed.",
-        ),
-    },
+    responses=problem_responses(
+        {200: {"description": "List, or the stored table.", "content": {PARQUET.media_type: {}}}},
+        _404="No such session, or its table is missing.",
+        _409="The table is written when the session is sealed.",
+    ),
 )
 async def list_markers(
     session_id: str,
@@ -422,11 +403,7 @@ async def restore_session(session_id: str, server: ServerState) -> SessionView:
     return make_session_view(server.recorder.restore_session(session_id), server.recorder)
 
 
-@trash_router.delete(
-    "",
-    summary="Empty the trash",
-    responses=problem_responses(_507="The data folder cannot be written."),
-)
+@trash_router.delete("", summary="Empty the trash", responses=FULL)
 async def empty_trash(server: ServerState) -> Emptied:
     """Delete all sessions in the trash for good."""
     deleted = await server.empty_trash()

@@ -16,7 +16,7 @@ from starlette.concurrency import run_in_threadpool
 
 from devices.arrays import Floats
 from devices.errors import StateError, UnknownError
-from service.api.routes.common import ServerState, has_matching_etag, problem_responses
+from service.api.routes.common import UNCHANGED, ServerState, has_matching_etag, problem_responses
 from service.api.static_files import ARROW_STREAM, accepts_gzip, compress_gzip, encode_arrow_stream
 from service.server.server import Server
 from service.sessions.stances import load_stances, overlay_stances
@@ -62,13 +62,11 @@ class StanceView(BaseModel):
     "/{session_id}/stances",
     summary="Stances",
     response_model=list[StanceView],
-    responses={
-        200: {"description": "All stances, in order of time.", "content": {ARROW_STREAM: {}}},
-        **problem_responses(
-            _404="No such session, nothing was recorded, or it has no estimates.",
-            _409="Stances are counted when the session is sealed.",
-        ),
-    },
+    responses=problem_responses(
+        {200: {"description": "All stances, in order of time.", "content": {ARROW_STREAM: {}}}},
+        _404="No such session, nothing was recorded, or it has no estimates.",
+        _409="Stances are counted when the session is sealed.",
+    ),
 )
 async def get_stances(
     session_id: str,
@@ -142,13 +140,11 @@ class OverlayView(BaseModel):
     "/{session_id}/stances/overlay",
     summary="Overlay of stances",
     response_model=OverlayView,
-    responses={
-        304: {"description": "Unchanged."},
-        **problem_responses(
-            _404="No such session, nothing was recorded, or it has no estimates.",
-            _409="Stances are counted when the session is sealed.",
-        ),
-    },
+    responses=problem_responses(
+        UNCHANGED,
+        _404="No such session, nothing was recorded, or it has no estimates.",
+        _409="Stances are counted when the session is sealed.",
+    ),
 )
 async def get_stances_overlay(
     session_id: str,

@@ -14,6 +14,7 @@ from starlette.concurrency import run_in_threadpool
 
 from devices.errors import StateError
 from service.api.routes.common import (
+    UNCHANGED,
     IdempotencyKey,
     ServerState,
     has_matching_etag,
@@ -112,9 +113,7 @@ async def get_take(take_id: str, server: ServerState) -> TakeView:
 
 
 @router.post(
-    "/{take_id}/stop",
-    summary="Stop all of a take",
-    responses={**_UNKNOWN, **_FAILED},
+    "/{take_id}/stop", summary="Stop all of a take", responses=problem_responses(_UNKNOWN, _FAILED)
 )
 async def stop_take(take_id: str, server: ServerState) -> TakeView:
     """Stop all sessions of a take that are being recorded.
@@ -138,7 +137,7 @@ async def stop_take(take_id: str, server: ServerState) -> TakeView:
     "/{take_id}/markers",
     summary="Add a marker to all of a take",
     status_code=HTTPStatus.CREATED,
-    responses={**_UNKNOWN, **_OVER},
+    responses=problem_responses(_UNKNOWN, _OVER),
 )
 async def mark_take(take_id: str, body: one.AddMarker, server: ServerState) -> TakeView:
     """Add a marker at one time and with one id to all sessions that are being recorded."""
@@ -162,18 +161,18 @@ data_router = APIRouter(prefix="/takes", tags=["data"])
     "/{take_id}/data",
     summary="Download all of a take as one file",
     response_class=Response,
-    responses={
-        200: {
-            "description": "The data.",
-            "content": {FORMATS[name].media_type: {} for name in MULTI_SESSION_FORMATS},
+    responses=problem_responses(
+        {
+            200: {
+                "description": "The data.",
+                "content": {FORMATS[name].media_type: {} for name in MULTI_SESSION_FORMATS},
+            }
         },
-        304: {"description": "Unchanged."},
-        **problem_responses(
-            _404="No such take, or one of its sessions has no frames.",
-            _409="One of its sessions is not sealed.",
-            _422="A format for one session only, or a session that cannot be in it.",
-        ),
-    },
+        UNCHANGED,
+        _404="No such take, or one of its sessions has no frames.",
+        _409="One of its sessions is not sealed.",
+        _422="A format for one session only, or a session that cannot be in it.",
+    ),
 )
 async def get_take_data(
     take_id: str, query: Annotated[TakeDataQuery, Query()], request: Request, server: ServerState

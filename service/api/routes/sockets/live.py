@@ -76,9 +76,7 @@ class LiveFeedSession:
         except UsageError as error:
             raise CloseConnection(LinkCloseCode.POLICY, error.what) from error
         position = check_stream_and_get_requested_position(
-            self._node,
-            query.stream_id,
-            None if query.from_seq is None else int(query.from_seq),
+            self._node, query.stream_id, None if query.from_seq is None else int(query.from_seq)
         )
         node, self._memory = self._node, server.live_feeds.get_or_create(self._node.name)
         self._reader = FeedReader(
