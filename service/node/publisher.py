@@ -69,7 +69,8 @@ class Publisher:
         self._token = token
         self._report = report
         self._last_report = ""
-        self._connected = False
+        self.is_connected = False
+        """True while a server has accepted the node."""
         self._fingerprint = ""
         """Fingerprint of the last used secret."""
         self._is_refused = False
@@ -108,13 +109,8 @@ class Publisher:
                     reason += f" (this machine: {self._fingerprint or 'its disk keeps no secret'})"
                 self._report_change(f"not connected to {self._url}: {reason}; trying again")
                 back_off.set_delays_for(error)
-            self._connected = False
+            self.is_connected = False
             await asyncio.sleep(back_off.next_delay_s())
-
-    @property
-    def is_connected(self) -> bool:
-        """True while a server has accepted the node."""
-        return self._connected
 
     async def _serve_connection(
         self, tcp: sockets.socket, token: str | None, back_off: ReconnectBackoff
@@ -137,7 +133,7 @@ class Publisher:
             self._is_refused = False
             connection = ServerConnection(link, on_acknowledged=back_off.reset)
             self._report_change(f"connected to {self._url}")
-            self._connected = True
+            self.is_connected = True
             await connection.exchange_messages(self._new_stream_began)
             await socket.close(CloseCode.GOING_AWAY, "another stream has begun")
 

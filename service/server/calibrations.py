@@ -339,7 +339,8 @@ class CalibrationJobs:
             with tempfile.TemporaryDirectory(prefix="foottile-fit-") as folder:
                 out = Path(folder) / "calibration.json"
                 await self._run_process(fit, paths, out, options)
-                found = await asyncio.to_thread(_read_result, out)
+                content = await asyncio.to_thread(read_small_file, out)
+                found = await asyncio.to_thread(parse_calibration, content, where=str(out))
                 fit.calibration_id = self._calibrations.save(found).id
             self._finish_job(fit, "done")
         except asyncio.CancelledError:
@@ -400,10 +401,6 @@ class CalibrationJobs:
             fit.log.extend(line.decode(errors="replace")[:1000] for line in lines if line.strip())
         if rest.strip():
             fit.log.append(rest.decode(errors="replace")[:1000])
-
-
-def _read_result(out: Path) -> Calibration:
-    return parse_calibration(read_small_file(out), where=str(out))
 
 
 @dataclass(frozen=True)

@@ -157,11 +157,6 @@ class ServerNode:
         return (*(each.array_info.stream_id for each in self.hello.earlier), self.stream_id)
 
     @property
-    def journals(self) -> dict[str, Journal]:
-        """Journals by stream id, for streams that have sent frames."""
-        return {name: s.journal for name, s in self.streams.items() if s.journal is not None}
-
-    @property
     def journal(self) -> Journal | None:
         """Journal of the present stream; None before its first frame."""
         return self.present_stream.journal

@@ -181,8 +181,4 @@ class TakeRecorder:
 
 
 def _format_errors(failed: dict[str, str]) -> str:
-    return "; ".join(_unique(failed.values()))
-
-
-def _unique(texts: Iterable[str]) -> list[str]:
-    return list(dict.fromkeys(texts))
+    return "; ".join(dict.fromkeys(failed.values()))

@@ -222,14 +222,14 @@ class SessionFrames:
     def __iter__(self) -> Iterator[tuple[FrameBatch, Columns]]:
         if self._inputs.calibration is None:
             self._note_no_estimates(self._inputs.problem)
-            yield from self.iterate_raw_with_part()
+            yield from iterate_raw_frames_with_part(self._inputs)
             return
         try:
             pieces = self._iterate_estimated()
             first = next(pieces, None)
         except FootTileError as error:  # no tare, a calibration of other tiles, no estimator
             self._note_no_estimates(error)
-            yield from self.iterate_raw_with_part()
+            yield from iterate_raw_frames_with_part(self._inputs)
             return
         if first is not None:
             yield first
@@ -252,7 +252,7 @@ class SessionFrames:
             unquantized=sources.unquantized,
         )
         stream = EstimateStream(sources.info, options)
-        for frames, columns in stream.estimate_batches(self.iterate_raw_with_part()):
+        for frames, columns in stream.estimate_batches(iterate_raw_frames_with_part(self._inputs)):
             if not self.notes and stream.plan is not None:
                 self.notes = make_estimate_metadata(stream.plan, stream.rounding, sources.tares)
                 if any(tare.is_lost for tare in sources.tares):
@@ -268,10 +268,6 @@ class SessionFrames:
             self.notes["calibration"] = calibration.model_dump(mode="json")
         if tares:
             self.notes["tares"] = [tare.as_dict() for tare in tares]
-
-    def iterate_raw_with_part(self) -> Iterator[tuple[FrameBatch, Columns]]:
-        """Yield frames with the column `part` only."""
-        return iterate_raw_frames_with_part(self._inputs)
 
 
 def iterate_raw_frames_with_part(

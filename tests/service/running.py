@@ -234,8 +234,8 @@ class Running:
                 await self._stop.wait()
         self.open_journals = []
         for node in self.server.nodes:
-            for journal in node.journals.values():
-                if journal.has_unclosed_segment:
+            for journal in (stream.journal for stream in node.streams.values()):
+                if journal is not None and journal.has_unclosed_segment:
                     self.open_journals.append(journal.folder)
                     journal.close()
         self._left_over = await _left_over()

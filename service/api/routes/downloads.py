@@ -44,7 +44,7 @@ from service.api.routes.exports import (
     require_frames,
 )
 from service.server.server import Server
-from service.sessions.inputs import SessionFrames
+from service.sessions.inputs import iterate_raw_frames_with_part
 from service.sessions.preview import SessionPreview
 from service.sessions.preview_frames import PreviewFrames
 from storage.clock.table import CLOCK_NAME
@@ -179,7 +179,7 @@ def _place_markers(session: Session, query: DataQuery, server: Server) -> Placed
     sources = server.recorder.collect_inputs_from_journals(session.id)
     times = (
         {name: getattr(frames, name) for name in PLACEMENT_COLUMNS} | {"part": columns["part"]}
-        for frames, columns in SessionFrames(sources).iterate_raw_with_part()
+        for frames, columns in iterate_raw_frames_with_part(sources)
     )
     axis = sources.compute_time_axis()
     return place_markers(session.markers, times, sources.make_clock_table(), query.slice, axis=axis)

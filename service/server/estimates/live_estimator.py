@@ -202,10 +202,11 @@ class LiveEstimator:
         previous: LiveEstimator | None = None,
     ) -> None:
         self.calibration_problem: str | None = None
-        self._info = info
+        self.info = info
         self._compensation = Compensation(info.tiles)
         self._is_loaded_tile = np.array([not tile.reference for tile in info.tiles])
-        self._calibration: Calibration | None = None
+        self.calibration: Calibration | None = None
+        """Calibration in use."""
         self.calibration_id: str | None = None
         """Id of the calibration in use: a hash that is slow to compute."""
         self.ranges: TileRanges | None = None
@@ -224,22 +225,12 @@ class LiveEstimator:
         if calibration is not None:
             try:
                 EstimateStream(info, EstimateOptions(calibration, info.models, LIVE_LAG_MS))
-                self._calibration = calibration
+                self.calibration = calibration
                 self.calibration_id = calibration.id
                 self.ranges = TileRanges.from_calibration(info, calibration)
             except FootTileError as error:  # it does not fit these tiles: report it
                 self.calibration_problem = str(error)
         self.set_tare(tare)
-
-    @property
-    def info(self) -> ArrayInfo:
-        """Description of the array."""
-        return self._info
-
-    @property
-    def calibration(self) -> Calibration | None:
-        """Calibration in use."""
-        return self._calibration
 
     @property
     def tare_in_use_unless_lost(self) -> Tare | None:
@@ -253,10 +244,10 @@ class LiveEstimator:
             self._flushed.extend(self._run.flush())
         self.airborne_since_t_ns = None
         self._has_epoch = False
-        if self._calibration is None or tare is None:
+        if self.calibration is None or tare is None:
             self._run = None
             return
-        self._run = EstimateRun(make_live_plan(self._info, self._calibration, tare))
+        self._run = EstimateRun(make_live_plan(self.info, self.calibration, tare))
 
     def drain_frames_from(self, previous: LiveEstimator) -> None:
         """Take the frames of an estimator of the same stream with another calibration, and end it.
@@ -278,7 +269,7 @@ class LiveEstimator:
         if self._run is None:
             if not self._has_epoch:
                 self._has_epoch = True
-                self.epochs.begin_epoch(frames, self._calibration, None)
+                self.epochs.begin_epoch(frames, self.calibration, None)
             yield frames, {}
             return
         if is_compiling():
@@ -289,12 +280,12 @@ class LiveEstimator:
             )
             yield frames, {"gauge_kpa": kpa}
             return
-        assert self._calibration is not None  # noqa: S101  # or there was no run
+        assert self.calibration is not None  # noqa: S101  # or there was no run
         if self._has_epoch:
-            self.epochs.store_state_if_due(frames, last_seq, self._calibration, self._run)
+            self.epochs.store_state_if_due(frames, last_seq, self.calibration, self._run)
         else:
             self._has_epoch = True
-            self.epochs.begin_epoch(frames, self._calibration, self._run.plan.tare)
+            self.epochs.begin_epoch(frames, self.calibration, self._run.plan.tare)
         for due, columns in self._run.feed_frames(frames, {}):
             self._update_contact(due, columns)
             yield due, columns
@@ -317,7 +308,7 @@ class LiveEstimator:
     def mean_recent_temperature_raw(self) -> Floats:
         """Return the mean temperature counts of the last second, per tile; NaN if none was read."""
         if not self._recent:
-            return np.full(len(self._info.tiles), np.nan)
+            return np.full(len(self.info.tiles), np.nan)
         since_t_ns = int(self._recent[-1].t_ns[-1]) - _TADC_OVER_NS
         recent = [*takewhile(lambda each: each.t_ns[-1] >= since_t_ns, reversed(self._recent))]
         temperature_raw = np.concatenate([frames.temperature_raw for frames in recent])
@@ -342,7 +333,7 @@ class LiveEstimator:
             TareError: its frames give no tare, or there is no calibration.
         """
         return compute_recording_tare(
-            lead, self._compensation, self._require_calibration(), self._info.serials
+            lead, self._compensation, self._require_calibration(), self.info.serials
         )
 
     def find_ongoing_flight_or_first_tare(self, anchor: Tare | None) -> FlightTareResult:
@@ -351,7 +342,7 @@ class LiveEstimator:
         Args:
             anchor: tare with which an automatic one is compared; None without a tare.
         """
-        calibration, tare = self._calibration, self.tare_in_use_unless_lost
+        calibration, tare = self.calibration, self.tare_in_use_unless_lost
         if calibration is None or not self._recent or is_compiling():
             return FlightTareResult()
         frames = FrameBatch.concatenate(list(self._recent))
@@ -386,7 +377,7 @@ class LiveEstimator:
         return seen.remove_recovery(tare)
 
     def _tare_frames(self, frames: FrameBatch, calibration: Calibration) -> TareFrames:
-        info = self._info
+        info = self.info
         # While the models are being compiled, an estimate would wait, and the event loop with it.
         removal = (
             None
@@ -396,12 +387,12 @@ class LiveEstimator:
         return TareFrames(frames, self._compensation, calibration, info.serials, removal)
 
     def _require_calibration(self) -> Calibration:
-        if self._calibration is None:
+        if self.calibration is None:
             raise TareError(
                 "without a calibration there is nothing to tare",
                 remedy="Calibrate the tiles and name the calibration in the node's scene",
             )
-        return self._calibration
+        return self.calibration
 
     def _update_contact(self, frames: FrameBatch, columns: Columns) -> None:
         t_ns = frames.t_ns

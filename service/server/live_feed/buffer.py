@@ -67,31 +67,26 @@ class FeedBuffer:
         self._batches: deque[FeedBatch] = deque()
         self._bytes_max = bytes_max
         self._bytes = 0
-        self._next_number = 0
+        self.next_batch_number = 0
         self._waiting: set[asyncio.Event] = set()
 
     @property
     def oldest_batch_number(self) -> int:
         """Number of the oldest batch, or of the next one if the buffer is empty."""
-        return self._next_number - len(self._batches)
+        return self.next_batch_number - len(self._batches)
 
     @property
     def reader_count(self) -> int:
         """Number of present readers."""
         return len(self._waiting)
 
-    @property
-    def next_batch_number(self) -> int:
-        """Number of the next batch."""
-        return self._next_number
-
     def add_batches(self, stream_id: str, batches: list[EstimatedBatch]) -> None:
         """Add due batches, which may be none, and wake all readers."""
         for frames, columns in batches:
             if not len(frames):
                 continue
-            self._batches.append(FeedBatch(self._next_number, stream_id, frames, columns))
-            self._next_number += 1
+            self._batches.append(FeedBatch(self.next_batch_number, stream_id, frames, columns))
+            self.next_batch_number += 1
             self._bytes += _size_bytes(frames, columns)
         while self._bytes > self._bytes_max and len(self._batches) > 1:
             oldest = self._batches.popleft()

@@ -246,7 +246,7 @@ def test_a_bug_in_a_nodes_estimates_costs_only_its_estimates(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     def is_of_bench(estimator: LiveEstimator, _: FrameBatch) -> bool:
-        return estimator._info.node == "bench" and estimator._calibration is not None
+        return estimator.info.node == "bench" and estimator.calibration is not None
 
     estimate = LiveEstimator.estimate_or_pass_frames
     fail = failing_if(is_of_bench, estimate, ZeroDivisionError, "a bug")

@@ -82,8 +82,9 @@ class Told:
         }
 
     def close(self) -> None:
-        for journal in self.node.journals.values():
-            journal.close()
+        for stream in self.node.streams.values():
+            if stream.journal is not None:
+                stream.journal.close()
 
 
 @pytest.fixture
@@ -151,7 +152,8 @@ def test_frames_of_two_streams_in_any_order_and_any_number_of_times_are_each_hel
                 note_acks()
         note_acks()
         for boot in (OLD, NEW):
-            journal = told.node.journals[boot]
+            journal = told.node.streams[boot].journal
+            assert journal is not None
             assert journal.stored == Intervals(whole)
             assert acked[boot] == Intervals(whole)
             found = FrameBatch.concatenate(list(journal.read_frames(0, total)))
@@ -249,7 +251,8 @@ def test_frames_of_an_earlier_stream_are_kept_and_never_shown(told: Told) -> Non
     assert told.take(0, 4) == [0, 1, 2, 3, 4]
     assert told.take(5, 9, OLD) == []
     assert told.node.last_seq == 4
-    assert told.node.journals[OLD].stored == Intervals([(5, 9)])
+    assert (journal := told.node.streams[OLD].journal) is not None
+    assert journal.stored == Intervals([(5, 9)])
 
 
 def test_a_stream_can_come_until_the_node_does_not_mention_it(told: Told) -> None:

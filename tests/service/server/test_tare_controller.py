@@ -53,8 +53,9 @@ class Foot:
         self.node.is_connected = True
 
     def close(self) -> None:
-        for journal in self.node.journals.values():
-            journal.close()
+        for stream in self.node.streams.values():
+            if stream.journal is not None:
+                stream.journal.close()
 
     def frames(
         self,
