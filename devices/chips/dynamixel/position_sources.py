@@ -20,7 +20,6 @@ import threading
 from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import replace
-from types import TracebackType
 from typing import Self
 
 from devices.chips.dynamixel.driver import DynamixelServo, PositionReading
@@ -204,12 +203,7 @@ class ThreadedServoSource(_ServoSourceBase):
         self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stop.set()
         self._thread.join()
 
