@@ -14,10 +14,9 @@ import asyncio
 import random
 import socket
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from contextlib import suppress
 from http import HTTPStatus
-from typing import Any
 from urllib.parse import urlsplit, urlunsplit
 
 from websockets.asyncio.client import ClientConnection
@@ -32,6 +31,7 @@ from service.protocol.codec import (
     LinkCloseCode,
     decode_link_message,
     encode_link_message,
+    run_until_first_ends,
 )
 from service.protocol.link import (
     INGEST_PATH,
@@ -74,7 +74,7 @@ class ServerConnection:
         Raises:
             LinkError, OSError, WebSocketException: the connection is broken.
         """
-        await _run_until_first_ends(
+        await run_until_first_ends(
             self._receive(),
             self._sender.send_frames(),
             self._sender.ping_until_timeout(),
@@ -141,23 +141,6 @@ def parse_server_message(message: str | bytes) -> ServerMessage:
             expected=f"{SUBPROTOCOL} messages",
             remedy="Check that it is a foottile server of the same version",
         ) from error
-
-
-async def _run_until_first_ends(*work: Coroutine[Any, Any, object]) -> None:
-    """Run coroutines concurrently until one ends, cancel the others, and raise its exception.
-
-    Without a TaskGroup: before Python 3.13 a group that ends while its owner is about to resume may
-    leave the owner cancelled (CPython 117407), and a node without its link.
-    """
-    tasks = [asyncio.create_task(each) for each in work]
-    try:
-        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-    for task in done:
-        task.result()
 
 
 CLOCK_INTERVAL_S = 10.0

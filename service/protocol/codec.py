@@ -1,4 +1,4 @@
-"""Encoding of messages, checksums, and the close codes of connections.
+"""Encoding of messages, checksums, and the end of connections: close codes, their tasks.
 
 Every message of the link has a CRC-32 (zlib), because neither websockets nor Arrow detect a
 flipped bit: the last four bytes of a binary message, little endian, over all before; the last field
@@ -8,10 +8,12 @@ wrong CRC-32 ends the connection, and its content is sent again. Live messages h
 
 from __future__ import annotations
 
+import asyncio
 import re
 import zlib
+from collections.abc import Awaitable
 from enum import IntEnum
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -153,3 +155,21 @@ def format_close_reason(text: str) -> str:
     text = strip_private_folders(text)
     plain = "".join(char if char.isprintable() else "?" for char in text[:_REASON_BYTES_MAX])
     return plain.encode()[:_REASON_BYTES_MAX].decode(errors="ignore")
+
+
+async def run_until_first_ends(*work: Awaitable[Any]) -> None:
+    """Run tasks of a connection until one ends, cancel the others, and raise its exception.
+
+    Without a TaskGroup: before Python 3.13 a group that ends while its owner is about to resume may
+    leave the owner cancelled (CPython 117407), and a node without its link.
+    """
+    tasks = [asyncio.ensure_future(each) for each in work]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+    for task in tasks:
+        if task in done:
+            task.result()

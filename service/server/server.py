@@ -62,8 +62,9 @@ class NodeLink:
         self.has_outgoing = asyncio.Event()
         """Event: something has to be sent to the node."""
         self._acks: dict[str, Intervals] = {}
-        self.close_reason: tuple[LinkCloseCode, str] | None = None
-        self.close_requested = asyncio.Event()
+        self.close_requested: asyncio.Future[tuple[LinkCloseCode, str]]
+        """Future with the reason, once the connection has to be closed."""
+        self.close_requested = asyncio.get_running_loop().create_future()
 
     def queue_ack(self, stream_id: str, frames: Intervals) -> None:
         """Queue an acknowledgement: these frames are on the disk."""
@@ -76,9 +77,9 @@ class NodeLink:
         return acks
 
     def request_close(self, code: LinkCloseCode, reason: str) -> None:
-        """Request that the connection is closed."""
-        self.close_reason = self.close_reason or (code, reason)
-        self.close_requested.set()
+        """Request that the connection is closed; the first reason counts."""
+        if not self.close_requested.done():
+            self.close_requested.set_result((code, reason))
 
 
 class DeletedTotals(NamedTuple):

@@ -20,6 +20,7 @@ from service.protocol.codec import (
     decode_link_message,
     encode_link_message,
     format_close_reason,
+    run_until_first_ends,
     strip_binary_crc,
 )
 from service.protocol.link import (
@@ -200,21 +201,11 @@ async def _send_welcome(socket: WebSocket, server: Server, link: NodeLink) -> No
 
 
 async def _run_tasks(socket: WebSocket, server: Server, link: NodeLink) -> None:
-    tasks = [
-        asyncio.create_task(_receive_messages(socket, server, link)),
-        asyncio.create_task(_send_updates(socket, server, link)),
-        asyncio.create_task(link.close_requested.wait()),
-    ]
-    try:
-        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        for task in done:
-            task.result()
-        if link.close_reason is not None:
-            raise CloseConnection(*link.close_reason)
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+    requested = link.close_requested
+    await run_until_first_ends(
+        _receive_messages(socket, server, link), _send_updates(socket, server, link), requested
+    )
+    raise CloseConnection(*requested.result())
 
 
 async def _receive_messages(socket: WebSocket, server: Server, link: NodeLink) -> None:

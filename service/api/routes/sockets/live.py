@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable
 from contextlib import aclosing
 from typing import TypeVar
 
@@ -21,6 +20,7 @@ from service.protocol.codec import (
     decode_message,
     encode_message,
     format_close_reason,
+    run_until_first_ends,
 )
 from service.protocol.link import SUBPROTOCOL
 from service.protocol.live import (
@@ -186,7 +186,7 @@ async def serve_live(socket: WebSocket, server: Server) -> None:
     outlet: Connection = socket.scope["extensions"][SOCKET_EXTENSION]["outlet"]
     try:
         if socket.query_params.get("format") == "arrow":
-            await _run_until_first(
+            await run_until_first_ends(
                 LiveFeedSession(socket, server).send_frames(), _answer_pings(socket)
             )
         else:
@@ -207,23 +207,9 @@ async def _serve_page(socket: WebSocket, server: Server, outlet: Connection) -> 
     outlet.write_framed_unless_closed(encode_websocket_messages([hello]))
     viewer = server.broadcaster.subscribe(outlet, query.rate_hz, query.node)
     try:
-        await _run_until_first(viewer.disconnected, _answer_pings(socket))
+        await run_until_first_ends(viewer.disconnected, _answer_pings(socket))
     finally:
         server.broadcaster.unsubscribe(viewer)
-
-
-async def _run_until_first(*ends: Awaitable[None]) -> None:
-    """Run until the first of these ends, cancel the others, and return its result."""
-    tasks = [asyncio.ensure_future(end) for end in ends]
-    try:
-        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        for task in tasks:
-            if task.done():
-                task.result()
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 def _parse_query(kind: type[_Query], socket: WebSocket) -> _Query:
