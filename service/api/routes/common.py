@@ -5,20 +5,25 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
-from fastapi import Depends, Header, Request
+from anyio import CapacityLimiter, to_thread
+from fastapi import Depends, Header, Request, Response
 from fastapi.responses import FileResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from devices.errors import StateError, UnknownError
 from service.api.problems import MEDIA_TYPE, Problem
+from service.api.static_files import accepts_gzip, compress_gzip
 from service.server.server import Server
+from service.version import SOFTWARE_VERSION
 from storage.formats.slice import SECONDS_MAX
 from storage.formats.writers.tables import PARQUET
 from storage.sessions.folder import IdempotencyRecord, Session
 
+JSON = "application/json"
 _SCHEMA = {"content": {MEDIA_TYPE: {"schema": Problem.model_json_schema()}}}
 Responses = dict[int | str, dict[str, Any]]
 
@@ -46,6 +51,36 @@ def require_file(path: Path) -> Path:
     if not path.is_file():
         raise UnknownError(f"the file {path.name} is missing", where=str(path))
     return path
+
+
+def require_sealed(session: Session, what: str, remedy: str = "Stop it") -> Session:
+    """Return the session if it is sealed, with frames or without.
+
+    Args:
+        session: the session.
+        what: subject and verb of the refusal: "its stances are".
+        remedy: remedy of the refusal.
+
+    Raises:
+        StateError: it is not.
+    """
+    if session.state != "sealed":
+        raise StateError(
+            f"session {session.id} is {session.state}, and {what} available when it is sealed",
+            remedy=remedy,
+        )
+    return session
+
+
+def require_frames(session: Session) -> Session:
+    """Return the session if its frames can be read.
+
+    Raises:
+        UnknownError: it was sealed without frames, or its file is damaged.
+    """
+    if session.state == "sealed" and session.sha256 is None:
+        raise UnknownError(f"session {session.id}: {session.problem}")
+    return session
 
 
 _LAST_MODIFIED_RANGE_S = (-62_135_596_800, 253_402_300_799)
@@ -152,3 +187,37 @@ def make_idempotency_record(
 
 def _digest(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+async def numbers_response(
+    request: Request,
+    make: Callable[[], bytes],
+    limiter: CapacityLimiter,
+    *,
+    sealed_key: str | None,
+    media_type: str = JSON,
+    accept_encoding: str,
+) -> Response:
+    """Answer with numbers, made in a thread; JSON is compressed if the client accepts it.
+
+    Args:
+        request: the request.
+        make: makes the content.
+        limiter: limit of such threads.
+        sealed_key: text that determines the content; None: it is of frames that still come.
+        media_type: media type of the content.
+        accept_encoding: header of the request.
+    """
+    as_gzip = media_type == JSON and accepts_gzip(accept_encoding)
+    headers = {"Cache-Control": "no-store"}
+    if sealed_key is not None:
+        tag = _digest(f"{sealed_key}|{media_type}|{as_gzip}|{SOFTWARE_VERSION}")
+        headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache"}
+        headers |= {"Vary": "Accept, Accept-Encoding"}
+        if has_matching_etag(request, tag):
+            return Response(status_code=304, headers=headers)
+    content = await to_thread.run_sync(make, limiter=limiter)
+    if as_gzip:
+        headers["Content-Encoding"] = "gzip"
+        content = await to_thread.run_sync(compress_gzip, content, limiter=limiter)
+    return Response(content, headers=headers, media_type=media_type)

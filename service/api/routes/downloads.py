@@ -23,7 +23,7 @@ from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import MutableHeaders
 
-from devices.errors import DamagedFileError, StateError, StorageError, UnknownError, UsageError
+from devices.errors import DamagedFileError, StorageError, UsageError
 from service.api.problems import problem_response
 from service.api.routes.common import (
     UNCHANGED,
@@ -32,6 +32,8 @@ from service.api.routes.common import (
     has_matching_etag,
     problem_responses,
     require_file,
+    require_frames,
+    require_sealed,
 )
 from service.api.routes.exports import (
     Chunks,
@@ -41,7 +43,6 @@ from service.api.routes.exports import (
     iterate_chunks,
     make_file_stem,
     marker_headers,
-    require_frames,
 )
 from service.server.server import Server
 from service.sessions.inputs import iterate_raw_frames_with_part
@@ -104,13 +105,10 @@ async def get_data(
     ledger = server.recorder.get_ledger(session_id)
     complete = "lossy" if ledger.lossy else str(ledger.complete).lower()
     headers = {"Foottile-Complete": complete}
-    if session.state != "sealed" and query.format_spec.needs_sealed:
-        others = [each.name for each in FORMATS.values() if not each.needs_sealed]
-        raise StateError(
-            f"session {session_id} is {session.state}, and {query.format_spec.title} is available "
-            "when it is sealed",
-            remedy=f"Stop it, or ask for format={' or '.join(others)}",
-        )
+    if query.format_spec.needs_sealed:
+        others = " or ".join(each.name for each in FORMATS.values() if not each.needs_sealed)
+        remedy = f"Stop it, or ask for format={others}"
+        require_sealed(session, f"{query.format_spec.title} is", remedy)
     if session.sha256 is not None and query.is_stored:
         return _stored_response(session, session.sha256, request, server, headers)
     return await _export_response(session, query, request, server, headers)
@@ -320,7 +318,7 @@ async def zip_sessions(
     if not 1 <= len(names) <= IDS_MAX:
         raise UsageError(f"{len(names)} sessions", expected=f"ids of 1 to {IDS_MAX}")
     chosen = [
-        _require_sealed(server.sessions.get_session(name), server.sessions.folder.get_path(name))
+        _require_files(server.sessions.get_session(name), server.sessions.folder.get_path(name))
         for name in names
     ]
     name = names[0] if len(names) == 1 else f"foottile-{len(names)}-sessions"
@@ -336,13 +334,8 @@ async def zip_sessions(
     )
 
 
-def _require_sealed(session: Session, folder: Path) -> ZippedSession:
-    if session.state != "sealed":
-        raise StateError(
-            f"session {session.id} is {session.state}, and a zip file has sealed ones only",
-            remedy="Stop it, or leave it out",
-        )
-    if session.sha256 is None:
-        raise UnknownError(f"session {session.id}: {session.problem}")
+def _require_files(session: Session, folder: Path) -> ZippedSession:
+    require_frames(require_sealed(session, "a zip file of it is", "Stop it, or leave it out"))
+    assert session.sha256 is not None  # noqa: S101  # it has frames
     require_file(folder / FRAMES_NAME)
     return ZippedSession(folder, session.sha256)

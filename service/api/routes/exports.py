@@ -12,7 +12,7 @@ from fastapi.responses import StreamingResponse
 from pydantic import Field
 from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 
-from devices.errors import UnknownError, UsageError
+from devices.errors import UsageError
 from service.api.routes.common import SecondsQuery
 from service.server.server import Server
 from service.version import SOFTWARE_VERSION
@@ -127,17 +127,6 @@ class TakeDataQuery(ExportQuery):
 Chunks = Generator[bytes, None, None]
 _NOT_IN_NAMES = re.compile(r"[^A-Za-z0-9.-]+")
 _NAME_LENGTH = 60
-
-
-def require_frames(session: Session) -> Session:
-    """Return the session if its frames can be read.
-
-    Raises:
-        UnknownError: it was sealed without frames, or its file is damaged.
-    """
-    if session.state == "sealed" and session.sha256 is None:
-        raise UnknownError(f"session {session.id}: {session.problem}")
-    return session
 
 
 async def compute_export_etag(session: Session, query: ExportQuery, server: Server) -> str:

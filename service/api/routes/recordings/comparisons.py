@@ -12,8 +12,8 @@ from fastapi import APIRouter, Query, Response
 from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 
-from devices.errors import FileFormatError, StateError, UnknownError, UsageError
-from service.api.routes.common import SecondsQuery, ServerState, problem_responses
+from devices.errors import FileFormatError, UnknownError, UsageError
+from service.api.routes.common import SecondsQuery, ServerState, problem_responses, require_sealed
 from service.api.static_files import encode_columns_json
 from service.server.server import Server
 from service.sessions.overview import POINTS_MAX
@@ -114,9 +114,7 @@ async def get_comparison_series(
     session_id: str, name: str, query: Annotated[SeriesQuery, Query()], server: ServerState
 ) -> Response:
     """Return minimum and maximum of the reference, and of ours minus it, aligned in time."""
-    session = server.sessions.get_session(session_id)
-    if session.state != "sealed":
-        raise StateError(f"session {session_id} is {session.state}", remedy="Stop it")
+    session = require_sealed(server.sessions.get_session(session_id), "the reference is")
     make = partial(_run_with_usage_errors, partial(_encode_series, session, name, query, server))
     content = await to_thread.run_sync(make, limiter=_ONE_AT_A_TIME)
     return Response(content, media_type="application/json")

@@ -10,12 +10,14 @@ from fastapi import APIRouter, Response
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
-from devices.errors import FileFormatError, FootTileError, StateError, UnknownError
+from devices.errors import FileFormatError, FootTileError, UnknownError
 from devices.frames import ArrayInfo, ServoInfo
 from service.api.routes.common import (
     ServerState,
     problem_responses,
     require_file,
+    require_frames,
+    require_sealed,
     stored_table_response,
 )
 from service.estimation import LIVE_LAG_MS
@@ -71,9 +73,7 @@ class ArrayView(View):
 )
 async def list_tiles(session_id: str, server: ServerState) -> ArrayView:
     """Return the tiles' positions and ranges, and the look-ahead of the estimates."""
-    session = server.sessions.get_session(session_id)
-    if session.state == "sealed" and session.sha256 is None:
-        raise UnknownError(f"session {session_id}: {session.problem}")
+    session = require_frames(server.sessions.get_session(session_id))
     if session.state == "sealed":
         return await run_in_threadpool(_read_sealed_array, session_id, server)
     sources = server.recorder.collect_inputs_from_journals(session_id)
@@ -207,12 +207,7 @@ async def get_verification(session_id: str, server: ServerState) -> dict[str, An
     one after the other. This proves nothing about the server itself: `foottile pull` and `foottile
     verify` do the same on another machine.
     """
-    session = server.sessions.get_session(session_id)
-    if session.state != "sealed":
-        raise StateError(
-            f"session {session_id} is {session.state}, and can be verified when it is sealed",
-            remedy="Stop it",
-        )
+    require_sealed(server.sessions.get_session(session_id), "verification is")
     read = partial(verify_session, server.sessions.folder.get_path(session_id))
     try:
         report = await to_thread.run_sync(read, limiter=_ONE_AT_A_TIME)

@@ -2,34 +2,29 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from functools import partial
 from typing import Annotated
 
 import pyarrow as pa
-from anyio import CapacityLimiter, to_thread
+from anyio import CapacityLimiter
 from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import BaseModel, Field
 
-from devices.errors import UnknownError, UsageError
+from devices.errors import UsageError
 from service.api.routes.common import (
+    JSON,
     UNCHANGED,
     SecondsQuery,
     ServerState,
-    has_matching_etag,
+    numbers_response,
     problem_responses,
+    require_frames,
 )
-from service.api.static_files import (
-    ARROW_STREAM,
-    accepts_gzip,
-    compress_gzip,
-    encode_arrow_stream,
-    encode_columns_json,
-)
+from service.api.static_files import ARROW_STREAM, encode_arrow_stream, encode_columns_json
 from service.server.server import Server
+from service.sessions.inputs import SessionInputs
 from service.sessions.overview import POINTS_MAX, BinnedSlice, bin_from_overview_or_rebuild
-from service.version import SOFTWARE_VERSION
 from storage.formats.slice import Slice
 from storage.schema import Array
 from storage.sessions.folder import Session
@@ -109,51 +104,34 @@ async def get_timeseries(
     session has its present frames, `provisional`: some ten thousand bins, with more frames each the
     longer it is.
     """
-    session = server.sessions.get_session(session_id)
-    if session.state == "sealed" and session.sha256 is None:
-        raise UnknownError(f"session {session_id}: {session.problem}")
-    as_arrow = ARROW_STREAM in accept
-    as_gzip = not as_arrow and accepts_gzip(accept_encoding)
+    session = require_frames(server.sessions.get_session(session_id))
+    media_type = ARROW_STREAM if ARROW_STREAM in accept else JSON
     if session.sha256 is None:
-        return await _preview_response(session, query, server, as_arrow=as_arrow, as_gzip=as_gzip)
-    server.previews.discard(session_id)
-    etag_input = (
-        f"{session.sha256}|{query.model_dump_json()}|{as_arrow}|{as_gzip}|{SOFTWARE_VERSION}"
+        sources = server.recorder.collect_inputs_from_journals(session.id)
+        make, key = partial(_encode_preview, session, query, server, sources, media_type), None
+    else:
+        server.previews.discard(session_id)
+        make = partial(_encode_sealed, session, query, server, media_type)
+        key = f"{session.sha256}|{query.model_dump_json()}"
+    return await numbers_response(
+        *(request, make, _ONE_AT_A_TIME),
+        sealed_key=key,
+        media_type=media_type,
+        accept_encoding=accept_encoding,
     )
-    tag = hashlib.sha256(etag_input.encode()).hexdigest()
-    headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache"}
-    headers |= {"Vary": "Accept, Accept-Encoding"}
-    if has_matching_etag(request, tag):
-        return Response(status_code=304, headers=headers)
-    make = partial(_encode_sealed, session, query, server, as_arrow=as_arrow, as_gzip=as_gzip)
-    content = await to_thread.run_sync(make, limiter=_ONE_AT_A_TIME)
-    if as_gzip:
-        headers |= {"Content-Encoding": "gzip"}
-    media_type = ARROW_STREAM if as_arrow else "application/json"
-    return Response(content, headers=headers, media_type=media_type)
 
 
-async def _preview_response(
-    session: Session, query: OverviewQuery, server: Server, *, as_arrow: bool, as_gzip: bool
-) -> Response:
-    sources = server.recorder.collect_inputs_from_journals(session.id)
-    part = Slice(query.start_s, query.end_s)
-
-    def make() -> bytes:
-        so_far = server.previews.advance_preview_within_time_limit(sources)
-        seen, serials = so_far.get_bins(part, query.points), list(sources.info.serials)
-        flags = {"provisional": True, "catching_up": so_far.is_catching_up}
-        return _encode(session, seen, serials, flags, query, as_arrow=as_arrow, as_gzip=as_gzip)
-
-    content = await to_thread.run_sync(make, limiter=_ONE_AT_A_TIME)
-    headers = {"Cache-Control": "no-store"} | ({"Content-Encoding": "gzip"} if as_gzip else {})
-    return Response(
-        content, headers=headers, media_type=ARROW_STREAM if as_arrow else "application/json"
-    )
+def _encode_preview(
+    session: Session, query: OverviewQuery, server: Server, sources: SessionInputs, media_type: str
+) -> bytes:
+    so_far = server.previews.advance_preview_within_time_limit(sources)
+    seen = so_far.get_bins(Slice(query.start_s, query.end_s), query.points)
+    flags = {"provisional": True, "catching_up": so_far.is_catching_up}
+    return _encode(session, seen, list(sources.info.serials), flags, query, media_type)
 
 
 def _encode_sealed(
-    session: Session, query: OverviewQuery, server: Server, *, as_arrow: bool, as_gzip: bool
+    session: Session, query: OverviewQuery, server: Server, media_type: str
 ) -> bytes:
     assert session.sha256 is not None  # noqa: S101  # asked before
     part = Slice(query.start_s, query.end_s)
@@ -163,7 +141,7 @@ def _encode_sealed(
         )
         serials = list(reader.info.serials)
     flags = {"provisional": False, "catching_up": False}
-    return _encode(session, seen, serials, flags, query, as_arrow=as_arrow, as_gzip=as_gzip)
+    return _encode(session, seen, serials, flags, query, media_type)
 
 
 def _encode(
@@ -172,9 +150,7 @@ def _encode(
     serials: list[str],
     remarks: dict[str, bool],
     query: OverviewQuery,
-    *,
-    as_arrow: bool,
-    as_gzip: bool,
+    media_type: str,
 ) -> bytes:
     columns = _select_columns(_times_to_seconds(seen), query.columns)
     about = {
@@ -186,9 +162,8 @@ def _encode(
         "serials": serials,
         **remarks,
     }
-    if not as_arrow:
-        text = encode_columns_json(about, columns)
-        return compress_gzip(text) if as_gzip else text
+    if media_type != ARROW_STREAM:
+        return encode_columns_json(about, columns)
     metadata = {"foottile.overview": json.dumps(about)}
     table = pa.table({name: pa.array(v) for name, v in columns.items()}, metadata=metadata)
     return encode_arrow_stream(table)

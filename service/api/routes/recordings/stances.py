@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
-from anyio import CapacityLimiter, to_thread
+from anyio import CapacityLimiter
 from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
 from devices.arrays import Floats
-from devices.errors import StateError, UnknownError
-from service.api.routes.common import UNCHANGED, ServerState, has_matching_etag, problem_responses
-from service.api.static_files import ARROW_STREAM, accepts_gzip, compress_gzip, encode_arrow_stream
+from service.api.routes.common import (
+    UNCHANGED,
+    ServerState,
+    numbers_response,
+    problem_responses,
+    require_frames,
+    require_sealed,
+)
+from service.api.static_files import ARROW_STREAM, encode_arrow_stream
 from service.server.server import Server
 from service.sessions.stances import load_stances, overlay_stances
-from service.version import SOFTWARE_VERSION
 from storage.sessions.folder import Session
 
 router = APIRouter(prefix="/sessions", tags=["sessions"])
@@ -77,7 +81,7 @@ async def get_stances(
 
     Missing stances are computed from the frames.
     """
-    session = _require_sealed(session_id, server)
+    session = _get_sealed_with_frames(session_id, server)
     folder = server.sessions.folder.get_path(session_id)
     table = await run_in_threadpool(load_stances, folder, frames_sha256=session.sha256)
     if ARROW_STREAM in accept:
@@ -159,32 +163,17 @@ async def get_stances_overlay(
 
     Values between two frames are interpolated linearly.
     """
-    session = _require_sealed(session_id, server)
-    as_gzip = accepts_gzip(accept_encoding)
-    etag_input = f"{session.sha256}|{query.model_dump_json()}|{as_gzip}|{SOFTWARE_VERSION}"
-    tag = hashlib.sha256(etag_input.encode()).hexdigest()
-    headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache", "Vary": "Accept-Encoding"}
-    if has_matching_etag(request, tag):
-        return Response(status_code=304, headers=headers)
+    session = _get_sealed_with_frames(session_id, server)
     make = partial(_encode_overlay, session, query, server)
-    content = await to_thread.run_sync(make, limiter=_ONE_AT_A_TIME)
-    if as_gzip:
-        headers["Content-Encoding"] = "gzip"
-        content = compress_gzip(content)
-    return Response(content, headers=headers, media_type="application/json")
+    key = f"{session.sha256}|{query.model_dump_json()}"
+    return await numbers_response(
+        request, make, _ONE_AT_A_TIME, sealed_key=key, accept_encoding=accept_encoding
+    )
 
 
-def _require_sealed(session_id: str, server: Server) -> Session:
+def _get_sealed_with_frames(session_id: str, server: Server) -> Session:
     session = server.sessions.get_session(session_id)
-    if session.state != "sealed":
-        raise StateError(
-            f"session {session_id} is {session.state}, and its stances are available when it is "
-            "sealed",
-            remedy="Stop it",
-        )
-    if session.sha256 is None:
-        raise UnknownError(f"session {session_id}: {session.problem}")
-    return session
+    return require_frames(require_sealed(session, "its stances are"))
 
 
 def _encode_overlay(session: Session, query: OverlayQuery, server: Server) -> bytes:

@@ -20,6 +20,7 @@ from service.api.routes.common import (
     has_matching_etag,
     make_idempotency_record,
     problem_responses,
+    require_frames,
 )
 from service.api.routes.exports import (
     Chunks,
@@ -28,7 +29,6 @@ from service.api.routes.exports import (
     export_response,
     make_file_stem,
     marker_headers,
-    require_frames,
 )
 from service.api.routes.recordings import sessions as one
 from service.protocol.live import SessionView, View
