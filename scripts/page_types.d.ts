@@ -32,6 +32,14 @@ type BandView = {
   half_width_n: number;
 };
 
+type BinsView = {
+  session_id: string;
+  begin_t_ns: number;
+  duration_s: number;
+  frames_in_bin: number;
+  columns: Record<string, Array<number | null>>;
+};
+
 type CalibrationSummaryView = {
   id: string;
   name: string;
@@ -306,11 +314,11 @@ type OverviewView = {
   begin_t_ns: number;
   duration_s: number;
   frames_in_bin: number;
+  columns: Record<string, Array<number | null>>;
   time_axis: Array<PartShift>;
   serials: Array<string>;
   provisional: boolean;
   catching_up: boolean;
-  columns: Record<string, Array<number | null>>;
 };
 
 type PageHello = {
@@ -434,14 +442,6 @@ type RouteView = {
   href: string;
   operation: string;
   summary: string;
-};
-
-type SeriesView = {
-  session_id: string;
-  begin_t_ns: number;
-  duration_s: number;
-  frames_in_bin: number;
-  columns: Record<string, Array<number | null>>;
 };
 
 type ServoInfo = {

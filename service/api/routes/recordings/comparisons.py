@@ -13,10 +13,15 @@ from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 
 from devices.errors import FileFormatError, UnknownError, UsageError
-from service.api.routes.common import SecondsQuery, ServerState, problem_responses, require_sealed
+from service.api.routes.common import ServerState, problem_responses, require_sealed
+from service.api.routes.recordings.overview import (
+    BinsView,
+    PointsQuery,
+    describe_bins,
+    times_to_seconds,
+)
 from service.api.static_files import encode_columns_json
 from service.server.server import Server
-from service.sessions.overview import POINTS_MAX
 from service.user_folders import PublicText
 from storage.formats.slice import Slice
 from storage.sessions.comparisons import (
@@ -64,26 +69,6 @@ class ReportView(ComparisonView):
     report: dict[str, Any] = Field(description="Content of `compare.json`.")
 
 
-class SeriesQuery(SecondsQuery):
-    """Time interval and resolution."""
-
-    points: Annotated[int, Field(ge=1, le=POINTS_MAX)] = Field(
-        default=1000,
-        description="Least number of bins, if there are as many frames; at most four times as "
-        "many.",
-    )
-
-
-class SeriesView(BaseModel):
-    """Reference in bins of consecutive frames, as overviews are; unknown values are null."""
-
-    session_id: str
-    begin_t_ns: int = Field(description="`t_ns` of the session's first frame.")
-    duration_s: float = Field(description="From its first frame to its last.")
-    frames_in_bin: int = Field(description="Frames per bin; 1: each bin is a frame.")
-    columns: dict[str, list[float | int | None]]
-
-
 @router.get(
     "/{session_id}/comparisons",
     summary="Comparisons",
@@ -107,11 +92,11 @@ async def get_comparison(session_id: str, name: str, server: ServerState) -> Rep
 @router.get(
     "/{session_id}/comparisons/{name}/series",
     summary="The reference at any zoom",
-    response_model=SeriesView,
+    response_model=BinsView,
     responses=_PROBLEMS,
 )
 async def get_comparison_series(
-    session_id: str, name: str, query: Annotated[SeriesQuery, Query()], server: ServerState
+    session_id: str, name: str, query: Annotated[PointsQuery, Query()], server: ServerState
 ) -> Response:
     """Return minimum and maximum of the reference, and of ours minus it, aligned in time."""
     session = require_sealed(server.sessions.get_session(session_id), "the reference is")
@@ -175,7 +160,7 @@ def _make_report(session: Session, name: str, server: Server) -> ReportView:
     )
 
 
-def _encode_series(session: Session, name: str, query: SeriesQuery, server: Server) -> bytes:
+def _encode_series(session: Session, name: str, query: PointsQuery, server: Server) -> bytes:
     cached = server.comparison_series.get_or_read(
         find_comparison_folder(server.sessions.folder.get_path(session.id), name)
     )
@@ -189,14 +174,6 @@ def _encode_series(session: Session, name: str, query: SeriesQuery, server: Serv
     part = Slice(query.start_s, query.end_s)
     bins, size = cached.get_bins(*part.compute_bounds_ns(begin_ns), query.points)
     columns = {column: values for column, values in bins.items() if column != "part"}
-    times = {
-        f"t_{which}_s": (columns.pop(f"t_{which}_ns") - begin_ns) * 1e-9
-        for which in ("first", "last")
-    }
-    metadata = {
-        "session_id": session.id,
-        "begin_t_ns": begin_ns,
-        "duration_s": (end_ns - begin_ns) * 1e-9,
-        "frames_in_bin": size,
-    }
-    return encode_columns_json(metadata, times | columns)
+    return encode_columns_json(
+        describe_bins(session, begin_ns, end_ns, size), times_to_seconds(columns, begin_ns)
+    )

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 import pyarrow as pa
 from anyio import CapacityLimiter
@@ -36,14 +37,19 @@ _ONE_AT_A_TIME = CapacityLimiter(1)
 """One thread: each thread that makes overviews keeps memory, and each takes milliseconds."""
 
 
-class OverviewQuery(SecondsQuery):
-    """Time interval, resolution and columns."""
+class PointsQuery(SecondsQuery):
+    """Time interval and resolution."""
 
     points: Annotated[int, Field(ge=1, le=POINTS_MAX)] = Field(
         default=1000,
         description="Least number of bins, if there are as many frames; at most four times as "
         "many.",
     )
+
+
+class OverviewQuery(PointsQuery):
+    """Time interval, resolution and columns."""
+
     columns: str | None = Field(
         default=None,
         description="Prefixes of names, comma-separated; `t_first_s` and `t_last_s` always.",
@@ -62,20 +68,25 @@ class PartShift(BaseModel):
     )
 
 
-class OverviewView(BaseModel):
+class BinsView(BaseModel):
     """Bins of consecutive frames (docs/api.md); unknown values are null."""
 
     session_id: str
     begin_t_ns: int = Field(description="`t_ns` of the session's first frame.")
     duration_s: float = Field(description="From the first frame to the last.")
     frames_in_bin: int = Field(description="Frames per bin; 1: each bin is a frame.")
+    columns: dict[str, list[float | int | None]]
+
+
+class OverviewView(BinsView):
+    """Bins of every column (docs/api.md); unknown values are null."""
+
     time_axis: list[PartShift] = Field(
         description="Shift of each part; all 0 unless the node's date was set between two."
     )
     serials: list[str] = Field(description="Serials of the tiles, in the order of the columns.")
     provisional: bool = Field(description="True: not sealed; frames and tares may still come.")
     catching_up: bool = Field(description="True: there are more frames; request again.")
-    columns: dict[str, list[float | int | None]]
 
 
 @router.get(
@@ -152,12 +163,8 @@ def _encode(
     query: OverviewQuery,
     media_type: str,
 ) -> bytes:
-    columns = _select_columns(_times_to_seconds(seen), query.columns)
-    about = {
-        "session_id": session.id,
-        "begin_t_ns": seen.begin_ns,
-        "duration_s": (seen.end_ns - seen.begin_ns) * 1e-9,
-        "frames_in_bin": seen.frames_per_bin,
+    columns = _select_columns(times_to_seconds(seen.bins, seen.begin_ns), query.columns)
+    about = describe_bins(session, seen.begin_ns, seen.end_ns, seen.frames_per_bin) | {
         "time_axis": seen.time_axis.to_json_list(),
         "serials": serials,
         **remarks,
@@ -169,15 +176,22 @@ def _encode(
     return encode_arrow_stream(table)
 
 
-def _times_to_seconds(seen: BinnedSlice) -> dict[str, Array]:
-    """Convert times to seconds after the first frame: JSON has no integers of that size."""
-    bins = dict(seen.bins)
-    times = {
-        f"{name.removesuffix('_ns')}_s": (bins.pop(name) - seen.begin_ns) * 1e-9
-        for name in seen.bins
-        if name.endswith("_ns")
+def describe_bins(session: Session, begin_ns: int, end_ns: int, size: int) -> dict[str, Any]:
+    """Return the fields of a `BinsView` but its columns."""
+    return {
+        "session_id": session.id,
+        "begin_t_ns": begin_ns,
+        "duration_s": (end_ns - begin_ns) * 1e-9,
+        "frames_in_bin": size,
     }
-    return times | bins
+
+
+def times_to_seconds(bins: Mapping[str, Array], begin_ns: int) -> dict[str, Array]:
+    """Convert times to seconds after the first frame: JSON has no integers of that size."""
+    times = [name for name in bins if name.endswith("_ns")]
+    return {f"{name.removesuffix('_ns')}_s": (bins[name] - begin_ns) * 1e-9 for name in times} | {
+        name: values for name, values in bins.items() if name not in times
+    }
 
 
 def _select_columns(columns: dict[str, Array], wanted: str | None) -> dict[str, Array]:
