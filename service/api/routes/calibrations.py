@@ -7,15 +7,16 @@ from typing import Annotated, Literal
 
 from fastapi import APIRouter, Header, Request, Response
 from fastapi.concurrency import run_in_threadpool
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import Field, StringConstraints
 
 from devices.clock import server_utc_ns
 from devices.errors import CalibrationError, FootTileError, UsageError
-from devices.types import check_user_name
+from devices.types import StrictModel
 from service.api.routes.common import (
     FULL,
     NO_CONTENT,
     UNCHANGED,
+    Name,
     ServerState,
     has_matching_etag,
     parse_if_match,
@@ -39,24 +40,17 @@ _NO_CALIBRATION = "none"
 _UNKNOWN = problem_responses(_404="No such calibration.", _409="Its file is damaged.")
 _NO_NODE = problem_responses(_404="No such node.")
 
-Line = Annotated[
-    str,
-    StringConstraints(strip_whitespace=True, min_length=1, max_length=200),
-    AfterValidator(check_user_name),
-]
 SessionId = Annotated[str, StringConstraints(max_length=100)]
 
 
-class StartFit(BaseModel):
+class StartFit(StrictModel):
     """Request to fit a calibration."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     sessions: Annotated[tuple[SessionId, ...], Field(min_length=1, max_length=JOB_SESSIONS_MAX)] = (
         Field(description="Test-rig recordings; repeats of a tile may be spread over several.")
     )
-    name: Line = Field(examples=["left leg, November"])
-    reference: Line = Field(default="not stated", description="Force sensor.")
+    name: Name = Field(examples=["left leg, November"])
+    reference: Name = Field(default="not stated", description="Force sensor.")
     reference_delay_ms: Annotated[float, Field(ge=-1000, le=1000, strict=True)] | None = Field(
         default=None,
         description="Delay of its readings; unknown if left out, which increases the uncertainty.",
@@ -80,10 +74,8 @@ class FitView(View):
     problem: PublicText | None = Field(description="Reason of a failure.")
 
 
-class AssignCalibration(BaseModel):
+class AssignCalibration(StrictModel):
     """Request to assign a calibration to a node."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     id: Annotated[str, StringConstraints(max_length=100)] = Field(
         description="Id of a calibration on the server."

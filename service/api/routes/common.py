@@ -12,9 +12,10 @@ from typing import Annotated, Any
 from anyio import CapacityLimiter, to_thread
 from fastapi import Depends, Header, Request, Response
 from fastapi.responses import FileResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, Field, StringConstraints
 
 from devices.errors import StateError, UnknownError
+from devices.types import StrictModel, check_user_name
 from service.api.problems import MEDIA_TYPE, Problem
 from service.api.static_files import accepts_gzip, compress_gzip
 from service.server.server import Server
@@ -119,15 +120,13 @@ def _server(request: Request) -> Server:
     return server
 
 
-class SecondsQuery(BaseModel):
+class SecondsQuery(StrictModel):
     """Time interval of a session."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    start_s: Annotated[float, Field(ge=0, le=SECONDS_MAX, allow_inf_nan=False)] | None = Field(
+    start_s: Annotated[float, Field(ge=0, le=SECONDS_MAX)] | None = Field(
         default=None, description="Seconds after the first frame."
     )
-    end_s: Annotated[float, Field(gt=0, le=SECONDS_MAX, allow_inf_nan=False)] | None = Field(
+    end_s: Annotated[float, Field(gt=0, le=SECONDS_MAX)] | None = Field(
         default=None, description="End, not included, in seconds after the first frame."
     )
 
@@ -139,6 +138,12 @@ def has_matching_etag(request: Request, tag: str) -> bool:
 
 
 ServerState = Annotated[Server, Depends(_server)]
+Name = Annotated[
+    str,
+    StringConstraints(strip_whitespace=True, min_length=1, max_length=200),
+    AfterValidator(check_user_name),
+]
+"""Name in one line."""
 
 CHANGED = problem_responses(_412="It was changed meanwhile: its revision is not that in If-Match.")
 UNCHANGED: Responses = {304: {"description": "Unchanged."}}

@@ -6,10 +6,11 @@ from http import HTTPStatus
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Request, Response
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import Field, StringConstraints
 from starlette.exceptions import HTTPException
 
 from devices.clock import server_utc_ns
+from devices.types import StrictModel
 from service.api.access import LOGIN_S, TICKET_S, Logins, Role, cookie_name
 from service.api.routes.common import NO_CONTENT
 from service.protocol.live import View
@@ -38,18 +39,14 @@ class LoginView(View):
     ends_t_ns: int | None = Field(description="End of the login, server's UTC.")
 
 
-class LogIn(BaseModel):
+class LogIn(StrictModel):
     """Ticket of a login; the token is sent as `Authorization` instead."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     ticket: Annotated[str, StringConstraints(max_length=100)] | None = None
 
 
-class NewTicket(BaseModel):
+class NewTicket(StrictModel):
     """Role of a new ticket."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     role: RoleName = Field(default="operator", description="Role of the login.")
 

@@ -7,9 +7,9 @@ from math import isfinite
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Header, Query
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, Field
 
-from devices.types import check_user_name
+from devices.types import StrictModel, check_user_name
 from service.api.routes.common import NO_CONTENT, ServerState, parse_if_match, problem_responses
 from service.protocol.live import NodeView, TareView, View
 from service.server.broadcast.summary import SECONDS_MAX, TILE_QUANTITIES, ForceSpan, round_values
@@ -22,10 +22,8 @@ from service.sessions.tares import REASON_LENGTH_MAX
 router = APIRouter(prefix="/nodes", tags=["nodes"])
 
 
-class TareRequest(BaseModel):
+class TareRequest(StrictModel):
     """Options of a tare."""
-
-    model_config = ConfigDict(extra="forbid")
 
     reason: Annotated[str, AfterValidator(check_user_name)] = Field(
         default="",
@@ -34,10 +32,8 @@ class TareRequest(BaseModel):
     )
 
 
-class AcceptReplacementRequest(BaseModel):
+class AcceptReplacementRequest(StrictModel):
     """Fingerprint of the accepted machine."""
-
-    model_config = ConfigDict(extra="forbid")
 
     fingerprint: str = Field(
         pattern=r"^[0-9a-f]{4}(-[0-9a-f]{4}){3}$",
@@ -45,12 +41,10 @@ class AcceptReplacementRequest(BaseModel):
     )
 
 
-class RecentQuery(BaseModel):
+class RecentQuery(StrictModel):
     """Time interval of the history."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    seconds: Annotated[float, Field(gt=0, le=SECONDS_MAX, allow_inf_nan=False)] = Field(
+    seconds: Annotated[float, Field(gt=0, le=SECONDS_MAX)] = Field(
         default=10.0, description="Length of the interval, back from the newest frame."
     )
     before_seq: Annotated[int, Field(ge=0, lt=2**53)] | None = Field(

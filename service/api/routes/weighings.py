@@ -7,13 +7,15 @@ from math import isfinite
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Header
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import Field, StringConstraints
 
 from devices.errors import UsageError
-from service.api.routes.calibrations import Line, check_fits
+from devices.types import StrictModel
+from service.api.routes.calibrations import check_fits
 from service.api.routes.common import (
     FULL,
     NO_CONTENT,
+    Name,
     ServerState,
     parse_if_match,
     problem_responses,
@@ -42,10 +44,8 @@ ThisOne = Annotated[
 ]
 
 
-class StartWeighing(BaseModel):
+class StartWeighing(StrictModel):
     """Tiles and weights."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     tiles: Annotated[
         tuple[Annotated[str, StringConstraints(max_length=100)], ...],
@@ -66,10 +66,10 @@ class StartWeighing(BaseModel):
         description="Reference of the force: weights on the dome, the reading of a kitchen scale "
         "under the tile, or that of a force sensor.",
     )
-    reference: Line | None = Field(
+    reference: Name | None = Field(
         default=None, description="The reference in words; default: by `method`."
     )
-    name: Line | None = Field(default=None, description="Of the calibration; default: by tiles.")
+    name: Name | None = Field(default=None, description="Of the calibration; default: by tiles.")
 
     def plan(self) -> WeighingPlan:
         """Return the plan, with the tolerance of each weight.

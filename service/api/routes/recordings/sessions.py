@@ -8,15 +8,16 @@ from itertools import islice, takewhile
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Query, Response
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import AfterValidator, Field, StringConstraints
 
-from devices.types import check_user_name, check_user_text
+from devices.types import StrictModel, check_user_name, check_user_text
 from service.api.routes.common import (
     CHANGED,
     FULL,
     NO_CONTENT,
     IdempotencyKey,
     IfMatch,
+    Name,
     ServerState,
     make_idempotency_record,
     parse_if_match,
@@ -43,11 +44,6 @@ SEAL_TIMEOUT_S = 5.0
 _UNKNOWN = problem_responses(_404="No such session.", _409="Its files are damaged.")
 _NO_EVENT = problem_responses(_404="No such session or event.", _409="Its files are damaged.")
 
-Name = Annotated[
-    str,
-    StringConstraints(strip_whitespace=True, min_length=1, max_length=200),
-    AfterValidator(check_user_name),
-]
 Text = Annotated[str, StringConstraints(max_length=10_000), AfterValidator(check_user_text)]
 Tag = Annotated[
     str,
@@ -55,10 +51,6 @@ Tag = Annotated[
     AfterValidator(check_user_name),
 ]
 Tags = Annotated[tuple[Tag, ...], Field(max_length=50)]
-
-
-class _Body(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class SessionPage(Page[SessionView]):
@@ -71,11 +63,11 @@ class SessionPage(Page[SessionView]):
     )
 
 
-class RecordingDescription(_Body):
+class RecordingDescription(StrictModel):
     """User-written description of a recording."""
 
     name: Name = Field(examples=["mud, third trial"])
-    pre_roll_s: Annotated[float, Field(ge=0, le=600, allow_inf_nan=False, strict=True)] = Field(
+    pre_roll_s: Annotated[float, Field(ge=0, le=600, strict=True)] = Field(
         default=0.0, description="Pre-roll, as long as the server still has the frames."
     )
     subject: Name | None = None
@@ -89,7 +81,7 @@ class StartSession(RecordingDescription):
     node: str = Field(examples=["demo"])
 
 
-class ChangeSession(_Body):
+class ChangeSession(StrictModel):
     """Changes of a session's description; omitted fields are unchanged."""
 
     name: Name | None = None
@@ -98,7 +90,7 @@ class ChangeSession(_Body):
     tags: Tags | None = None
 
 
-class AddMarker(_Body):
+class AddMarker(StrictModel):
     """New marker."""
 
     label: Name = Field(examples=["stepped on a stone"])
@@ -110,7 +102,7 @@ class AddMarker(_Body):
     )
 
 
-class ChangeMarker(_Body):
+class ChangeMarker(StrictModel):
     """Changes of a marker; omitted fields are unchanged."""
 
     label: Name | None = None

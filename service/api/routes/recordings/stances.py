@@ -10,10 +10,11 @@ from typing import Annotated, Any
 import numpy as np
 from anyio import CapacityLimiter
 from fastapi import APIRouter, Header, Query, Request, Response
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 
 from devices.arrays import Floats
+from devices.types import StrictModel
 from service.api.routes.common import (
     UNCHANGED,
     ServerState,
@@ -90,10 +91,8 @@ async def get_stances(
     return rows
 
 
-class OverlayQuery(BaseModel):
+class OverlayQuery(StrictModel):
     """Resolution, and number of single curves."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     points: Annotated[int, Field(ge=2, le=1001)] = Field(
         default=101, description="Number of percentages from 0 to 100, both included."
