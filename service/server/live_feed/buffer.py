@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from typing import Protocol
 
 from devices.frames import FrameBatch
 from service.server.estimates.node_estimator import EstimatedBatch
@@ -172,35 +171,8 @@ def _size_bytes(frames: FrameBatch, columns: Columns) -> int:
     return _BATCH_OVERHEAD_BYTES + sum(int(column.nbytes) for column in of_all)
 
 
-class StreamView(Protocol):
-    """Present state of a stream."""
-
-    @property
-    def stored(self) -> Intervals:
-        """Frames in its journal."""
-
-    @property
-    def lost(self) -> Losses:
-        """Frames that will not come, by reason."""
-
-    @property
-    def has_ended(self) -> bool:
-        """True if the node has another present stream."""
-
-    @property
-    def end_seq(self) -> int:
-        """Number after the last known frame."""
-
-    @property
-    def next_stream_id(self) -> str | None:
-        """Next stream of the node; None: this is the present one."""
-
-    def compute_unstored_obtainable(self) -> Intervals:
-        """Return the frames that are not stored and that the node can still send."""
-
-
-class ServerStreamView:
-    """State of a stream of this server.
+class StreamView:
+    """Present state of a stream of this server.
 
     Args:
         node: the node.
@@ -223,7 +195,7 @@ class ServerStreamView:
     @classmethod
     def find_known(
         cls, node: ServerNode, stream_id: str, needed_frames: Callable[[], Mapping[str, Intervals]]
-    ) -> ServerStreamView | None:
+    ) -> StreamView | None:
         """Return the view of a stream, empty without stored frames; None: not known, or not now."""
         stream = node.streams.get(stream_id)
         # After a restart of the server a stream without stored frames has no folder.
@@ -233,29 +205,29 @@ class ServerStreamView:
 
     @property
     def stored(self) -> Intervals:
-        """See `StreamView.stored`."""
+        """Frames in its journal."""
         return Intervals() if self._stream is None else self._stream.stored
 
     @property
     def lost(self) -> Losses:
-        """See `StreamView.lost`."""
+        """Frames that will not come, by reason."""
         return Losses() if self._stream is None else self._stream.lost
 
     @property
     def has_ended(self) -> bool:
-        """See `StreamView.has_ended`."""
+        """True if the node has another present stream."""
         return self._stream_id != self._node.stream_id
 
     @property
     def end_seq(self) -> int:
-        """See `StreamView.end_seq`."""
+        """Number after the last known frame."""
         announced = None if self._stream is None else self._stream.notes.next_seq
         ends = [last + 1 for last in (self.stored.last, self.lost.numbers.last) if last is not None]
         return max([announced or 0, *ends])
 
     @property
     def next_stream_id(self) -> str | None:
-        """See `StreamView.next_stream_id`."""
+        """Next stream of the node; None: this is the present one."""
         node, order = self._node, self._node.announced_stream_order
         if self._stream_id in order:
             return (*order, None)[order.index(self._stream_id) + 1]
@@ -271,7 +243,7 @@ class ServerStreamView:
         return node.stream_id
 
     def compute_unstored_obtainable(self) -> Intervals:
-        """Return the frames as in `StreamView.compute_unstored_obtainable`."""
+        """Return the frames that are not stored and that the node can still send."""
         stream = self._stream
         if stream is None:
             return Intervals([(0, NO_END)])

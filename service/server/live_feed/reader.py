@@ -35,12 +35,7 @@ from service.server.estimates.live_estimator import (
     make_live_plan,
 )
 from service.server.estimates.node_estimator import EstimatedBatch
-from service.server.live_feed.buffer import (
-    FeedBuffer,
-    ServerStreamView,
-    StreamView,
-    wait_briefly_for_batch,
-)
+from service.server.live_feed.buffer import FeedBuffer, StreamView, wait_briefly_for_batch
 from service.server.live_feed.cursors import QUEUE_NS, LosslessCursor, LossyCursor, Recompute
 from service.server.live_feed.events import FeedEvent, FrameRows, Position, StreamStart, slice_batch
 from service.server.node import ServerNode
@@ -323,7 +318,7 @@ class FeedReader:
             raise CloseConnection(
                 LinkCloseCode.TRY_LATER, f"its journal cannot be read; {self._cursor.position}"
             )
-        return ServerStreamView.find_known(self._node, stream_id, self._needed_frames)
+        return StreamView.find_known(self._node, stream_id, self._needed_frames)
 
     async def _recompute(self, step: Recompute) -> FrameRows | None:
         """Return the next recomputed rows; None: the state has changed, or no frame is due."""
