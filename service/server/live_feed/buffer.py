@@ -10,11 +10,11 @@ import asyncio
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from devices.frames import FrameBatch
 from service.server.estimates.node_estimator import EstimatedBatch
-from service.server.live_feed.events import EncodeCache
+from service.server.live_feed.events import EncodeCache, FrameRows, slice_batch
 from service.server.node import ServerNode
 from service.server.streams import ServerStream
 from service.sessions.pipeline import Columns
@@ -28,24 +28,17 @@ _POLL_S = 1.0
 
 
 @dataclass(frozen=True)
-class FeedBatch:
-    """Consecutive frames of one stream with their live estimates."""
+class FeedBatch(FrameRows):
+    """Batch of live estimates, numbered since the node's first reader."""
 
-    number: int
-    """Number of the batch, counted since the node's first reader."""
-    stream_id: str
-    frames: FrameBatch
-    columns: Columns
+    batch_number: int = field(kw_only=True)
 
-    @property
-    def first_seq(self) -> int:
-        """Number of its first frame."""
-        return int(self.frames.seq[0])
-
-    @property
-    def last_seq(self) -> int:
-        """Number of its last frame."""
-        return int(self.frames.seq[-1])
+    def rows_from(self, seq: int) -> FrameRows:
+        """Return the rows from a frame of this batch on."""
+        begin = seq - self.first_seq
+        if begin <= 0:
+            return self
+        return FrameRows(self.stream_id, slice_batch(self.batch, begin, len(self.batch[0])))
 
 
 class FeedBuffer:
@@ -81,15 +74,15 @@ class FeedBuffer:
 
     def add_batches(self, stream_id: str, batches: list[EstimatedBatch]) -> None:
         """Add due batches, which may be none, and wake all readers."""
-        for frames, columns in batches:
-            if not len(frames):
+        for batch in batches:
+            if not len(batch[0]):
                 continue
-            self._batches.append(FeedBatch(self.next_batch_number, stream_id, frames, columns))
+            number = self.next_batch_number
+            self._batches.append(FeedBatch(stream_id, batch, batch_number=number))
             self.next_batch_number += 1
-            self._bytes += _size_bytes(frames, columns)
+            self._bytes += _size_bytes(*batch)
         while self._bytes > self._bytes_max and len(self._batches) > 1:
-            oldest = self._batches.popleft()
-            self._bytes -= _size_bytes(oldest.frames, oldest.columns)
+            self._bytes -= _size_bytes(*self._batches.popleft().batch)
         self.wake_readers()
 
     def wake_readers(self) -> None:

@@ -17,14 +17,7 @@ from dataclasses import dataclass
 
 from service.protocol.codec import CloseConnection, LinkCloseCode
 from service.server.live_feed.buffer import FeedBatch, FeedBuffer, StreamView
-from service.server.live_feed.events import (
-    FeedEvent,
-    FrameRows,
-    Gap,
-    Position,
-    StreamStart,
-    slice_batch,
-)
+from service.server.live_feed.events import FeedEvent, Gap, Position, StreamStart
 from storage.intervals import NO_END, Intervals
 
 NOT_KEPT = "not_kept"
@@ -83,11 +76,9 @@ class LosslessCursor:
             piece = memory[self._next_number]
             position = self.position = Position(piece.stream_id, piece.first_seq)
         if (found := self._buffered_batch(position)) is not None:
-            self._next_number = found.number + 1
+            self._next_number = found.batch_number + 1
             self.position = Position(position.stream_id, found.last_seq + 1)
-            begin = position.seq - found.first_seq
-            rows = slice_batch((found.frames, found.columns), begin, len(found.frames))
-            return FrameRows(position.stream_id, rows, found.number if begin == 0 else None)
+            return found.rows_from(position.seq)
         stream = self._find_stream(position.stream_id)
         if stream is None:
             raise CloseConnection(
@@ -201,13 +192,13 @@ class LossyCursor:
         if position is not None:
             key = position.stream_id, position.seq
             found = buffer.find_batch(*key) or buffer.find_first_batch_beginning_after(*key)
-            self._next_number = self._next_number if found is None else found.number
+            self._next_number = self._next_number if found is None else found.batch_number
 
     def next_event(self) -> FeedEvent | None:
         """Return the next event and go on to the one after; None: nothing yet."""
         while self._next_number < self._buffer.next_batch_number:
             piece, position = self._oldest_allowed(), self.position
-            reason = SLOW if piece.number > self._next_number else LATE
+            reason = SLOW if piece.batch_number > self._next_number else LATE
             if position is not None and position.stream_id != piece.stream_id:
                 end = self._end_seq(position.stream_id)
                 self.position = Position(self._next_stream(position.stream_id, piece.stream_id), 0)
@@ -217,12 +208,11 @@ class LossyCursor:
                 self.position = Position(position.stream_id, piece.first_seq)
                 return Gap(position.stream_id, position.seq, piece.first_seq - 1, reason)
             else:
-                self._next_number = piece.number + 1
-                begin = 0 if position is None else position.seq - piece.first_seq
-                if begin < len(piece.frames):
+                self._next_number = piece.batch_number + 1
+                seq = piece.first_seq if position is None else position.seq
+                if seq <= piece.last_seq:
                     self.position = Position(piece.stream_id, piece.last_seq + 1)
-                    rows = slice_batch((piece.frames, piece.columns), begin, len(piece.frames))
-                    return FrameRows(piece.stream_id, rows, piece.number if begin == 0 else None)
+                    return piece.rows_from(seq)
         return None
 
     def _oldest_allowed(self) -> FeedBatch:
@@ -232,8 +222,8 @@ class LossyCursor:
         if self._queue_ns is None:
             return newest
         number = max(self._next_number, memory.oldest_batch_number)
-        until_t_ns = int(newest.frames.t_ns[-1]) - self._queue_ns
-        while number < newest.number and memory[number].frames.t_ns[-1] < until_t_ns:
+        until_t_ns = int(newest.batch[0].t_ns[-1]) - self._queue_ns
+        while number < newest.batch_number and memory[number].batch[0].t_ns[-1] < until_t_ns:
             number += 1
         return memory[number]
 
