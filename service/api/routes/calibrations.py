@@ -99,14 +99,11 @@ class NodeCalibrationView(View):
         """Return the present calibration of a node."""
         estimates, own_calibration = node.estimator, node.hello.calibration
         live, assigned = estimates.live, estimates.assignment.current
-        used = None
-        if live.calibration is not None and live.calibration_id and live.ranges is not None:
-            used = make_calibration_view(live.calibration, live.calibration_id, live.ranges)
         return cls(
             node=node.name,
             source=estimates.calibration_source,
             assigned_t_ns=None if assigned is None else assigned.t_ns,
-            calibration=used,
+            calibration=make_calibration_view(live.calibration, live.calibration_id, live.ranges),
             problem=estimates.calibration_problem,
             own_id=None if own_calibration is None else own_calibration.id,
         )

@@ -90,20 +90,11 @@ def make_drift_view(node: ServerNode) -> DriftView:
     )
     unknown = np.full(tiles, np.nan)
     slope = unknown if live.ranges is None else live.ranges.slope_n_per_kpa
-    warmer_by_k = (
-        unknown
-        if live.tare_in_use_unless_lost is None
-        else compute_warming_k(
-            live.tare_in_use_unless_lost,
-            live.mean_recent_temperature_raw(),
-            live.counts_per_kelvin,
-        )
-    )
-    since_kpa = (
-        unknown
-        if live.tare_in_use_unless_lost is None
-        else compute_sealed_gas_shift_kpa(live.tare_in_use_unless_lost, warmer_by_k)
-    )
+    warmer_by_k = since_kpa = unknown
+    if (tare := live.tare_in_use_unless_lost) is not None:
+        recent_raw = live.mean_recent_temperature_raw()
+        warmer_by_k = compute_warming_k(tare, recent_raw, live.counts_per_kelvin)
+        since_kpa = compute_sealed_gas_shift_kpa(tare, warmer_by_k)
     # A bare tile has no sealed gas.
     since_kpa = np.where([tile.reference for tile in node.last_info.tiles], np.nan, since_kpa)
     return DriftView(
@@ -135,9 +126,11 @@ def _list_count_fields(node: ServerNode, lost: dict[str, int]) -> dict[str, Any]
 
 
 def make_calibration_view(
-    calibration: Calibration, calibration_id: str, ranges: TileRanges
-) -> CalibrationView:
-    """Return a calibration in use."""
+    calibration: Calibration | None, calibration_id: str | None, ranges: TileRanges | None
+) -> CalibrationView | None:
+    """Return a calibration in use; None: there is none, or it is of other tiles."""
+    if calibration is None or calibration_id is None or ranges is None:
+        return None
     return CalibrationView(
         id=calibration_id,
         name=calibration.name,
@@ -151,7 +144,7 @@ def make_node_view(
     """Return the present state of a node."""
     info, estimates = node.last_info, node.estimator
     live, keeper = estimates.live, estimates.tare_controller
-    calibration, lost = live.calibration, node.present_stream_lost_by_reason
+    lost = node.present_stream_lost_by_reason
     tare = estimates.tare_history.tare_in_force_unless_lost(info)
     return NodeView(
         **_list_count_fields(node, lost),
@@ -163,9 +156,7 @@ def make_node_view(
         servo=info.servo,
         schedule=info.schedule,
         nominal_rate_hz=info.nominal_rate_hz,
-        calibration=None
-        if calibration is None or live.calibration_id is None or live.ranges is None
-        else make_calibration_view(calibration, live.calibration_id, live.ranges),
+        calibration=make_calibration_view(live.calibration, live.calibration_id, live.ranges),
         calibration_source=estimates.calibration_source,
         calibration_problem=estimates.calibration_problem,
         tare=make_tare_view(tare) if tare is not None else None,

@@ -124,16 +124,14 @@ def _make_view(
         ranges = None if calibration is None else TileRanges.from_calibration(info, calibration)
     except FootTileError:  # it is of other tiles
         ranges = None
-    calibration_view = None
-    if calibration is not None and ranges is not None:
-        calibration_view = make_calibration_view(calibration, calibration.id, ranges)
+    calibration_id = None if calibration is None else calibration.id
     return ArrayView(
         session_id=session_id,
         node=info.node,
         tiles=make_tile_views(info, ranges),
         servo=info.servo,
         nominal_rate_hz=info.nominal_rate_hz,
-        calibration=calibration_view,
+        calibration=make_calibration_view(calibration, calibration_id, ranges),
         tares=tares,
         lag_ms=lag_ms,
         estimates_problem=problem,
