@@ -41,6 +41,14 @@ from service.server.server import Server
 from service.version import SOFTWARE_VERSION
 
 API = "/api/v1"
+_PAGES = {
+    "/": "index.html",
+    "/nodes": "nodes.html",
+    "/calibrate": "calibrate.html",
+    "/sessions": "sessions.html",
+    "/sessions/{session_id}": "session.html",
+    "/docs": "docs.html",
+}
 _SWAGGER_FILES = ("swagger-ui-bundle.js", "swagger-ui.css")
 
 _DESCRIPTION = """
@@ -111,29 +119,13 @@ def make_app(
 
     page = PageFiles(find_page_folder())
 
-    @app.get("/", include_in_schema=False)
-    async def live_page(request: Request) -> Response:
-        return await page.get_response("index.html", request.scope)
+    def add_page(path: str, name: str) -> None:
+        @app.get(path, include_in_schema=False)
+        async def get_page(request: Request) -> Response:
+            return await page.get_response(name, request.scope)
 
-    @app.get("/nodes", include_in_schema=False)
-    async def nodes_page(request: Request) -> Response:
-        return await page.get_response("nodes.html", request.scope)
-
-    @app.get("/calibrate", include_in_schema=False)
-    async def calibrate_page(request: Request) -> Response:
-        return await page.get_response("calibrate.html", request.scope)
-
-    @app.get("/sessions", include_in_schema=False)
-    async def sessions_page(request: Request) -> Response:
-        return await page.get_response("sessions.html", request.scope)
-
-    @app.get("/sessions/{session_id}", include_in_schema=False)
-    async def session_page(session_id: str, request: Request) -> Response:
-        return await page.get_response("session.html", request.scope)
-
-    @app.get("/docs", include_in_schema=False)
-    async def docs_page(request: Request) -> Response:
-        return await page.get_response("docs.html", request.scope)
+    for path, name in _PAGES.items():
+        add_page(path, name)
 
     swagger = PageFiles(_find_swagger_folder())
 
