@@ -342,17 +342,14 @@ class RunningNode:
                     await asyncio.sleep(_POLL_S)
 
     def _count_undelivered(self, *, counts_unneeded: bool = False) -> int:
-        streams = self._journal.streams
-        if counts_unneeded and self._current_stream is not None:
-            present = self._current_stream
-            behind = (present.available - present.acked).number_count
-            return behind + sum(
-                self._journal.available_undelivered_numbers(stream).number_count
-                for stream in streams
-                if stream != present
-            )
+        present = self._current_stream if counts_unneeded else None
         return sum(
-            self._journal.available_undelivered_numbers(stream).number_count for stream in streams
+            (
+                stream.available - stream.acked
+                if stream is present
+                else self._journal.available_undelivered_numbers(stream)
+            ).number_count
+            for stream in self._journal.streams
         )
 
     def _seal_earlier_sessions(self) -> None:
