@@ -31,7 +31,7 @@ class LimitSettings(BaseModel):
     max_connections: _Connections = 512
     """Requests and subscribers at once, without nodes; beyond it 503, or 1013 on a websocket."""
     max_connections_per_address: _Connections = 256
-    """The same per address. A phone's hotspot is one address, and so is a reverse proxy that is
+    """Limit per address. A phone's hotspot is one address, and so is a reverse proxy that is
     not trusted."""
     max_nodes: _Connections = 32
     """Nodes at once."""
