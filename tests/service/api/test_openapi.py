@@ -141,7 +141,8 @@ def test_no_get_changes_anything(running: Running, tared: FakeNode) -> None:
             and path.suffix not in (".arrows", ".idx", ".tmp")
             and path.name not in ("stream.json", "clock.jsonl")
         }
-        return files, running.node(), session.now()
+        # The rate of a silent node falls, whoever looks.
+        return files, running.node() | {"rate_hz": None}, session.now()
 
     before = state()
     for path in paths:
