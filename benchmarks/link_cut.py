@@ -4,7 +4,7 @@ Server and node run as processes of their own, with a proxy between them that le
 for a while and then everything again, or only so many bytes a second. Measured: how long after the
 link's return the page has a frame that was taken after it, and how long until the server has the
 last frame of the backlog. The backlog's bytes over the link's spare bandwidth is what no sender can
-be quicker than; it stands beside. A session is recorded all the while, and has to be complete, and so
+be quicker than; it stands beside. A session is recorded all the while, and has to be complete; so
 does what a client of every frame receives. The server's CPU time is that from the link's return
 until the client has the last late frame.
 """
