@@ -84,7 +84,7 @@ class TileRanges:
 
 _TADC_OVER_NS = 1_000_000_000
 _EPOCHS_MAX = 256
-STATE_BYTES_MAX = 4 << 20
+_STATES_MAX = 20  # ten minutes, as the journal has of frames that no session needs
 STATE_PERIOD_NS = 30_000_000_000
 _GAP_PERIOD_NS = 1_000_000_000
 
@@ -97,28 +97,23 @@ class EstimateEpoch:
         calibration: calibration in use; None: they are not estimated.
         tare: tare in force; None: they are not estimated.
         seq: first frame.
-        t_ns: or time after which it is in force, node's UTC.
+        t_ns: time after which it is in force instead, node's UTC; None: `seq` holds.
         state: state of the run before the first frame; None: the initial one.
-        last_seq: newest frame that this state has seen; None: none.
+        seen_seq: newest frame that this state has seen; None: none.
     """
 
     calibration: Calibration | None
     tare: Tare | None
-    seq: int | None = None
+    seq: int = 0
     t_ns: int | None = None
     state: Columns | None = None
-    last_seq: int | None = None
-
-    @property
-    def state_bytes(self) -> int:
-        """Size of the state."""
-        return sum(column.nbytes for column in (self.state or {}).values())
+    seen_seq: int | None = None
 
     def count_rows_before(self, frames: FrameBatch) -> int:
         """Return the number of frames before it."""
-        if self.seq is not None:
-            return int(np.searchsorted(frames.seq, self.seq, side="left"))
-        return 0 if self.t_ns is None else int(np.searchsorted(frames.t_ns, self.t_ns, "right"))
+        if self.t_ns is not None:
+            return int(np.searchsorted(frames.t_ns, self.t_ns, side="right"))
+        return int(np.searchsorted(frames.seq, self.seq, side="left"))
 
     def make_run(self, info: ArrayInfo) -> EstimateRun | None:
         """Make the run that estimates its frames; None: they are not estimated."""
@@ -131,52 +126,57 @@ class EstimateEpoch:
 class EpochHistory:
     """Epochs of one stream since the server was started, with states to go on from.
 
-    States are taken now and then, and where live goes on behind frames that it has not seen. The
-    oldest go first.
+    A state is stored every 30 s, and where live goes on behind frames that it has not seen, at most
+    once a second. The oldest go first, each kind by itself: a bad link leaves the regular ones.
     """
 
     def __init__(self) -> None:
-        self._begun: deque[EstimateEpoch] = deque(maxlen=_EPOCHS_MAX)
-        """Epochs from the initial state."""
-        self._states: deque[EstimateEpoch] = deque()
-        self._state_bytes = 0
-        self._next_state_ns = self._next_gap_ns = 0
+        self._from_initial_state: deque[EstimateEpoch] = deque(maxlen=_EPOCHS_MAX)
+        self._regular: deque[EstimateEpoch] = deque(maxlen=_STATES_MAX)
+        self._behind_gaps: deque[EstimateEpoch] = deque(maxlen=_STATES_MAX)
+        self._next_regular_ns = self._next_gap_ns = 0
 
     def list_epochs(self) -> list[EstimateEpoch]:
         """Return the epochs, oldest first."""
-        return sorted((*self._begun, *self._states), key=lambda epoch: epoch.seq or 0)
+        epochs = (*self._from_initial_state, *self._regular, *self._behind_gaps)
+        return sorted(epochs, key=lambda epoch: epoch.seq)
+
+    def drop_states(self) -> None:
+        """Keep only calibrations and tares: states take memory, some 20 kB a tile each."""
+        self._regular.clear()
+        self._behind_gaps.clear()
 
     def begin_epoch(
         self, frames: FrameBatch, calibration: Calibration | None, tare: Tare | None
     ) -> None:
         """Record that these frames are the first with this calibration and tare."""
-        self._begun.append(EstimateEpoch(calibration, tare, int(frames.seq[0])))
+        self._from_initial_state.append(EstimateEpoch(calibration, tare, int(frames.seq[0])))
         self._next_gap_ns = int(frames.t_mono_ns[0])
-        self._next_state_ns = self._next_gap_ns + STATE_PERIOD_NS
+        self._next_regular_ns = self._next_gap_ns + STATE_PERIOD_NS
 
     def store_state_if_due(
-        self, frames: FrameBatch, last_seq: int, calibration: Calibration, run: EstimateRun
+        self, frames: FrameBatch, seen_seq: int, calibration: Calibration, run: EstimateRun
     ) -> None:
         """Store the state of a run before its next frames.
 
         Args:
             frames: the next frames.
-            last_seq: newest frame before them.
+            seen_seq: newest frame before them.
             calibration: calibration of the run.
             run: the run.
         """
         t_mono_ns, seq = int(frames.t_mono_ns[0]), int(frames.seq[0])
-        follows_gap = seq != last_seq + 1
-        if t_mono_ns < (self._next_gap_ns if follows_gap else self._next_state_ns):
+        follows_gap = seq != seen_seq + 1
+        if t_mono_ns < (self._next_gap_ns if follows_gap else self._next_regular_ns):
             return
-        state, tare = run.state_dict(), run.plan.tare
-        epoch = EstimateEpoch(calibration, tare, seq, state=state, last_seq=last_seq)
-        self._states.append(epoch)
-        self._state_bytes += epoch.state_bytes
-        while self._state_bytes > STATE_BYTES_MAX:
-            self._state_bytes -= self._states.popleft().state_bytes
-        self._next_gap_ns = t_mono_ns + _GAP_PERIOD_NS
-        self._next_state_ns = t_mono_ns + STATE_PERIOD_NS
+        state = run.state_dict()
+        epoch = EstimateEpoch(calibration, run.plan.tare, seq, state=state, seen_seq=seen_seq)
+        if follows_gap:
+            self._behind_gaps.append(epoch)
+            self._next_gap_ns = t_mono_ns + _GAP_PERIOD_NS
+        else:
+            self._regular.append(epoch)
+            self._next_regular_ns = t_mono_ns + STATE_PERIOD_NS
 
 
 def make_live_plan(info: ArrayInfo, calibration: Calibration, tare: Tare) -> EstimationPlan:
@@ -260,7 +260,7 @@ class LiveEstimator:
 
     def estimate_or_pass_frames(self, frames: FrameBatch) -> Iterator[tuple[FrameBatch, Columns]]:
         """Add the next frames; yield the frames that are due, with or without estimates."""
-        last_seq = int(self._recent[-1].seq[-1]) if self._recent else -1
+        seen_seq = int(self._recent[-1].seq[-1]) if self._recent else -1
         self._recent.append(frames)
         while int(frames.t_ns[-1]) - int(self._recent[0].t_ns[-1]) > HISTORY_NS:
             self._recent.popleft()
@@ -282,7 +282,7 @@ class LiveEstimator:
             return
         assert self.calibration is not None  # noqa: S101  # or there was no run
         if self._has_epoch:
-            self.epochs.store_state_if_due(frames, last_seq, self.calibration, self._run)
+            self.epochs.store_state_if_due(frames, seen_seq, self.calibration, self._run)
         else:
             self._has_epoch = True
             self.epochs.begin_epoch(frames, self.calibration, self._run.plan.tare)

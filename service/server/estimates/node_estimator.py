@@ -37,11 +37,7 @@ from service.estimation.tare.tare import (
 from service.protocol.link import Hello
 from service.protocol.live import AutoTareState
 from service.server.calibrations import CalibrationAssignment
-from service.server.estimates.live_estimator import (
-    STATE_BYTES_MAX,
-    EstimateEpoch,
-    LiveEstimator,
-)
+from service.server.estimates.live_estimator import EpochHistory, EstimateEpoch, LiveEstimator
 from service.sessions.pipeline import Columns
 from service.sessions.tares import RecordedTare, TareHistory
 from storage.intervals import Intervals
@@ -270,8 +266,8 @@ class NodeEstimator:
         self.tare_controller: TareController
         self._hello = hello
         self._has_failed = False
-        self._ended_epochs: OrderedDict[str, list[EstimateEpoch]] = OrderedDict()
-        """Epochs of streams before the present one."""
+        self._ended_epochs: OrderedDict[str, EpochHistory] = OrderedDict()
+        """Epochs of streams before the present one; only the newest of these has states."""
         self._restart()
 
     @property
@@ -314,7 +310,8 @@ class NodeEstimator:
         """Return the epochs of a stream since the server was started, in order."""
         if stream_id == self.live.info.stream_id:
             return self.live.epochs.list_epochs()
-        return self._ended_epochs.get(stream_id, [])
+        ended = self._ended_epochs.get(stream_id)
+        return [] if ended is None else ended.list_epochs()
 
     def store_and_apply_calibration(self, calibration: Calibration | None, t_ns: int) -> None:
         """Store the assigned calibration, and use it from the next frame on.
@@ -343,13 +340,11 @@ class NodeEstimator:
         """Restart the estimator if hello has another stream or calibration."""
         previous, self._hello = self._hello, hello
         if previous.array_info.stream_id != hello.array_info.stream_id:
-            self._ended_epochs[previous.array_info.stream_id] = self.live.epochs.list_epochs()
-            while (
-                len(ended := self._ended_epochs) > _ENDED_STREAMS_MAX
-                or sum(epoch.state_bytes for epochs in ended.values() for epoch in epochs)
-                > STATE_BYTES_MAX
-            ):
-                ended.popitem(last=False)
+            for history in self._ended_epochs.values():
+                history.drop_states()
+            self._ended_epochs[previous.array_info.stream_id] = self.live.epochs
+            if len(self._ended_epochs) > _ENDED_STREAMS_MAX:
+                self._ended_epochs.popitem(last=False)
         is_same = (previous.array_info, previous.calibration) == (
             hello.array_info,
             hello.calibration,

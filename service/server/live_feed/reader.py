@@ -4,11 +4,10 @@ A reader is a position, not a queue: a slow reader costs no memory. The next eve
 `cursors`; `FeedReader` waits for it, and recomputes frames in a thread, one reader after the other.
 
 Frames that are no longer buffered are estimated again as they were live: with the live look-ahead,
-the tare that was in force, and from a state that live had. So the bits are the same; frames that
-live has not seen, of a backlog, go on from the state before them. Where no state is kept any more,
-as for the time before the server was started, models start so many frames earlier that their
-initial state is forgotten, and the history of tares says which tare was in force, by the frames'
-times.
+the tare that was in force, and from the states that live had. So the bits are the same; those of a
+backlog, which live has not seen, go on from the state before them. In front of the oldest state, as
+before the server's start, models begin so many frames earlier that their initial state is
+forgotten; which tare was in force before the start is known from the history, by the frames' times.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ import asyncio
 import logging
 from collections import deque
 from collections.abc import AsyncGenerator, Callable, Iterator, Mapping
-from itertools import chain
 
 import numpy as np
 
@@ -71,33 +69,36 @@ class RecomputedFrames:
         self._calibration = calibration
         self._next_seq = self._find_first_seq()
         """Next frame to estimate."""
-        self._last: tuple[int, int] | None = None
-        """Number and time of the last estimated frame."""
+        self._last_fed: tuple[int, int] | None = None
+        """Number and time of the last frame that was estimated."""
         self._run: EstimateRun | None = None
-        self._end: tuple[int, bool] | None = None
-        self._pieces: Iterator[EstimatedBatch] = iter(())
-        self._rest: EstimatedBatch | None = None
+        self._extended_to: tuple[int, bool] | None = None
+        self._frames: Iterator[FrameBatch] = iter(())
+        self._to_come: deque[EstimateEpoch] = deque()
+        self._due: deque[EstimatedBatch] = deque()
 
     def _find_first_seq(self) -> int:
         """Return the first frame to estimate: that of an epoch, or so early that models settle."""
-        seq, info = self.position.seq, self._stream.info
-        epochs = self._node.estimator.epochs_since_server_start(self._stream.stream_id)
-        epoch = next((each for each in reversed(epochs) if (each.seq or 0) <= seq), None)
-        if epoch is not None and epoch.seq is not None and epoch.state is not None:
+        seq = self.position.seq
+        recorded = self._node.estimator.epochs_since_server_start(self._stream.stream_id)
+        epoch = next((each for each in reversed(recorded) if each.seq <= seq), None)
+        if epoch is not None and epoch.state is not None:
             return epoch.seq
         t_ns = self._journal.find_batch_t_ns_near(seq, at_or_before=False)
-        tare = self._node.estimator.tare_history.tare_in_force_or_lost(info)
-        if self._calibration is None or tare is None or t_ns is None:
+        if t_ns is None:
             return seq
-        settling_s = compute_settling_time_s(make_live_plan(info, self._calibration, tare))
+        if epoch is None:
+            epoch = next(iter(self._list_epochs_before_start(t_ns, t_ns)), None)
+        if epoch is None or epoch.calibration is None or epoch.tare is None:
+            return seq
+        plan = make_live_plan(self._stream.info, epoch.calibration, epoch.tare)
         # At least the time between two states: the initial one of an epoch counts as one of them.
-        settling_ns = max(round(1e9 * settling_s), STATE_PERIOD_NS)
+        settling_ns = max(round(1e9 * compute_settling_time_s(plan)), STATE_PERIOD_NS)
         settled_seq = self._journal.find_first_batch_seq_since(t_ns - settling_ns)
-        first = seq if settled_seq is None else min(seq, settled_seq)
-        return first if epoch is None or epoch.seq is None else max(first, epoch.seq)
+        return seq if settled_seq is None else max(min(seq, settled_seq), epoch.seq)
 
     def extend(self, last_seq: int, *, is_final: bool) -> bool:
-        """Go on to a number, all frames before which are here or lost.
+        """Go on to a number; all frames up to it are stored or lost.
 
         Args:
             last_seq: the number.
@@ -107,59 +108,59 @@ class RecomputedFrames:
         Returns:
             False: it has gone on to there before.
         """
-        if self._end == (last_seq, is_final):
+        if self._extended_to == (last_seq, is_final):
             return False
-        self._end = last_seq, is_final
-        epochs = filter(self._is_to_come, self._list_epochs(last_seq))
-        self._pieces = self._estimate(deque(epochs), last_seq, is_final=is_final)
+        self._extended_to = last_seq, is_final
+        self._to_come = deque(filter(self._is_to_come, self._list_epochs(last_seq)))
+        self._frames = self._journal.read_frames(self._next_seq, last_seq)
         return True
 
     def _is_to_come(self, epoch: EstimateEpoch) -> bool:
-        if self._last is None:
+        if self._last_fed is None:
             return True
-        seq, t_ns = self._last
-        return epoch.seq > seq if epoch.seq is not None else (epoch.t_ns or 0) >= t_ns
+        seq, t_ns = self._last_fed
+        return epoch.seq > seq if epoch.t_ns is None else epoch.t_ns >= t_ns
 
     def _list_epochs(self, last_seq: int) -> list[EstimateEpoch]:
-        """Return the epochs of the frames still to estimate, in order."""
-        estimator, info, begin = self._node.estimator, self._stream.info, self._next_seq
-        recorded = estimator.epochs_since_server_start(self._stream.stream_id)
-        before = [epoch for epoch in recorded if (epoch.seq or 0) <= begin]
-        if before:  # this server has estimated all of these frames
+        """Return the epochs from the next frame to estimate on, that of this frame first."""
+        begin = self._next_seq
+        recorded = self._node.estimator.epochs_since_server_start(self._stream.stream_id)
+        before = [epoch for epoch in recorded if epoch.seq <= begin]
+        if before:
             return recorded[len(before) - 1 :]
-        until = last_seq if not recorded else max(begin, (recorded[0].seq or 0) - 1)
+        until = max(begin, recorded[0].seq - 1) if recorded else last_seq
         t_ns = self._journal.find_batch_t_ns_near(begin, at_or_before=False)
         until_ns = self._journal.find_batch_t_ns_near(until, at_or_before=True)
         if t_ns is None or until_ns is None:
             return recorded
-        tares = estimator.tare_history.tares_in_force_or_lost_between(info, t_ns, until_ns)
-        earlier = (EstimateEpoch(self._calibration, tare, t_ns=tare.t_ns) for tare in tares)
-        return [*earlier, *recorded]
+        return [*self._list_epochs_before_start(t_ns, until_ns), *recorded]
 
-    def _estimate(
-        self, to_come: deque[EstimateEpoch], last_seq: int, *, is_final: bool
-    ) -> Iterator[EstimatedBatch]:
-        """Yield the frames up to a number that are due, with their estimates."""
-        for frames in self._journal.read_frames(self._next_seq, last_seq):
-            rest = frames
-            while to_come and (count := to_come[0].count_rows_before(rest)) < len(rest):
-                yield from self._feed_run(rest.slice_rows(0, count))
-                rest = rest.slice_rows(count, len(rest))
-                epoch = to_come.popleft()
-                if epoch.state is not None and self._last and epoch.last_seq == self._last[0]:
-                    continue  # this run has that state
-                if self._run is not None:
-                    yield from self._run.flush()
-                self._run = epoch.make_run(self._stream.info)
-            yield from self._feed_run(rest)
-        if is_final and self._run is not None:
-            yield from self._run.flush()
+    def _list_epochs_before_start(self, begin_t_ns: int, end_t_ns: int) -> list[EstimateEpoch]:
+        """Return the epochs before the server's start, by the history of tares."""
+        tares = self._node.estimator.tare_history.tares_in_force_or_lost_between(
+            self._stream.info, begin_t_ns, end_t_ns
+        )
+        return [EstimateEpoch(self._calibration, tare, t_ns=tare.t_ns) for tare in tares]
+
+    def _estimate(self, frames: FrameBatch) -> Iterator[EstimatedBatch]:
+        """Yield the frames that are due with these, with their estimates."""
+        rest = frames
+        while self._to_come and (count := self._to_come[0].count_rows_before(rest)) < len(rest):
+            yield from self._feed_run(rest.slice_rows(0, count))
+            rest = rest.slice_rows(count, len(rest))
+            epoch = self._to_come.popleft()
+            # A state has the frames that wait for their look-ahead, unless others came between.
+            has_waiting = self._last_fed is not None and self._last_fed[0] == epoch.seen_seq
+            if self._run is not None and not has_waiting:
+                yield from self._run.flush()
+            self._run = epoch.make_run(self._stream.info)
+        yield from self._feed_run(rest)
 
     def _feed_run(self, frames: FrameBatch) -> Iterator[EstimatedBatch]:
         if not len(frames):
             return
-        self._last = int(frames.seq[-1]), int(frames.t_ns[-1])
-        self._next_seq = self._last[0] + 1
+        self._last_fed = int(frames.seq[-1]), int(frames.t_ns[-1])
+        self._next_seq = self._last_fed[0] + 1
         if self._run is None:
             yield frames, {}
         else:
@@ -174,10 +175,9 @@ class RecomputedFrames:
             StorageError: it cannot be read.
         """
         while True:
-            rest, self._rest = self._rest, None
-            frames, columns = rest if rest is not None else next(self._pieces, (None, {}))
-            if frames is None:
+            if not self._due and not self._estimate_next_frames():
                 return None
+            frames, columns = self._due.popleft()
             begin = int(np.searchsorted(frames.seq, self.position.seq))
             end = min(len(frames), begin + ROWS_AT_ONCE)
             # Return consecutive frames only.
@@ -185,15 +185,26 @@ class RecomputedFrames:
             if len(steps):
                 end = begin + int(steps[0]) + 1
             if end < len(frames):
-                self._rest = slice_batch((frames, columns), end, len(frames))
+                self._due.appendleft(slice_batch((frames, columns), end, len(frames)))
             if begin < end:
                 self.position = Position(self.position.stream_id, int(frames.seq[end - 1]) + 1)
                 return slice_batch((frames, columns), begin, end)
 
+    def _estimate_next_frames(self) -> bool:
+        """Estimate the next frames of the journal until some are due; return whether any are."""
+        while not self._due:
+            frames = next(self._frames, None)
+            if frames is None:
+                _, is_final = self._extended_to or (0, False)
+                if is_final and self._run is not None:
+                    self._due.extend(self._run.flush())
+                return bool(self._due)
+            self._due.extend(self._estimate(frames))
+        return True
+
     def put_back(self, rows: EstimatedBatch) -> None:
         """Take back the rows that `next_rows` returned last; they are the next."""
-        rest = () if self._rest is None else (self._rest,)
-        self._pieces, self._rest = chain((rows, *rest), self._pieces), None
+        self._due.appendleft(rows)
         self.position = Position(self.position.stream_id, int(rows[0].seq[0]))
 
 
@@ -301,6 +312,8 @@ class FeedReader:
         while True:
             step = self._cursor.next_event()
             if not isinstance(step, Recompute):
+                if isinstance(step, FrameRows):  # from the buffer
+                    self._recomputed = None  # and so its journal is closed
                 return step
             # During warm-up this would compile here. Frames not due wait for their look-ahead.
             if is_compiling() or step == self._request_without_rows:

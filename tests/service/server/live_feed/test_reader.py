@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
@@ -16,8 +17,10 @@ from devices.errors import DamagedFramesError, FileFormatError, StorageError
 from devices.frames import FrameBatch
 from service.protocol.codec import CloseConnection, LinkCloseCode
 from service.protocol.live import Policy
+from service.server.estimates import live_estimator
 from service.server.estimates.live_estimator import make_live_plan
 from service.server.estimates.node_estimator import EstimatedBatch
+from service.server.live_feed import reader as reader_module
 from service.server.live_feed.events import (
     EncodeCache,
     FeedEvent,
@@ -244,6 +247,78 @@ def test_frames_of_live_are_as_they_were_also_behind_a_gap_that_was_filled(cut: 
         found = estimates_of(all_of(cut, cut.reader("lossless", Position(FIRST, first))))
         numbers = [seq for seq in live if seq >= first]
         assert [seq for seq in numbers if found[seq] != cut.published[FIRST, seq]] == []
+
+
+def walking(world: World, frames: int) -> World:
+    """A world that has taken so many frames of the walk, none of them buffered any more."""
+    world.present.counts = walk_with_a_lost_baseline
+    for _ in range(frames // 100):
+        world.send_newest(100)
+    world.forget()
+    return world
+
+
+def test_a_replay_from_before_the_oldest_state_has_the_bits_of_live_behind_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live_estimator, "_STATES_MAX", 2)
+    for module in (live_estimator, reader_module):
+        monkeypatch.setattr(module, "STATE_PERIOD_NS", 2000 * PERIOD_NS)
+    world = walking(World(tmp_path, models=("static", "denoise")), 16_000)
+    oldest = min(e.seq for e in world.node.estimator.live.epochs.list_epochs() if e.state)
+    found = estimates_of(all_of(world, world.reader("lossless", Position(FIRST, oldest - 500))))
+    differ = [seq for seq, each in found.items() if each != world.published[FIRST, seq]]
+    world.close()
+    assert differ[:1] == [oldest - 500]  # it does not know of the lost baseline yet
+    assert max(differ) < oldest
+
+
+def test_frames_of_a_calibration_that_was_removed_are_replayed_with_it(tmp_path: Path) -> None:
+    world = walking(World(tmp_path), 8000)
+    world.calibration = None
+    world.connect()
+    walking(world, 200)
+    found = estimates_of(all_of(world, world.reader("lossless", Position(FIRST, 6000))))
+    numbers = range(6000, 8000 - WAITING)
+    differ = [seq for seq in numbers if found[seq] != world.published[FIRST, seq]]
+    world.close()
+    assert differ == []
+
+
+def test_tares_of_ended_streams_outlive_their_states(tmp_path: Path) -> None:
+    world = walking(World(tmp_path), 16_000)
+    world.tare((world.node.last_t_ns or 0) - 50 * PERIOD_NS, counts=-5)
+    walking(world, 1000)
+    for _ in range(2):
+        world.reboot()
+        walking(world, 100)
+    items = all_of(world, world.reader("lossless", Position(FIRST, 0)))
+    found = estimates_of([item for item in items if item.stream_id == FIRST])
+    numbers = range(17_000 - WAITING)
+    differ = [seq for seq in numbers if found[seq] != world.published[FIRST, seq]]
+    epochs = world.node.estimator.epochs_since_server_start(FIRST)
+    world.close()
+    assert differ == []
+    assert [epoch.state for epoch in epochs] == [None, None]
+
+
+def test_a_reader_that_is_served_from_the_buffer_again_holds_no_journal_open(world: World) -> None:
+    walking(world, 10_000)
+    before = count_open_journals()
+    reader = world.reader("lossless", Position(FIRST, 0))
+    assert isinstance(world.read(reader), FrameRows)
+    assert count_open_journals() > before
+    world.memory._bytes_max = 1 << 20
+    for _ in range(4):
+        world.send_newest(10)
+    all_of(world, reader)
+    assert count_open_journals() == before
+
+
+def count_open_journals() -> int:
+    """How many files of journals this process has open."""
+    files = Path("/proc/self/fd").iterdir()
+    return sum(os.readlink(each).endswith(".arrows") for each in files if each.is_symlink())
 
 
 def test_of_another_scene_that_the_calibration_does_not_fit_frames_come_alone(world: World) -> None:

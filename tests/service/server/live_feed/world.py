@@ -17,6 +17,7 @@ import numpy as np
 from devices.arrays import Ints
 from devices.errors import DamagedFramesError
 from devices.frames import ArrayInfo, FrameBatch
+from service.estimation.calibration import Calibration
 from service.protocol.link import EarlierStream, Hello
 from service.protocol.live import Policy
 from service.server.live_feed.buffer import FeedBuffer
@@ -86,7 +87,7 @@ class World:
         self.memory: FeedBuffer
         self._loop = asyncio.Runner()
         self._is_there = False
-        self._calibration = make_calibration("T01", "T02")
+        self.calibration: Calibration | None = make_calibration("T01", "T02")
         self._boot()
         self.start()
         self.tare(UTC_NS - 1)
@@ -237,7 +238,7 @@ class World:
             "scene": {"auto_tare": False},
             "earlier": told_before,
         }
-        return make_hello(calibration=self._calibration, **facts, **said(present))
+        return make_hello(calibration=self.calibration, **facts, **said(present))
 
     # --- readers ----------------------------------------------------------------------------------
 
