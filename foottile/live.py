@@ -45,6 +45,7 @@ MESSAGE_BYTES_MAX = 1 << 24
 _POLICY, _NO_STREAM, _UNREADABLE = 1008, 4011, 4012
 _LOSSES_MAX = 1000
 _RETRY_DELAYS_S = (0.1, 5.0)
+_NO_CLOSE_FRAME = 1006
 
 
 @dataclass(frozen=True)
@@ -257,9 +258,6 @@ class LiveProtocol:
             self._on_loss(loss)
         elif self._request.policy == "lossless":
             warnings.warn(str(loss), FramesLostWarning, stacklevel=5)
-
-
-_NO_CLOSE_FRAME = 1006
 
 
 class LiveStreamState:

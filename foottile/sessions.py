@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 Clock = Literal["node", "server"]
 
 _CHUNK_BYTES = 1 << 16
+_WRITE_BYTES = 1 << 20
 _ARROW_START, _ARROW_END = b"ARROW1\0\0", b"ARROW1"
 """First and last bytes of an Arrow IPC file."""
 
@@ -172,9 +173,6 @@ class _ResponseFile(io.RawIOBase):
         buffer[:n] = self._rest[:n]
         self._rest = self._rest[n:]
         return n
-
-
-_WRITE_BYTES = 1 << 20
 
 
 def download(

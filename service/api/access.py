@@ -37,6 +37,58 @@ LOGIN_S = 12 * 3600.0
 TICKETS_MAX = 32
 LOGINS_MAX = 256
 _SECRET_BYTES = 16
+BODY_BYTES_MAX = 64 << 10
+"""Size limit of a request's body: names and notes."""
+CALIBRATIONS_PATH = "/api/v1/calibrations"
+
+LOGIN_PATH = "/api/v1/login"
+TICKETS_PATH = "/api/v1/tickets"
+
+_HERE = "the computer on which `foottile serve` runs"
+_AS_PROGRAM = (
+    "A program sends the token as Authorization: Bearer TOKEN, and commands of foottile take it "
+    "from FOOTTILE_TOKEN; the server keeps it in the file `token` of its data folder, unless it "
+    "was given one, and `foottile invite --data` takes it from there"
+)
+_CREDENTIALS_NEEDED = (
+    "A change needs the server's token or a login: `foottile invite`, on "
+    f"{_HERE}, prints a link that logs a browser in. {_AS_PROGRAM}"
+)
+_PRIVATE_SERVER = (
+    "This server is private: reading needs the server's token or a login: "
+    f"`foottile invite`, on {_HERE}, prints a link that logs a browser in. {_AS_PROGRAM}"
+)
+_WRONG_TOKEN = f"This is not the server's token. {_AS_PROGRAM}"
+_LOGIN_EXPIRED = (
+    "This login has expired: the server was restarted, or 12 hours have passed. "
+    f"`foottile invite` creates a new one, on {_HERE}"
+)
+_VIEWER_ONLY = (
+    "This login is a viewer's and may not change anything. `foottile invite` creates "
+    f"an operator's, on {_HERE}"
+)
+_TOKEN_NEEDED = "A login is not enough for this: it needs the server's token"  # noqa: S105  # words
+_PUBLIC_PATHS = re.compile(
+    rf"/|/nodes|/calibrate|/docs(?:/[^/]+)?|/sessions(?:/[^/]+)?|/static/.*|{LOGIN_PATH}|/api/v1/ready"
+)
+"""Paths that a private server also serves without credentials: pages and files without data, login,
+and the readiness probe."""
+_HOST_HEADER = re.compile(
+    r"(?:(?P<name>[A-Za-z0-9._-]+)|\[(?P<address>[0-9A-Fa-f:.]+)(?P<zone>%[A-Za-z0-9._~%-]{1,40})?\])"
+    r"(?::[0-9]{1,5})?"
+)
+"""Host header as browsers write it: a name or an address, and a port; no user, no path.
+
+A link-local address may have a zone, the name of an interface behind `%` or `%25` (RFC 6874): some
+clients send it, and the client has used it before the request arrives here.
+"""
+SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
+_DEFAULT_HEADERS = {
+    "content-security-policy": "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'",
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cache-control": "no-cache",  # revalidate: after an update the page must be new
+}
 
 
 class Role(IntEnum):
@@ -184,60 +236,6 @@ def parse_bearer_token(headers: Sequence[str]) -> str | None:
     """Return the token in Authorization headers; None unless they are one `Bearer TOKEN`."""
     scheme, _, token = (headers[0] if len(headers) == 1 else "").partition(" ")
     return token.strip() or None if scheme.lower() == "bearer" else None
-
-
-BODY_BYTES_MAX = 64 << 10
-"""Size limit of a request's body: names and notes."""
-CALIBRATIONS_PATH = "/api/v1/calibrations"
-
-LOGIN_PATH = "/api/v1/login"
-TICKETS_PATH = "/api/v1/tickets"
-
-_HERE = "the computer on which `foottile serve` runs"
-_AS_PROGRAM = (
-    "A program sends the token as Authorization: Bearer TOKEN, and commands of foottile take it "
-    "from FOOTTILE_TOKEN; the server keeps it in the file `token` of its data folder, unless it "
-    "was given one, and `foottile invite --data` takes it from there"
-)
-_CREDENTIALS_NEEDED = (
-    "A change needs the server's token or a login: `foottile invite`, on "
-    f"{_HERE}, prints a link that logs a browser in. {_AS_PROGRAM}"
-)
-_PRIVATE_SERVER = (
-    "This server is private: reading needs the server's token or a login: `foottile "
-    f"ticket`, on {_HERE}, prints a link that logs a browser in. {_AS_PROGRAM}"
-)
-_WRONG_TOKEN = f"This is not the server's token. {_AS_PROGRAM}"
-_LOGIN_EXPIRED = (
-    "This login has expired: the server was restarted, or 12 hours have passed. "
-    f"`foottile invite` creates a new one, on {_HERE}"
-)
-_VIEWER_ONLY = (
-    "This login is a viewer's and may not change anything. `foottile invite` creates "
-    f"an operator's, on {_HERE}"
-)
-_TOKEN_NEEDED = "A login is not enough for this: it needs the server's token"  # noqa: S105  # words
-_PUBLIC_PATHS = re.compile(
-    rf"/|/nodes|/calibrate|/docs(?:/[^/]+)?|/sessions(?:/[^/]+)?|/static/.*|{LOGIN_PATH}|/api/v1/ready"
-)
-"""Paths that a private server also serves without credentials: pages and files without data, login,
-and the readiness probe."""
-_HOST_HEADER = re.compile(
-    r"(?:(?P<name>[A-Za-z0-9._-]+)|\[(?P<address>[0-9A-Fa-f:.]+)(?P<zone>%[A-Za-z0-9._~%-]{1,40})?\])"
-    r"(?::[0-9]{1,5})?"
-)
-"""Host header as browsers write it: a name or an address, and a port; no user, no path.
-
-A link-local address may have a zone, the name of an interface behind `%` or `%25` (RFC 6874): some
-clients send it, and the client has used it before the request arrives here.
-"""
-SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
-_DEFAULT_HEADERS = {
-    "content-security-policy": "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'",
-    "x-content-type-options": "nosniff",
-    "referrer-policy": "no-referrer",
-    "cache-control": "no-cache",  # revalidate: after an update the page must be new
-}
 
 
 class AccessGuard:

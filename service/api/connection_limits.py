@@ -17,7 +17,7 @@ from typing import Protocol
 
 from service.api.settings import LimitSettings
 
-log = logging.getLogger("foottile.doors")
+log = logging.getLogger("foottile.connections")
 
 
 RESERVE = 32

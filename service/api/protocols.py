@@ -35,7 +35,7 @@ from service.api.problems import problem_response
 from service.protocol.codec import LinkCloseCode
 from service.protocol.link import INGEST_PATH, SUBPROTOCOL
 
-log = logging.getLogger("foottile.doors")
+log = logging.getLogger("foottile.connections")
 
 SOCKET_EXTENSION = "foottile.outlet"
 """Extension in a websocket's scope with its connection, a `SubscriberSocket`."""
@@ -296,13 +296,13 @@ class LimitedWebSocket(WebSocketsSansIOProtocol):
 
     def handle_connect(self, event: Request) -> None:
         """Reject the connection if the limit is reached, else accept it."""
-        doors = self.config.limiter
+        limiter = self.config.limiter
         self._is_node = event.path.partition("?")[0] == INGEST_PATH
         if not self._is_node:
             self.conn.max_message_size = CLIENT_MESSAGE_BYTES_MAX
         named = event.headers.get_all("X-Forwarded-For")
         client = self.config.find_forwarded_client(_address(self.client), named)
-        if doors.has_max_nodes if self._is_node else not doors.acquire(self.transport, client):
+        if limiter.has_max_nodes if self._is_node else not limiter.acquire(self.transport, client):
             self.app = refuse_connection
         super().handle_connect(event)
         if not self.close_sent:

@@ -78,7 +78,7 @@ class Settings(LimitSettings):
     advertise: str | None = None
     """Address or name shown to people, as that of a reverse proxy; else the addresses found."""
     no_quantize: bool = False
-    """Estimates as computed in recorded sessions, their noise not rounded off."""
+    """Store estimates of recorded sessions as computed; their noise is not rounded off."""
 
     @field_validator("data", mode="before")
     @classmethod

@@ -205,11 +205,11 @@ def replace_tiles(scene: Scene, serials: Sequence[str]) -> Scene:
 
 
 def find_scene_calibration(
-    options: RigOptions, on_progress: Callable[[str], None]
+    options: RigOptions, on_progress: ProgressCallback
 ) -> tuple[Calibration | None, str | None]:
     """Return the calibration of a rig's scene, or the reason for its absence.
 
-    Raw frames need none: `on_progress` receives the reason, too.
+    `on_progress` also receives the reason, unless the scene names none: raw frames need none.
     """
     scene = options.scene
     if scene.calibration == "none":

@@ -1,4 +1,4 @@
-"""Encoding of messages, checksums, and the end of connections: close codes, their tasks.
+"""Encoding of messages, checksums, close codes, and the tasks of a connection.
 
 Every message of the link has a CRC-32 (zlib), because neither websockets nor Arrow detect a
 flipped bit: the last four bytes of a binary message, little endian, over all before; the last field

@@ -168,7 +168,7 @@ class Proof(StrictModel):
 
     type: Literal["proof"] = "proof"
     proof: _Hex256 | None = None
-    """`service.protocol.link.make_proof`."""
+    """`make_proof`."""
     secret: _Hex256 | None = None
     """The secret itself: at first contact, or where a person has to accept this machine."""
 

@@ -431,7 +431,7 @@ class Rig:
         pressed = options.foot.compute_tile_load(scene)
         clock: Clock = self._line_clock
         if options.is_emulated:
-            from devices.clock import DriverClock, WireClock
+            from devices.emulation.driver_clock import DriverClock, WireClock
 
             self._clock = driver = DriverClock(self._clock)
             clock = WireClock(driver, self._line_clock)

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from devices.clock import server_utc_ns
 from devices.errors import (
@@ -35,6 +35,7 @@ from devices.errors import (
     UnknownError,
     UsageError,
 )
+from devices.types import StrictModel
 from service.estimation.calibration import Calibration
 from service.protocol.live import View
 from service.server.session_store import SessionStore
@@ -411,9 +412,7 @@ class AssignedCalibration:
     t_ns: int
 
 
-class _Assignment(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
+class _Assignment(StrictModel):
     t_ns: int
     calibration: Calibration | None
     """None: the assignment was removed."""

@@ -360,9 +360,9 @@ class Recorder:
     ) -> None:
         """Record a plausible measurement of a node's clock, in its stream and its sessions.
 
-        The stream's log stores it at once; sessions are saved with their next change. It is
-        dropped if its server time is far from the present time, or its node time far from the
-        clock that the hello stated.
+        A measurement is dropped if its server time is far from the present time, or its node time
+        far from the clock that the hello stated. Others go into the stream's log at once; sessions
+        are saved with their next change.
         """
         stated_t_ns = row.t_mono_ns + node.last_info.utc_offset_ns + row.server_minus_node_ns
         if abs(stated_t_ns - now_t_ns) > CLOCK_ERROR_MAX_NS + row.uncertainty_ns:

@@ -62,9 +62,8 @@ class NodeLink:
         self.has_outgoing = asyncio.Event()
         """Event: something has to be sent to the node."""
         self._acks: dict[str, Intervals] = {}
-        self.close_requested: asyncio.Future[tuple[LinkCloseCode, str]]
+        self.close_requested = asyncio.Future[tuple[LinkCloseCode, str]]()
         """Future with the reason, once the connection has to be closed."""
-        self.close_requested = asyncio.get_running_loop().create_future()
 
     def queue_ack(self, stream_id: str, frames: Intervals) -> None:
         """Queue an acknowledgement: these frames are on the disk."""

@@ -343,7 +343,7 @@ def _seal_if_possible(
         return stream.make_session_stream() if stream is not None else None
 
     facts = NodeFacts(find_stream=find_stream, frames_to_come=frames_to_come)
-    session = _settle(session, own_streams.values(), facts)
+    session = _close_parts_without_damaged_frames(session, own_streams.values(), facts)
     if any(part.seq_last is None for part in session.parts):
         return RecoveredSession(session, "waiting", "its node may still be recording it")
     for part in session.parts:
@@ -351,7 +351,7 @@ def _seal_if_possible(
         if stream is not None and part.seq_last is not None:
             stream.read_and_invalidate_damaged(part.seq_first, part.seq_last)
             stream.save_damage()
-    session = _settle(session, own_streams.values(), facts)
+    session = _close_parts_without_damaged_frames(session, own_streams.values(), facts)
     ledger = compute_present_ledger(session, facts)
     if session.state != "sealing":
         text = f"{ledger.pending} frames may still come from node {session.node}"
@@ -375,7 +375,9 @@ def _seal_if_possible(
     return RecoveredSession(sealed, "sealed", sealed.problem or "", ledger)
 
 
-def _settle(session: Session, streams: Iterable[OpenedStream | None], facts: NodeFacts) -> Session:
+def _close_parts_without_damaged_frames(
+    session: Session, streams: Iterable[OpenedStream | None], facts: NodeFacts
+) -> Session:
     """Return the session with its parts closed, as well as they are known."""
     while True:
         try:

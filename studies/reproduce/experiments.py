@@ -31,8 +31,7 @@ from service.estimation.fitting.least_squares import (
 )
 from service.estimation.fitting.rig.indentation import Strokes, average_stroke_blocks, select_loaded
 from service.estimation.fitting.static_fit import fit_static_curve
-from service.offline.calibration_fit import TileRecording as MillRecording
-from service.offline.calibration_fit import fit_calibration, read_indentations
+from service.offline.calibration_fit import TileRecording, fit_calibration, read_indentations
 from service.offline.calibration_lookup import RIG_REFERENCE, RIG_REFERENCE_DELAY, make_rig_scene
 from service.offline.simulation import SimulationOptions, run_simulation
 from service.rig.emulated_foot import EmulatedFoot
@@ -268,7 +267,7 @@ def calibrate_tile(scene: Scene, *, seed: int, parts_seed: int) -> Calibration:
 @contextmanager
 def _record_indentation(
     scene: Scene, seed: int, parts_seed: int
-) -> Iterator[Mapping[str, Sequence[MillRecording]]]:
+) -> Iterator[Mapping[str, Sequence[TileRecording]]]:
     with tempfile.TemporaryDirectory(prefix="foottile-indentation-") as work:
         recording = Path(work) / "indentation.parquet"
         foot = EmulatedFoot(seed=seed, parts_seed=parts_seed)

@@ -1,4 +1,4 @@
-"""Shared parts of routes: server state, files, entity tags, documented problems."""
+"""Shared parts of routes: server state, types, refusals, answers, documented problems."""
 
 from __future__ import annotations
 

@@ -318,7 +318,9 @@ async def zip_sessions(
     if not 1 <= len(names) <= IDS_MAX:
         raise UsageError(f"{len(names)} sessions", expected=f"ids of 1 to {IDS_MAX}")
     chosen = [
-        _require_files(server.sessions.get_session(name), server.sessions.folder.get_path(name))
+        _make_zipped_session(
+            server.sessions.get_session(name), server.sessions.folder.get_path(name)
+        )
         for name in names
     ]
     name = names[0] if len(names) == 1 else f"foottile-{len(names)}-sessions"
@@ -334,7 +336,7 @@ async def zip_sessions(
     )
 
 
-def _require_files(session: Session, folder: Path) -> ZippedSession:
+def _make_zipped_session(session: Session, folder: Path) -> ZippedSession:
     require_frames(require_sealed(session, "a zip file of it is", "Stop it, or leave it out"))
     assert session.sha256 is not None  # noqa: S101  # it has frames
     require_file(folder / FRAMES_NAME)

@@ -77,7 +77,7 @@ def calibrate_live(
         CalibrationError: the weights give no curve.
     """
     import foottile
-    from service.cli.report import calibration_to_json, make_calibration_tables
+    from service.cli.calibration_report import make_calibration_json, make_calibration_tables
     from service.estimation.dead_weights import check_and_label_weights
     from service.sessions.calibration_file import parse_calibration
     from storage.durable_files import write_atomically
@@ -114,7 +114,7 @@ def calibrate_live(
             _assign(source, node, calibration)
     if as_json:
         print_json(
-            {**calibration_to_json(calibration), "session": weighing["session_id"], "out": out}
+            {**make_calibration_json(calibration), "session": weighing["session_id"], "out": out}
         )
     else:
         remark(f"written: {out}; its recording is session {weighing['session_id']}")
@@ -388,7 +388,7 @@ def calibrate_command(
     for_plate = (*stated.values(), rate_hz, lag_range_s)
     if per_tile or shear or reference_gain_sigma or any(each is not None for each in for_plate):
         raise UsageError("these options go with --reference", remedy="Add --reference FILE")
-    from service.cli.report import calibration_to_json, make_calibration_tables
+    from service.cli.calibration_report import make_calibration_json, make_calibration_tables
     from service.estimation.effects import Parameter
     from service.estimation.fitting.effects_fit import DEFAULT_REFERENCE_DELAY
     from service.estimation.fitting.weights_fit import has_weights
@@ -432,7 +432,7 @@ def calibrate_command(
     if plot_path is not None and png is not None:
         write_atomically(plot_path, png)
     if as_json:
-        print_json(calibration_to_json(calibration))
+        print_json(make_calibration_json(calibration))
     else:
         for table in make_calibration_tables(calibration):
             stdout.print(table)
@@ -446,7 +446,7 @@ def _calibrate_mounted_foot(
     session: Path, reference: Path, out: Path, options: MountCalibrationOptions, *, as_json: bool
 ) -> None:
     """Fit a mounted foot to a force plate."""
-    from service.cli.report import make_mount_json, make_mount_table
+    from service.cli.calibration_report import make_mount_json, make_mount_table
     from service.offline.mount_calibration import calibrate_mount
     from service.sessions.calibration_file import write_calibration
 

@@ -61,6 +61,8 @@ def _add_setting_options(command: Callable[..., None]) -> Callable[..., None]:
     parameters = []
     limits = LimitSettings.model_fields
     for name, field in sorted(Settings.model_fields.items(), key=lambda item: item[0] in limits):
+        if name == "token":
+            continue  # a list of processes would show it
         kind: Any = field.annotation if field.annotation in (bool, int, float, Path) else str
         if get_origin(field.annotation) is tuple:
             kind = list[str]
@@ -74,9 +76,10 @@ def _add_setting_options(command: Callable[..., None]) -> Callable[..., None]:
                 annotation=Annotated[kind | None, option],
             )
         )
-    shown = [parameter for parameter in parameters if parameter.name != "token"]
     # A list that is not given may be empty.
-    return expand_options(command, shown, lambda given: {k: v for k, v in given.items() if v != []})
+    return expand_options(
+        command, parameters, lambda given: {k: v for k, v in given.items() if v != []}
+    )
 
 
 @require_extra("server", "`foottile serve`")

@@ -55,7 +55,7 @@ class StaticParams(ModelParams):
 
     @classmethod
     def make(cls, tiles: LoadBearingTiles) -> RecordArray[Self]:
-        """Make the curves of load-bearing tiles, of settled forces if `rubber` is named."""
+        """Make the curves of load-bearing tiles, of settled forces if `rubber` is used."""
         return cls.from_calibrations(tiles.calibrations, use_settled_curve="rubber" in tiles.models)
 
     @classmethod

@@ -68,10 +68,10 @@ def make_model_params(tiles: LoadBearingTiles) -> dict[str, RecordArray[Any]]:
         CalibrationError: the tiles are not calibrated for one of the models.
     """
     check_known_models_with_static(tiles.models)
-    named = {name: model for name, model in MODELS.items() if name in tiles.models}
-    for name, model in named.items():
+    used = {name: model for name, model in MODELS.items() if name in tiles.models}
+    for name, model in used.items():
         _reject_undetermined(name, model, tiles)
-    return {name: model.make(tiles) for name, model in named.items()}
+    return {name: model.make(tiles) for name, model in used.items()}
 
 
 def _reject_undetermined(name: str, model: type[ModelParams], tiles: LoadBearingTiles) -> None:
@@ -133,7 +133,7 @@ class FootParams(KernelRecord):
 
 
 class TileParams(ModelParamsByName):
-    """Parameters of a tile and of its models; those of models that are not named are not read."""
+    """Parameters of a tile and of its models; those of models that are not used are not read."""
 
     is_load_bearing: int
     a0: float  # law of the chip's counts

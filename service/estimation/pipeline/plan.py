@@ -82,7 +82,7 @@ class EstimationPlan:
 
     @property
     def curves(self) -> RecordArray[StaticParams]:
-        """Static curves of the load-bearing tiles; of settled forces if `rubber` is named."""
+        """Static curves of the load-bearing tiles; of settled forces if `rubber` is used."""
         found: RecordArray[StaticParams] = self.params.tiles["static"][self.load_bearing_columns]
         return found
 

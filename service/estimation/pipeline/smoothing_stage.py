@@ -263,7 +263,7 @@ def _copy_dome_state(dome_state: DomeState, to: DomeState) -> None:
 
 @jit_cached
 def _is_same_dome_state(tile_params: TileParams, one: DomeState, other: DomeState) -> bool:
-    """Return whether two states are equal in the models that are named."""
+    """Return whether two states are equal in the models that are used."""
     is_same = hysteresis.is_same_state(tile_params.hysteresis, one.hysteresis, other.hysteresis)
     if tile_params.rubber.is_used == 1:
         is_same = is_same and rubber.is_same_state(one.rubber, other.rubber)

@@ -143,7 +143,7 @@ def make_node_view(
 ) -> NodeView:
     """Return the present state of a node."""
     info, estimates = node.last_info, node.estimator
-    live, keeper = estimates.live, estimates.tare_controller
+    live, controller = estimates.live, estimates.tare_controller
     lost = node.present_stream_lost_by_reason
     tare = estimates.tare_history.tare_in_force_unless_lost(info)
     return NodeView(
@@ -160,9 +160,9 @@ def make_node_view(
         calibration_source=estimates.calibration_source,
         calibration_problem=estimates.calibration_problem,
         tare=make_tare_view(tare) if tare is not None else None,
-        tare_problem=keeper.missing_tare_reason,
-        tare_warnings=keeper.list_reasons_to_tare_again(),
-        auto_tare=keeper.auto_tare_state,
+        tare_problem=controller.missing_tare_reason,
+        tare_warnings=controller.list_reasons_to_tare_again(),
+        auto_tare=controller.auto_tare_state,
         drift=make_drift_view(node),
         storage_problem=node.storage_problem,
         clock=None if node.clock_offset is None else ClockView.model_validate(node.clock_offset),

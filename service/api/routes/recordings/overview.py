@@ -125,7 +125,9 @@ async def get_timeseries(
         make = partial(_encode_sealed, session, query, server, media_type)
         key = f"{session.sha256}|{query.model_dump_json()}"
     return await numbers_response(
-        *(request, make, _ONE_AT_A_TIME),
+        request,
+        make,
+        _ONE_AT_A_TIME,
         sealed_key=key,
         media_type=media_type,
         accept_encoding=accept_encoding,

@@ -42,7 +42,7 @@ SEAL_TIMEOUT_S = 5.0
 """Time that a stop waits for the sealed file before it answers."""
 
 _UNKNOWN = problem_responses(_404="No such session.", _409="Its files are damaged.")
-_NO_EVENT = problem_responses(_404="No such session or event.", _409="Its files are damaged.")
+_NO_MARKER = problem_responses(_404="No such session or marker.", _409="Its files are damaged.")
 
 Text = Annotated[str, StringConstraints(max_length=10_000), AfterValidator(check_user_text)]
 Tag = Annotated[
@@ -301,7 +301,7 @@ async def add_marker(session_id: str, body: AddMarker, server: ServerState) -> M
 @router.patch(
     "/{session_id}/markers/{marker_id}",
     summary="Rename or move a marker",
-    responses=problem_responses(_NO_EVENT, CHANGED, FULL),
+    responses=problem_responses(_NO_MARKER, CHANGED, FULL),
 )
 async def change_marker(
     session_id: str,
@@ -322,7 +322,7 @@ async def change_marker(
     "/{session_id}/markers/{marker_id}",
     summary="Delete a marker",
     **NO_CONTENT,
-    responses=problem_responses(_NO_EVENT, CHANGED, FULL),
+    responses=problem_responses(_NO_MARKER, CHANGED, FULL),
 )
 async def delete_marker(
     session_id: str, marker_id: str, server: ServerState, if_match: IfMatch = None
