@@ -4,9 +4,8 @@ Server and node run as processes of their own, with a proxy between them that le
 for a while and then everything again, or only so many bytes a second. Measured: how long after the
 link's return the page has a frame that was taken after it, and how long until the server has the
 last frame of the backlog. The backlog's bytes over the link's spare bandwidth is what no sender can
-be quicker than; it stands beside. A session is recorded all the while, and has to be complete; so
-does what a client of every frame receives. The server's CPU time is that from the link's return
-until the client has the last late frame.
+be quicker than; it stands beside. A session and a client of every frame run meanwhile; both have to
+be complete. The server's CPU time is that from the link's return until the client has caught up.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ RATES = (None, 400_000.0, 100_000.0)
 def main() -> None:
     parser = argparse.ArgumentParser(description="A link that goes away and comes back.")
     parser.add_argument("--seconds", type=float, default=60.0, help="length of each cut")
-    parser.add_argument("--rate", type=float, help="only the silent link of so many bytes a second")
+    parser.add_argument("--rate", type=float, help="one cut only: silent, at this many bytes/s")
     parser.add_argument("--out", type=Path, help="write a report in markdown")
     arguments = parser.parse_args()
     rows = []
@@ -88,12 +87,12 @@ def measure(
             time.sleep(0.1)
         time.sleep(2.0)
         session = api.post("/sessions", json={"node": "foot", "name": "cut"}).json()
-        told = folder / "frames.csv"
-        with told.open("w") as file:
+        client_csv = folder / "frames.csv"
+        with client_csv.open("w") as file:
             client = subprocess.Popen(
                 [*COMMAND, "stream", "foot", "--columns=seq,grf_n", f"--server={url}"], stdout=file
             )
-        while last_seq_of(told) is None:
+        while last_seq_of(client_csv) is None:
             time.sleep(0.1)
         time.sleep(2.0)
         with connect(url.replace("http", "ws") + "/api/v1/live", compression=None) as live:
@@ -123,12 +122,12 @@ def measure(
                 break
             time.sleep(0.05)
         backlog_s = time.monotonic() - back_s
-        while (last_seq_of(told) or 0) < missing_from and time.monotonic() - back_s < 600.0:
+        while (last_seq_of(client_csv) or 0) < missing_from and time.monotonic() - back_s < 600.0:
             time.sleep(0.05)
         cpu_s = server.cpu_s - cpu_s
         client.terminate()
         client.wait(20)
-        numbers = [int(line.split(",")[0]) for line in told.read_text().splitlines()[1:-1]]
+        numbers = [int(line.split(",")[0]) for line in client_csv.read_text().splitlines()[1:-1]]
         written = sum(path.stat().st_size for path in folder.glob("node/journal/*/*/*.arrows"))
         frame_bytes = written / node()["last_seq"]
         spare = None if rate is None else rate - frames_hz * frame_bytes
@@ -153,10 +152,10 @@ def measure(
         }
 
 
-def last_seq_of(told: Path) -> int | None:
+def last_seq_of(client_csv: Path) -> int | None:
     """The newest number in the client's table, which may end within a line."""
-    with told.open("rb") as file:
-        file.seek(max(0, told.stat().st_size - 200))
+    with client_csv.open("rb") as file:
+        file.seek(max(0, client_csv.stat().st_size - 200))
         lines = file.read().decode().splitlines()[1:-1]
     return int(lines[-1].split(",")[0]) if lines else None
 
@@ -176,7 +175,8 @@ def report(rows: list[dict[str, Any]], seconds: float) -> str:
         "a reset one ends every connection at once. Live picture: from the link's return to a "
         "frame on a screen that was taken after it; it contains the batch (25 ms), the estimator's "
         "look-ahead (10 ms) and the pacing of messages (33 ms). Least: the backlog's bytes over "
-        "what the link has to spare.",
+        "what the link has to spare. Gaps: jumps in the numbers that a client of every frame "
+        "received. CPU: the server's, from the link's return until that client has caught up.",
         "",
         "| link | bytes/s | live picture back, s | backlog, frames | complete after, s | least, s "
         "| session | gaps of the client | server's CPU, s |",

@@ -1,1 +1,1 @@
-"""Array of tiles behind multiplexers: start-up, schedules, scans, plausibility of readings."""
+"""Array of tiles behind multiplexers: start-up, schedules, scans, screening, bus recovery."""

@@ -294,7 +294,7 @@ class RecoveryResult:
 
 
 def recover_bus(recovery: BusRecovery, is_bus_working: Callable[[], bool]) -> RecoveryResult:
-    """Free a stuck bus by nine clocks, then by the multiplexers' RESET, until `moves()` is True.
+    """Free a stuck bus by nine clocks, else by the multiplexers' RESET, until it works.
 
     High lines do not prove that the bus works: a slave may pull them low again. A GPIO line that is
     busy now may be free at the next attempt.

@@ -1,4 +1,4 @@
-"""Each benchmark still runs, on few and short data, and prints its rows. Nothing here is timed."""
+"""The benchmarks of a table still run, on few and short data. Nothing here is timed."""
 
 from __future__ import annotations
 
@@ -42,7 +42,13 @@ RUNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("step_speed", "20", (r"\| 4 \| static ", r"\| 64 \| static ")),
 )
 """Script, arguments, and the beginnings of lines that it prints."""
-SLOW = ("fanout", "first_bar", "many_nodes")
+_PROCESSES = [pytest.mark.slow, pytest.mark.process]
+MARKS = {
+    "fanout": [*_PROCESSES, pytest.mark.real_time],
+    "first_bar": _PROCESSES,
+    "formats": _PROCESSES,
+    "many_nodes": [*_PROCESSES, pytest.mark.real_time],
+}
 SHORTER: dict[str, tuple[str, Any]] = {
     "many_nodes": ("SETTLE_S", 0.5),
     "pace": ("SCENES", 1),
@@ -54,7 +60,7 @@ SHORTER: dict[str, tuple[str, Any]] = {
 
 @pytest.mark.parametrize(
     ("name", "arguments", "expected"),
-    [pytest.param(*run, marks=[pytest.mark.slow] * (run[0] in SLOW)) for run in RUNS],
+    [pytest.param(*run, marks=MARKS.get(run[0], ())) for run in RUNS],
 )
 def test_a_benchmark_prints_its_rows(
     name: str,

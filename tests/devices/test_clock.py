@@ -1,4 +1,4 @@
-"""Injected time."""
+"""Injected time, and a server's UTC."""
 
 from __future__ import annotations
 
@@ -69,12 +69,12 @@ def test_an_anchor_converts_the_time_of_one_clock_to_the_other(t_mono_ns: int, t
 HOUR_NS = 3_600_000_000_000
 
 
-def test_it_is_the_date_of_this_machine() -> None:
+def test_a_servers_utc_is_the_date_of_its_machine() -> None:
     assert abs(server_utc_ns() - time.time_ns()) < HOUR_NS
 
 
 @pytest.mark.parametrize("step_ns", [HOUR_NS, -HOUR_NS])
-def test_it_does_not_follow_a_step_of_the_machines_clock(
+def test_a_servers_utc_does_not_follow_a_step_of_the_machines_clock(
     monkeypatch: pytest.MonkeyPatch, step_ns: int
 ) -> None:
     before_ns, real = server_utc_ns(), time.time_ns
@@ -82,6 +82,6 @@ def test_it_does_not_follow_a_step_of_the_machines_clock(
     assert 0 <= server_utc_ns() - before_ns < 60_000_000_000
 
 
-def test_it_never_goes_back() -> None:
+def test_a_servers_utc_never_goes_back() -> None:
     readings = [server_utc_ns() for _ in range(1000)]
     assert readings == sorted(readings)

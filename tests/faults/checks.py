@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -23,8 +22,6 @@ _STOP_S = 0.03
 """Frames that were on the link so long before the stop were surely taken before it."""
 _GOOD, _DAMAGED, _LOSSY = 0, 1, 3
 _NOT_READ_COUNTS = 65535
-
-Seqs = npt.NDArray[np.uint64]
 
 
 def findings(facts: Facts) -> list[str]:

@@ -119,6 +119,10 @@ class Proxy:
         """End `cut` or `black_hole`; `quality` stays."""
         self._call(self._set_flowing(True))
 
+    def drop_connections(self) -> None:
+        """Reset every connection there is, once."""
+        self._call(self._reset_all())
+
     def _call(self, coroutine: Coroutine[Any, Any, None]) -> None:
         asyncio.run_coroutine_threadsafe(coroutine, self._loop).result(10.0)
 

@@ -58,3 +58,17 @@ print((time.time_ns() - begin) - (time.monotonic_ns() - steady))
         < int(run(STEADY, **clock.environment()).out.split()[0])
         < int(run(STEADY).out.split()[0])
     )
+
+
+def test_a_stepped_datetime_is_still_the_real_type(run: Run, tmp_path: Path) -> None:
+    clock = WallClock(tmp_path / "clock")
+    code = """
+import datetime, pickle
+from pydantic import TypeAdapter
+now = datetime.datetime.now(datetime.UTC)
+assert type(now) is datetime.datetime and isinstance(now, datetime.date)
+assert pickle.loads(pickle.dumps(now)) == now
+assert TypeAdapter(datetime.datetime).validate_python(now) == now
+print(now.tzinfo)
+"""
+    assert run(code, **clock.environment()).out == "UTC\n"

@@ -20,8 +20,10 @@ HEAD = b"GET /api/v1/ingest HTTP/1.1\r\nUpgrade: websocket\r\n\r\n"
 TEXT, BINARY = 1, 2
 
 
-def frame(opcode: Opcode, payload: bytes = b"", *, masked: bool = True) -> bytes:
-    return Frame(opcode, payload).serialize(mask=masked)
+def frame(
+    opcode: Opcode, payload: bytes = b"", *, masked: bool = True, is_last: bool = True
+) -> bytes:
+    return Frame(opcode, payload, fin=is_last).serialize(mask=masked)
 
 
 @pytest.mark.parametrize("masked", [True, False])
@@ -37,6 +39,17 @@ def test_messages_are_found_however_the_bytes_come(
     messages = Messages()
     pieces = [data[at : at + cut] for at in range(0, len(data), cut)]
     assert [m for piece in pieces for m in messages.feed(piece)] == [(BINARY, p) for p in payloads]
+
+
+def test_a_message_in_pieces_with_a_ping_between_them_is_one() -> None:
+    data = (
+        HEAD
+        + frame(Opcode.TEXT, b"he", is_last=False)
+        + frame(Opcode.PING, b"?")
+        + frame(Opcode.CONT, b"llo")
+        + frame(Opcode.CLOSE)
+    )
+    assert list(Messages().feed(data)) == [(TEXT, b"hello")]
 
 
 def frames(first: int, count: int, stream_id: str) -> bytes:

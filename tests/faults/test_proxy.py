@@ -5,8 +5,9 @@ from __future__ import annotations
 import socket
 import socketserver
 import threading
+import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from typing import Any
 
 import pytest
@@ -90,6 +91,12 @@ def answer(connection: socket.socket, data: bytes) -> bytes:
     return got
 
 
+def test_a_good_link_changes_nothing(proxy: Proxy) -> None:
+    with connect(proxy) as connection:
+        data = bytes(range(256)) * 2000
+        assert answer(connection, data) == data
+
+
 def test_a_cut_link_resets_what_is_open_and_what_is_opened_and_comes_back_on_the_same_port(
     proxy: Proxy,
 ) -> None:
@@ -124,6 +131,24 @@ def test_in_a_black_hole_nobody_hears_anything_and_it_all_comes_late(
         assert connection.recv(5) == b"lost?"
 
 
+@pytest.mark.parametrize(
+    ("quality", "size", "least_s"),
+    [
+        (Quality(delay_s=0.1, jitter_s=0.1), 25_600, 0.2),  # both ways
+        (Quality(bytes_per_s=100_000), 40_000, 0.35),
+    ],
+)
+def test_delayed_or_throttled_bytes_come_in_order_and_not_early(
+    proxy: Proxy, quality: Quality, size: int, least_s: float
+) -> None:
+    proxy.quality = quality
+    with connect(proxy) as connection:
+        begin_s = time.monotonic()
+        data = (bytes(range(256)) * 200)[:size]
+        assert answer(connection, data) == data
+        assert time.monotonic() - begin_s >= least_s
+
+
 def test_bits_flip_on_the_way_to_the_server_only_and_are_counted(echo: Echo) -> None:
     heard = Heard()
     with Proxy(echo.port, seed=1, tap=lambda: heard) as proxy:
@@ -136,3 +161,19 @@ def test_bits_flip_on_the_way_to_the_server_only_and_are_counted(echo: Echo) -> 
         assert proxy.flips == sum(byte.bit_count() for byte in wrong)
         assert heard.node == data, "a tap sees what was sent"
         assert heard.server == got
+
+
+def test_bits_that_begin_to_flip_while_a_connection_is_open_flip(proxy: Proxy) -> None:
+    with connect(proxy) as connection:
+        assert answer(connection, bytes(20_000)) == bytes(20_000)
+        proxy.quality = Quality(flip_every_bytes=1000)
+        assert answer(connection, bytes(100_000)) != bytes(100_000)
+
+
+def test_a_dead_server_is_a_reset_and_one_that_is_back_is_reached(proxy: Proxy, echo: Echo) -> None:
+    echo.close()
+    with suppress(ConnectionResetError), connect(proxy) as connection:
+        assert connection.recv(1) == b""
+    again = Echo(echo.port)
+    with closing(again), connect(proxy) as connection:
+        assert answer(connection, b"again") == b"again"

@@ -109,3 +109,23 @@ def test_on_a_phone_nothing_is_wider_than_the_screen(scripted: Scripted, firefox
     firefox.open(f"{scripted.url}/sessions/{session.id}", 390, 844)
     firefox.wait("document.querySelector('#plots')?.dataset.settled === 'true'")
     firefox.wait("document.documentElement.scrollWidth <= innerWidth")
+
+
+def test_what_a_page_complains_of_is_heard(scripted: Scripted, browser_of_all: Firefox) -> None:
+    """Else the tests before this one could not fail for it."""
+    browser_of_all.open(scripted.url)
+    browser_of_all.complaints()
+    browser_of_all.run(
+        "console.warn('hm'); setTimeout(() => missing());"
+        "document.body.append(Object.assign(document.createElement('script'), {text: 'void 0'}))"
+    )
+    heard: list[str] = []
+
+    def all_three() -> bool:
+        heard.extend(browser_of_all.complaints())
+        return len(heard) >= 3
+
+    until(all_three)
+    for word in ("hm", "missing is not defined", "Content-Security-Policy"):
+        assert any(word in complaint for complaint in heard), heard
+    assert len(heard) == 3

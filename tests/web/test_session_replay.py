@@ -141,6 +141,16 @@ def test_the_foot_at_the_cursor_is_the_frame_of_the_file(
     expect(page.locator("#replay-lag")).to_contain_text("100 ms of look-ahead")
 
 
+def test_the_frames_were_worth_comparing(stored: dict[str, np.ndarray]) -> None:
+    """Else the test before this one could not fail."""
+    rows = slice(200 + ROLLED, 200 + ROLLED + SATURATED)
+    assert np.isnan(stored["force_sigma_n_1"][rows]).any()
+    assert (stored["tile_flags_1"] > 0).sum() == UNREAD
+    assert np.isnan(stored["grf_n"].astype(float)).any()
+    assert len(set(np.round(stored["cop_x_m"][300:800].astype(float), 5))) > 40
+    assert np.ptp(stored["angle_rad"].astype(float)) > 0.5
+
+
 def test_keys_step_from_frame_to_frame_over_what_is_lost_and_by_a_tenth_of_a_second(
     session: Recording, stored: dict[str, np.ndarray], open_page: OpenPage
 ) -> None:

@@ -2,9 +2,9 @@
 
 Sources: e-manual protocol1.md, protocol2.md and crc.md, hardware.md 5.1 and 5.2.
 
-Requests and answers have the same form, and a one-wire adapter echoes requests. An answer may equal
-its request: the answer to a ping, with the voltage bit set, is a ping. So the driver sends no
-request whose answer would have the same length: no ping, no read of two bytes.
+Requests and answers have the same form, and a one-wire adapter echoes requests. In 1.0 an answer
+may equal its request: the answer to a ping, with the voltage bit set, is a ping. So in 1.0 the
+driver sends no request whose answer would have the same length: no ping, no read of two bytes.
 
 The factory's firmware uses Protocol 1.0. "MX(2.0)" firmware uses 2.0 and has another control table
 and another model number (e-manual mx-28.md, mx-64.md and their `-2` pages).
@@ -327,7 +327,7 @@ class Register:
 
     address: int
     size: int
-    """Bytes to read: never two in 1.0, see above."""
+    """Bytes to read: never two in 1.0, see the module's docstring."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -341,14 +341,14 @@ class Firmware:
     position_bytes: int
     """Bytes of the present position: little-endian, signed, beyond one turn in multi-turn mode."""
     position_read_bytes: int
-    """Bytes to read from there: in 1.0 one more, see above."""
+    """Bytes to read from there: in 1.0 one more, see the module's docstring."""
     tick_register: Register
     """Realtime Tick: its first two bytes are milliseconds since power-up."""
     mode_register: Register
     """Operating Mode; in 1.0 the limits of the angle, CW and CCW, which decide the mode."""
 
     def get_count_range(self, mode_bytes: bytes) -> CountRange:
-        """Return the range of the count for the content of the register `mode`."""
+        """Return the range of the count for the content of `mode_register`."""
         if self.protocol.version == 2:
             return (
                 CountRange.ONE_TURN if mode_bytes[0] == _POSITION_CONTROL else CountRange.MANY_TURNS

@@ -43,7 +43,7 @@ def open_servo(
     """Open the servo at `port` (such as /dev/ttyUSB0) and check its model.
 
     A silent servo is opened as well, since it may start later: silence and a slow adapter are
-    `remarks` of the result. A port that fails later is reopened by its path, or by udev's link to
+    its `opening_warnings`. A port that fails later is reopened by its path, or by udev's link to
     its adapter.
 
     The default `timeout_s`, in seconds, is ample for the slowest case: 9600 baud (30 ms), the
@@ -59,7 +59,7 @@ def open_servo(
             clock, where a busy machine must not look like silence. None: `timeout_s`.
         model: "MX-28" or "MX-64".
         protocol: 1 or 2.
-        allows_missing_port: a missing port is a remark, and is opened as soon as it exists.
+        allows_missing_port: a missing port is a warning, and is opened as soon as it exists.
 
     Raises:
         ServoLostError: the port is missing, not permitted, or used by another program.

@@ -24,7 +24,6 @@ from service.offline.estimate.preparation import CHUNK_FRAMES, EstimateRequest
 from service.offline.export import ExportOptions, export_session
 from storage.clock.table import CLOCK_NAME
 from storage.documents import append_json_checksum
-from storage.formats.slice import Slice
 from storage.formats.writers.registry import get_format
 from storage.parquet_hash import compute_sha256
 from storage.sessions.folder import FRAMES_NAME
@@ -43,8 +42,6 @@ if TYPE_CHECKING:
     from service.offline.estimate.session import EstimateResult
 
 _SIDECAR_NAMES = (MARKERS_NAME, CLOCK_NAME, LEDGER_NAME, PULLED_MARKERS_NAME)
-
-_ALL = Slice()
 
 
 class SessionTask(Protocol):

@@ -105,6 +105,11 @@ def test_the_first_machine_is_accepted_whatever_dies(events: list[str]) -> None:
         assert machine.connect(server)
 
 
+def test_no_challenge_comes_twice(server: NodeIdentities) -> None:
+    challenges = [server.read_secret_and_make_challenge(NODE, SERVER) for _ in range(10)]
+    assert len({challenge.nonce for challenge in challenges}) == 10, "a proof could be replayed"
+
+
 def test_an_accepted_machine_replaces_the_first_one(
     server: NodeIdentities, machine: Machine, stranger: Machine
 ) -> None:

@@ -21,7 +21,6 @@ from tests.devices.chips.dynamixel.lines import SHORT_S
 MS = 1_000_000
 
 # hardware.md 5.1, from the e-manual
-PING_1 = bytes.fromhex("FFFFFD00 01 0300 01 194E")
 READ_POSITION_OF_1 = bytes.fromhex("FFFFFD00 01 0700 02 84000400 1D15")
 STATUS_OF_1_AT_166 = bytes.fromhex("FFFFFD00 01 0800 55 00 A6000000 8CC0")
 STATUS_OF_2_AT_2079 = bytes.fromhex("FFFFFD00 02 0800 55 00 1F080000 BABE")
@@ -47,12 +46,10 @@ class ScriptedPort:
         self.incoming = stale
         self.unsent = unsent
         self.read_ns = read_ns
-        self.written = b""
         self.reads = 0
         self.clock = VirtualClock(7)
 
     def write(self, data: bytes, /) -> int:
-        self.written += data
         self.incoming += self.answer
         return len(data) - self.unsent
 

@@ -1,4 +1,4 @@
-"""`static` where no counts lead: no number, any curve, and a covariance of rounded numbers."""
+"""`static` for inputs that no counts give: NaN, infinities, any curve, a rounded covariance."""
 
 from __future__ import annotations
 

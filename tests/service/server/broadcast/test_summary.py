@@ -27,7 +27,6 @@ from tests.builders.arrays import PERIOD_NS
 from tests.builders.frames import make_frames
 
 TILES = 2
-RANGE_KPA = np.array([15.0, 15.0])
 
 Columns = dict[str, np.ndarray]
 
