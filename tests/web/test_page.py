@@ -30,10 +30,10 @@ def test_a_stopped_server_greys_the_page_within_a_second_and_it_comes_back(
         body = page.locator("body")
         page.keyboard.press("r")
         expect(page.locator("#stop")).to_be_enabled()
-        stopped_s = time.monotonic()
-        running.stop()
-        expect(body).to_have_attribute("data-live", "false")
-        assert time.monotonic() - stopped_s < 1.5  # a second, and what looking takes
+    stopped_s = time.monotonic()
+    running.stop()
+    expect(body).to_have_attribute("data-live", "false")
+    assert time.monotonic() - stopped_s < 1.5  # a second, and what looking takes
     expect(page.locator("#frozen")).to_contain_text("No data")
     running.start()
     node.connect()
