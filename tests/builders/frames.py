@@ -115,7 +115,7 @@ def laid_out(batch: FrameBatch, how: str) -> FrameBatch:
 
 
 def cut_up(batch: FrameBatch, cuts: Iterable[int], how: str = "as it is") -> list[FrameBatch]:
-    """The frames in pieces, each laid out for itself; equal cuts, or one at an end, give an empty."""
+    """The frames in pieces, each laid out for itself; empty between equal cuts, or at an end."""
     edges = sorted(cut for cut in cuts if 0 <= cut <= len(batch))
     return [laid_out(batch.slice_rows(a, b), how) for a, b in pairwise((0, *edges, len(batch)))]
 
