@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -85,8 +84,8 @@ def test_saturated_and_silent_tiles_cannot_be_mistaken_for_values(
         expect(page.locator("#grf")).to_have_attribute("data-value", "")  # no sum without T02
         # What T01, T03 and T04 bear at least, and why it is no more.
         expect(page.locator("#grf-bound")).to_have_text("at least")
-        expect(page.locator("#grf")).to_have_text(re.compile(r"\d"))  # it is drawn less often
-        at_least_n = float(page.inner_text("#grf"))
+        # Not `inner_text`: a pause of the frames hides the card, as on a busy machine.
+        at_least_n = float(page.text_content("#grf") or "nan")
         assert 20.0 < at_least_n < 210.0
         expect(page.locator("#grf-sigma")).to_have_text("(T02 missing, T03 saturated)")
         expect(page.locator("#cop")).to_have_text("No COP: T02 missing, T03 saturated")
