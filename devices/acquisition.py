@@ -137,13 +137,13 @@ class Acquisition:
         array.begin_stream()
 
     def acquire_batches(self, should_stop: Callable[[], bool]) -> Iterator[FrameBatch]:
-        """Acquire frames until `stop()`, evaluated before every frame, returns True.
+        """Acquire frames until `should_stop()`, evaluated before every frame, returns True.
 
         Yields:
             Batches of at least one frame; the last one may be short.
 
         Raises:
-            BusMisuseError: as for `TileArray.scan`; other faults are flags.
+            BusMisuseError: as for `TileArray.scan_frame`; other faults are flags.
         """
         slot_ns = self._clock.now_ns()
         while not should_stop():

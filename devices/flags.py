@@ -84,7 +84,7 @@ TILE_FLAGS: Mapping[TileFlag, FlagText] = {
         "no answer", "it did not acknowledge, or is looked for: no counts", Severity.UNKNOWN
     ),
     TileFlag.STALE: FlagText(
-        "stale", "the same words for ten frames: counts are kept, not used", Severity.UNKNOWN
+        "stale", "the node read the same counts for ten frames: kept, not used", Severity.UNKNOWN
     ),
     TileFlag.RETRIED: FlagText("", "it took a second attempt, or a third reading: good"),
     TileFlag.IMPLAUSIBLE: FlagText(
@@ -149,7 +149,7 @@ ESTIMATE_FLAGS: Mapping[EstimateFlag, FlagText] = {
     ),
     EstimateFlag.STUCK: FlagText(
         "tile stuck",
-        "a tile repeats a count for longer than its noise allows: its force is unknown",
+        "the estimator sees a count repeated for longer than noise allows: force is unknown",
         Severity.UNKNOWN,
     ),
     EstimateFlag.TARE_LOST: FlagText(

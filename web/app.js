@@ -94,10 +94,10 @@ const handlers = {
   },
   node({ node }) {
     const isNew = !state.nodes.has(node.node);
-    const wasBoot = state.nodes.get(node.node)?.stream_id;
+    const previousStreamId = state.nodes.get(node.node)?.stream_id;
     state.nodes.set(node.node, node);
     if (state.node?.node === node.node) {
-      if (wasBoot !== node.stream_id) clearFrames(); // new stream: the old trace does not continue
+      if (previousStreamId !== node.stream_id) clearFrames(); // new stream: the old trace does not continue
       state.node = node;
       show();
     }

@@ -30,9 +30,9 @@ class PlausibilityCheck:
     """Plausibility check of the readings of an array's tiles."""
 
     def __init__(
-        self, ports: TileIo, clock: Clock, health: Sequence[TileHealth], bus: BusMonitor
+        self, tile_io: TileIo, clock: Clock, health: Sequence[TileHealth], bus: BusMonitor
     ) -> None:
-        self._tile_io = ports
+        self._tile_io = tile_io
         self._clock = clock
         self._health = health
         self._bus = bus
@@ -92,33 +92,33 @@ class PlausibilityCheck:
             health.accept_reading(*counts, self._clock.now_ns())
 
     def _read_majority(
-        self, scan: Scan, tile: int, words: Counts, with_temperature: bool
+        self, scan: Scan, tile: int, counts: Counts, with_temperature: bool
     ) -> Counts:
         """Read again and return the majority: if two readings differ, a third one decides."""
         again = self._reread(scan, tile, with_temperature)
-        if again == words:
-            return words
+        if again == counts:
+            return counts
         if again is None:
-            if self._health[tile].is_jump(*words):
+            if self._health[tile].is_jump(*counts):
                 scan.add_flag(tile, TileFlag.IMPLAUSIBLE)
-            return words
+            return counts
         third = self._reread(scan, tile, with_temperature)
         self._disturbed_until_ns = self._clock.now_ns() + DISTURBED_NS
         self._health[tile].fault_counts["disturbed"] += 1
         scan.add_flag(tile, TileFlag.RETRIED)
-        if third is None or third not in (words, again):
+        if third is None or third not in (counts, again):
             scan.add_flag(tile, TileFlag.IMPLAUSIBLE)
             return again
         return third
 
     def _reread(self, scan: Scan, tile: int, with_temperature: bool) -> Counts | None:
         """Select the tile and read the same conversion again; None without an answer."""
-        words = None
+        counts = None
         self._tile_io.invalidate_muxes([tile])
         with scan.charge_retry(self._clock), suppress(NoAcknowledgeError):
             self._tile_io.connect_tile(tile)
-            words = self._tile_io.read_counts(tile, with_temperature)
-        return words
+            counts = self._tile_io.read_counts(tile, with_temperature)
+        return counts
 
     def _verify_identity(self, scan: Scan, tile: int) -> None:
         """Verify by the registers that only this tile is connected; else flag it."""
@@ -162,7 +162,7 @@ class ConversionMonitor:
 
     def __init__(
         self,
-        ports: TileIo,
+        tile_io: TileIo,
         clock: Clock,
         health: Sequence[TileHealth],
         timing: BusTiming,
@@ -170,18 +170,18 @@ class ConversionMonitor:
         self._measured_ns = tuple(round(wait_s * 1e9) for wait_s in timing.conversions_s)
         self.wait_ns = list(self._measured_ns)
         """Wait for each tile's conversion."""
-        self._tile_io = ports
+        self._tile_io = tile_io
         self._clock = clock
         self._health = health
-        whole = replace(timing, bytes_per_read=max(chip.counts_bytes for chip in ports.chips))
-        self._longest_ns = [chip.conversion_max_ns for chip in ports.chips]
+        whole = replace(timing, bytes_per_read=max(chip.counts_bytes for chip in tile_io.chips))
+        self._longest_ns = [chip.conversion_max_ns for chip in tile_io.chips]
         self._wires_ns = round((whole.convert_s + whole.read_s) * 1e9)
         self._suspects: list[int] = []
         self._slow_due_ns = 0
         self._tries = 0
 
     def check_read_in_time(self, tile: int, last_counts: Counts) -> None:
-        """Re-read a tile that gave `words` and was not restarted; suspect it if they changed.
+        """Re-read a tile that was not restarted; suspect it if its counts have changed.
 
         Raises:
             I2cError: the tile does not answer.
@@ -224,11 +224,11 @@ class ConversionMonitor:
         settled = [self._convert_fully(tile)]
         early: list[Counts] = []
         for _ in range(tries):
-            words, in_time = self._convert_and_read(tile, self._measured_ns[tile])
+            counts, in_time = self._convert_and_read(tile, self._measured_ns[tile])
             if not in_time:
                 settled[-1] = self._convert_fully(tile)
                 continue
-            early.append(words)
+            early.append(counts)
             if early[-1][1] != settled[-1][1]:
                 self._mark_fast(tile)  # the temperature is loaded last: the conversion had finished
                 return
@@ -236,7 +236,7 @@ class ConversionMonitor:
             if len(early) >= _SAME_MAX and early == settled[: len(early)]:
                 break  # no count has changed: the part is late
         if len({temperature_raw for _, temperature_raw in settled}) == 1 and any(
-            words != before for words, before in zip(early, settled, strict=False)
+            counts != before for counts, before in zip(early, settled, strict=False)
         ):
             self._mark_fast(tile)  # with constant temperature the pressure decides
         elif len(early) >= _SAME_MAX and len(set(settled)) > 1 and not health.is_slow:
@@ -263,7 +263,7 @@ class ConversionMonitor:
         self._tile_io.start_conversions([tile])
         stop_ns = self._clock.now_ns()
         self._clock.sleep_until_ns(stop_ns + delay_ns)
-        words = self._tile_io.read_counts(tile, with_temperature=True)
+        counts = self._tile_io.read_counts(tile, with_temperature=True)
         waited_ns = self._clock.now_ns() - begin_ns - self._wires_ns
         self._clock.sleep_until_ns(stop_ns + self._longest_ns[tile])
-        return words, waited_ns <= delay_ns + _HESITATION_NS
+        return counts, waited_ns <= delay_ns + _HESITATION_NS

@@ -228,10 +228,10 @@ def measure_conversion_ns(
         driver.start_conversion()
         stop_ns = clock.now_ns()
         clock.sleep_until_ns(stop_ns + delay_ns)
-        words = driver.read_counts()
+        counts = driver.read_counts()
         waited_ns = max(delay_ns, clock.now_ns() - begin_ns - wires_ns)
         clock.sleep_until_ns(stop_ns + settled_ns)
-        return words, waited_ns
+        return counts, waited_ns
 
     def finished_within(delay_ns: int, known_ns: int) -> int | None:
         """Return a wait after which a conversion had finished; None if none had.
@@ -243,13 +243,13 @@ def measure_conversion_ns(
         pressure_changed = False
         for _ in range(_TEMPERATURE_SAME_MAX):
             settled, _ = convert_and_read(settled_ns)
-            words, waited_ns = convert_and_read(delay_ns)
-            if waited_ns >= known_ns and words != settled:
+            counts, waited_ns = convert_and_read(delay_ns)
+            if waited_ns >= known_ns and counts != settled:
                 continue
-            if words[1] != settled[1]:
+            if counts[1] != settled[1]:
                 return waited_ns
             in_time += 1
-            pressure_changed |= words[0] != settled[0]
+            pressure_changed |= counts[0] != settled[0]
             if in_time >= _SAME_MAX and not pressure_changed:
                 return None
         return None if in_time >= _SAME_MAX else known_ns

@@ -193,7 +193,7 @@ class TileHealth:
         self._recent: deque[int] = deque(maxlen=_RECENT)
         self._temperature_raw: int | None = None
         self._temperature_ns = 0
-        self._last_words = (NOT_READ, NOT_READ)
+        self._last_counts = (NOT_READ, NOT_READ)
         self._stale_evidence = 0
         self._probe_due_ns = 0
         self._probe_wait_ns = 0
@@ -262,16 +262,16 @@ class TileHealth:
         """Update the evidence with a frame's reading; return whether the tile is stale."""
         if pressure_raw == NOT_READ:
             return False
-        same = pressure_raw == self._last_words[0] and (
-            temperature_raw == NOT_READ or self._last_words[1] in (temperature_raw, NOT_READ)
+        same = pressure_raw == self._last_counts[0] and (
+            temperature_raw == NOT_READ or self._last_counts[1] in (temperature_raw, NOT_READ)
         )
         if same:
             self._stale_evidence += 1 if temperature_raw == NOT_READ else 2
         else:
             self._stale_evidence = 0
-        self._last_words = (
+        self._last_counts = (
             pressure_raw,
-            self._last_words[1] if same and temperature_raw == NOT_READ else temperature_raw,
+            self._last_counts[1] if same and temperature_raw == NOT_READ else temperature_raw,
         )
         return self.has_stale_readings
 

@@ -33,8 +33,8 @@ from devices.scene.hardware_sections import ScheduleName
 class TileReconnector:
     """Prober of the lost tiles of an array, with a backoff for each."""
 
-    def __init__(self, ports: TileIo, clock: Clock, health: Sequence[TileHealth]) -> None:
-        self._tile_io = ports
+    def __init__(self, tile_io: TileIo, clock: Clock, health: Sequence[TileHealth]) -> None:
+        self._tile_io = tile_io
         self._clock = clock
         self._health = health
 
@@ -69,16 +69,16 @@ class TileReconnector:
             health.is_replaced = False
             return True
         # A flipped bit, in the reading or the select before it, must not look like another part.
-        words = set()
+        readings = set()
         for _ in range(2):
             self._tile_io.router.invalidate_cache()
             self._tile_io.connect_tile(tile)
-            words.add(self._tile_io.identify(tile))
-        if words == {health.registers}:
+            readings.add(self._tile_io.identify(tile))
+        if readings == {health.registers}:
             health.is_replaced = False
             return True
         # Equal, plausible readings of other registers: another part.
-        health.is_replaced = len(words) == 1 and not self._tile_io.router.silent_addresses
+        health.is_replaced = len(readings) == 1 and not self._tile_io.router.silent_addresses
         return False
 
 
@@ -306,21 +306,21 @@ class TileArray:
             self._frame_index % self._temperature_every == 0
             or health.is_temperature_due(self._clock.now_ns())
         )
-        words = (NOT_READ, NOT_READ)
+        counts = (NOT_READ, NOT_READ)
 
         def transfers() -> None:
-            nonlocal words
+            nonlocal counts
             self._tile_io.connect_tile(tile)
             self._wait_for_conversion(scan, ready_ns)
-            words = self._tile_io.read_counts(tile, with_temperature)
+            counts = self._tile_io.read_counts(tile, with_temperature)
 
         answers = self._run_with_retry(scan, [tile], transfers)
         self._is_converting[tile] = False
-        self._last_counts[tile] = words
+        self._last_counts[tile] = counts
         if answers:
             may_ask = self._may_retry(scan, tile)
             self._plausibility.check_reading(
-                scan, tile, words, with_temperature=with_temperature, may_retry=may_ask
+                scan, tile, counts, with_temperature=with_temperature, may_retry=may_ask
             )
         else:
             scan.add_flag(tile, TileFlag.NO_ANSWER)

@@ -160,7 +160,7 @@ class AcquisitionProcess:
         self._thread.start()
 
     def request_stop(self) -> None:
-        """Request the end; the last frames still arrive, then `Failed(None)`."""
+        """Request the end; the last frames still arrive, then `AcquisitionEnded(None)`."""
         with suppress(OSError):
             self._connection.send(None)
 

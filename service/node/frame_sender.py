@@ -72,7 +72,7 @@ class SendWindow:
         self._sent += length
 
     def record_ping(self, number: int) -> None:
-        """Record a ping behind all bytes sent before; `answered` takes its answer."""
+        """Record a ping behind all bytes sent before, until `record_ping_answer`."""
         self._pings.append((number, self._sent))
 
     def record_ping_answer(self, number: int, now_s: float) -> None:

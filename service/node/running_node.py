@@ -397,7 +397,7 @@ def make_hello(options: NodeOptions, journal: NodeJournal, present_stream: NodeS
     Raises:
         StorageError: a journal cannot be read.
     """
-    next_seq = present_stream.next_seq  # before `held`, which may grow meanwhile
+    next_seq = present_stream.next_seq  # before `stored`, which may grow meanwhile
     # Another stream may have begun meanwhile; it has not ended.
     others = list(takewhile(lambda stream: stream is not present_stream, journal.streams))
     # Streams that a session waits for come first, then the newest.

@@ -360,7 +360,7 @@ class Rig:
         self._rate_monitor = FrameRateMonitor(self.info.nominal_rate_hz)
 
     def acquire_batches(self, should_stop: Callable[[], bool]) -> Iterator[FrameBatch]:
-        """Acquire batches of one stream until `stop()` returns True.
+        """Acquire batches of one stream until `should_stop()` returns True.
 
         Frames before the begin of an emulated load are flagged as lead. The stream also ends when a
         part was replaced, or when it is faster than its nominal rate: then `info` describes a new

@@ -76,7 +76,7 @@ class FrameRateMeter:
 
 log = logging.getLogger("foottile.nodes")
 
-BOOT_ID_PATTERN = re.compile(STREAM_ID_PATTERN)
+STREAM_ID_RULE = re.compile(STREAM_ID_PATTERN)
 HELLO_NAME = "hello.json"
 
 
@@ -99,7 +99,7 @@ class ServerNode:
         self.unreadable_streams: dict[str, str] = {}
         """Streams whose journals cannot be read now, by id: why. Their frames are unknown."""
         self.is_dirty = False
-        """True if hello is not saved yet; `save` saves it before its frames are acknowledged."""
+        """True if hello is not saved yet; it must be before its frames are acknowledged."""
         self.has_connected = False
         """True if the node has sent hello since the server was started."""
         self.hello_t_ns: int | None = None
@@ -121,7 +121,7 @@ class ServerNode:
         self._rate_meter = FrameRateMeter()
         self._problems: list[str] = []
         for path in sorted(journals.glob("*")):
-            if BOOT_ID_PATTERN.fullmatch(path.name):
+            if STREAM_ID_RULE.fullmatch(path.name):
                 try:
                     self.streams[path.name] = stream = ServerStream.open_stored(path)
                     self._problems += stream.problems

@@ -39,7 +39,7 @@ from storage.sessions.folder import (
 from storage.sessions.metadata import write_markers
 from storage.sessions.reader import SealedFileReader, VerifiedFileCache
 
-log = logging.getLogger("foottile.book")
+log = logging.getLogger("foottile.sessions")
 
 
 def load_or_rebuild_sessions(folder: SessionsFolder) -> LoadedSessions:

@@ -238,7 +238,7 @@ class SessionFrames:
     def _iterate_estimated(self) -> Iterator[tuple[FrameBatch, Columns]]:
         sources = self._inputs
         with require_extra("server", "the estimator", remedy=_REMEDY):
-            from service.sessions.pipeline import (
+            from service.sessions.estimate_stream import (
                 EstimateOptions,
                 EstimateStream,
                 make_estimate_metadata,

@@ -27,9 +27,9 @@ from devices.errors import FootTileError, StateError, StorageError
 from devices.frames import FrameBatch
 from service.estimation import LIVE_LAG_MS
 from service.estimation.compilation import is_compiling
+from service.sessions.estimate_stream import EstimateOptions, EstimateStream
 from service.sessions.inputs import Columns, SessionInputs, iterate_raw_frames_with_part
 from service.sessions.overview import BinnedSlice
-from service.sessions.pipeline import EstimateOptions, EstimateStream
 from storage.durable_files import ScratchBlock, ScratchFile
 from storage.formats.slice import Slice
 from storage.schema import Array

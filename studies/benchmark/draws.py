@@ -34,7 +34,7 @@ from service.offline.calibration_lookup import find_calibration
 from service.offline.estimate_summary import concatenate_columns
 from service.offline.simulation import EmulatedRun, SimulationOptions
 from service.rig.emulated_foot import EmulatedFoot
-from service.sessions.pipeline import ROWS_PER_STEP, EstimateOptions, EstimateStream
+from service.sessions.estimate_stream import ROWS_PER_STEP, EstimateOptions, EstimateStream
 
 BASE_MODELS = ("unwrap", "static")
 """First model set: the models that every force needs."""

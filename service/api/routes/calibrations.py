@@ -30,7 +30,7 @@ from service.server.calibrations import JOB_SESSIONS_MAX, CalibrationSummaryView
 from service.server.node import ServerNode
 from service.server.session_store import check_revision
 from service.sessions.calibration_file import encode_calibration, parse_calibration
-from service.sessions.pipeline import EstimateOptions, EstimateStream
+from service.sessions.estimate_stream import EstimateOptions, EstimateStream
 from service.user_folders import PublicText
 
 router = APIRouter(tags=["calibrations"])

@@ -67,7 +67,7 @@ def simulate_command(
     from service.offline.calibration_lookup import find_calibration, replace_tiles
     from service.offline.simulation import SimulationOptions, run_simulation
     from service.rig.emulated_foot import make_injected_path
-    from service.sessions.pipeline import EstimateOptions
+    from service.sessions.estimate_stream import EstimateOptions
 
     the_scene = load_scene(scene)
     if tiles is not None:

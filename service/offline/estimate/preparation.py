@@ -23,7 +23,7 @@ from service.estimation.estimate import Estimator, ModelEstimator
 from service.estimation.pipeline.plan import EstimationPlan, compute_settling_time_s
 from service.estimation.tare.tare import Tare
 from service.offline.calibration_lookup import EMULATED_RIG, find_calibration
-from service.sessions.pipeline import EstimateOptions, Extra
+from service.sessions.estimate_stream import EstimateOptions, Extra
 from storage.formats.slice import Slice
 from storage.schema import INDENTER_COLUMNS, PART_COLUMNS, TRUTH_COLUMNS
 from storage.sessions.reader import SealedFileReader

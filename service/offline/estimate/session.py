@@ -36,7 +36,7 @@ from service.offline.estimate.preparation import (
     select_tares_in_force,
 )
 from service.offline.estimate_summary import EstimateSummarizer, EstimateSummary
-from service.sessions.pipeline import EstimateOptions, EstimateStream, make_estimate_metadata
+from service.sessions.estimate_stream import EstimateOptions, EstimateStream, make_estimate_metadata
 from service.sessions.stances import StancesWriter
 from storage.documents import append_json_checksum, verify_and_strip_json_checksum
 from storage.durable_files import open_for_atomic_write, read_small_file, write_atomically

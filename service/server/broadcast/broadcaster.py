@@ -118,8 +118,8 @@ class RateGroup:
                 await self.send_update(loop.time())
             except Exception as error:
                 # An encoding error affects one group only: its subscribers may reconnect.
-                for viewer in self.subscribers:
-                    viewer.request_disconnect(error)
+                for subscriber in self.subscribers:
+                    subscriber.request_disconnect(error)
             await asyncio.sleep(due_s - loop.time())
 
     async def send_update(self, now_s: float) -> None:
@@ -127,9 +127,9 @@ class RateGroup:
         if not self._pending:
             return
         tick = Tick(self._pending, _newest_frame_ages_ms(self._nodes.values()))
-        for count, viewer in enumerate(tuple(self.subscribers), 1):
-            if viewer in self.subscribers:  # it may have left meanwhile
-                viewer.send_or_merge_tick(tick, now_s)
+        for count, subscriber in enumerate(tuple(self.subscribers), 1):
+            if subscriber in self.subscribers:  # it may have left meanwhile
+                subscriber.send_or_merge_tick(tick, now_s)
             if count % _WRITES_PER_TURN == 0:
                 await asyncio.sleep(0)
 
@@ -146,7 +146,7 @@ class Broadcaster:
     @property
     def subscriber_count(self) -> int:
         """Number of subscribers."""
-        return sum(len(feed.subscribers) for feed, _ in self._groups.values())
+        return sum(len(group.subscribers) for group, _ in self._groups.values())
 
     def subscribe(
         self, socket: SubscriberSocket, max_rate_hz: float, node_filter: str | None = None
@@ -160,17 +160,17 @@ class Broadcaster:
         """
         key = node_filter, max(rate for rate in RATES_HZ if rate <= max_rate_hz)
         if key not in self._groups:
-            feed = RateGroup(*key, self._nodes)
-            self._groups[key] = feed, asyncio.create_task(feed.run())
-        viewer = Subscriber(socket)
-        self._groups[key][0].subscribers.add(viewer)
-        return viewer
+            group = RateGroup(*key, self._nodes)
+            self._groups[key] = group, asyncio.create_task(group.run())
+        subscriber = Subscriber(socket)
+        self._groups[key][0].subscribers.add(subscriber)
+        return subscriber
 
     def unsubscribe(self, subscriber: Subscriber) -> None:
         """Remove a subscriber."""
-        for key, (feed, task) in list(self._groups.items()):
-            feed.subscribers.discard(subscriber)
-            if not feed.subscribers:
+        for key, (group, task) in list(self._groups.items()):
+            group.subscribers.discard(subscriber)
+            if not group.subscribers:
                 task.cancel()
                 del self._groups[key]
 
@@ -218,7 +218,7 @@ class Broadcaster:
         return _newest_frame_ages_ms([node]).get(node.name) if has_frames else None
 
     def _pending_updates(self) -> list[PendingUpdate]:
-        return [feed.schedule_pending_update() for feed, _ in self._groups.values()]
+        return [group.schedule_pending_update() for group, _ in self._groups.values()]
 
 
 def encode_websocket_messages(texts: Iterable[str]) -> bytes:

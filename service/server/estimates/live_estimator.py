@@ -31,7 +31,7 @@ from service.estimation.tare.automatic import (
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded_windows import TareFrames, compute_recording_tare
 from service.estimation.tare_recovery import remove_recovery
-from service.sessions.pipeline import Columns, EstimateOptions, EstimateRun, EstimateStream
+from service.sessions.estimate_stream import Columns, EstimateOptions, EstimateRun, EstimateStream
 
 
 @dataclass(frozen=True)

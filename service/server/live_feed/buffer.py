@@ -17,7 +17,7 @@ from service.server.estimates.node_estimator import EstimatedBatch
 from service.server.live_feed.events import EncodeCache, FrameRows, slice_batch
 from service.server.node import ServerNode
 from service.server.streams import ServerStream
-from service.sessions.pipeline import Columns
+from service.sessions.estimate_stream import Columns
 from storage.intervals import NO_END, Intervals, Losses
 
 _BUFFER_BYTES_MAX = 8 << 20

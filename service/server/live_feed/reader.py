@@ -38,7 +38,7 @@ from service.server.live_feed.cursors import QUEUE_NS, LosslessCursor, LossyCurs
 from service.server.live_feed.events import FeedEvent, FrameRows, Position, StreamStart, slice_batch
 from service.server.node import ServerNode
 from service.server.streams import ServerStream
-from service.sessions.pipeline import EstimateOptions, EstimateRun, EstimateStream
+from service.sessions.estimate_stream import EstimateOptions, EstimateRun, EstimateStream
 from storage.intervals import Intervals
 
 ROWS_AT_ONCE = 1024

@@ -11,7 +11,7 @@ import numpy as np
 from devices.flags import FrameFlag
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
-from service.sessions.pipeline import EstimateOptions, EstimateStream
+from service.sessions.estimate_stream import EstimateOptions, EstimateStream
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.calibrations import make_calibration, newton_tile
 from tests.builders.frames import loaded_frames

@@ -38,7 +38,7 @@ from storage.sessions.pyramid import (
 from tests.builders.arrays import PERIOD_NS
 from tests.builders.frames import make_frames
 from tests.service.sessions.pieces import array, calibration, hopping
-from tests.service.sessions.test_pipeline_tares import taken_at
+from tests.service.sessions.test_estimate_stream_tares import taken_at
 
 EVERY = 24
 

@@ -15,7 +15,7 @@ from service.offline.calibration_lookup import find_calibration
 from service.offline.compare.block_covariance import UncertainValue
 from service.offline.simulation import SimulationOptions, run_simulation
 from service.rig.emulated_foot import EmulatedFoot, PlateFiles
-from service.sessions.pipeline import EstimateOptions
+from service.sessions.estimate_stream import EstimateOptions
 from studies.reproduce.experiments import POPPY, ROLLING, ExperimentSetup
 from studies.reproduce.result import (
     InjectedValueCheck,

@@ -28,7 +28,7 @@ from storage.parquet_hash import compute_sha256
 from storage.sessions.writer import SealedFileWriter
 from tests.builders.calibrations import make_calibration, make_effects, newton_tile
 from tests.service.sessions.pieces import array, frames, hopping
-from tests.service.sessions.test_pipeline_tares import later_part, taken_at
+from tests.service.sessions.test_estimate_stream_tares import later_part, taken_at
 
 PERIOD_NS = 20_000_000
 MINUTE = 3000

@@ -11,7 +11,7 @@ import pytest
 
 from service.offline.estimate.preparation import EstimateRequest
 from service.offline.estimate.session import estimate_session
-from service.sessions.pipeline import EstimateStream
+from service.sessions.estimate_stream import EstimateStream
 from service.sessions.stances import load_stances
 from storage.formats.export import make_one_pass_frame_source
 from storage.formats.slice import Slice

@@ -30,7 +30,7 @@ from service.server.live_feed.events import (
     StreamStart,
 )
 from service.server.live_feed.reader import FeedReader, RecomputedFrames
-from service.sessions.pipeline import EstimateRun
+from service.sessions.estimate_stream import EstimateRun
 from storage.journal.journal import Journal
 from tests.builders.arrays import PERIOD_NS, UTC_NS
 from tests.service.server.live_feed.world import WAITING, World, bits

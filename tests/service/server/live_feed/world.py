@@ -24,7 +24,7 @@ from service.server.live_feed.buffer import FeedBuffer
 from service.server.live_feed.events import Position
 from service.server.live_feed.reader import FeedReader
 from service.server.node import ServerNode
-from service.sessions.pipeline import Columns
+from service.sessions.estimate_stream import Columns
 from storage.intervals import NO_END, Intervals
 from storage.schema import wire_schema
 from storage.wire import encode_frames

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from devices.errors import TareError
 from devices.frames import FrameBatch
 from service.estimation.tare.tare import Tare
-from service.sessions.pipeline import EstimateStream, make_estimate_metadata
+from service.sessions.estimate_stream import EstimateStream, make_estimate_metadata
 from tests.builders.arrays import COUNT_KPA, UNLOADED_KPA
 from tests.service.sessions.pieces import Piece, array, cut, frames, hopping, options, run, same
 

@@ -20,8 +20,8 @@ from service.estimation.estimate import ModelEstimator
 from service.estimation.pipeline.plan import make_plan
 from service.estimation.records import Estimates
 from service.estimation.tare.tare import Tare
-from service.sessions import pipeline
-from service.sessions.pipeline import EstimateStream, make_estimate_metadata
+from service.sessions import estimate_stream
+from service.sessions.estimate_stream import EstimateStream, make_estimate_metadata
 from storage.schema import ESTIMATE_COLUMNS
 from tests.builders.arrays import COUNT_KPA, UNLOADED_KPA
 from tests.service.sessions.pieces import (
@@ -50,7 +50,7 @@ def test_every_frame_comes_out_once_with_its_own_estimate_whatever_the_pieces(
     batch = frames(hopping(120, loaded_from=lead), lead=lead)
     _, _, whole = run(cut(batch, []), lag_ms=lag_ms)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "ROWS_PER_STEP", chunk)
+        patch.setattr(estimate_stream, "ROWS_PER_STEP", chunk)
         _, out, columns = run(cut(batch, cuts), lag_ms=lag_ms)
     for f in fields(FrameBatch):
         assert getattr(out, f.name).tobytes() == getattr(batch, f.name).tobytes(), f.name
