@@ -330,7 +330,7 @@ def test_every_link_between_documents_leads_somewhere(document: Path) -> None:
 def packages() -> list[str]:
     return [
         str(folder.relative_to(ROOT))
-        for top in ("devices", "storage", "service")
+        for top in ("devices", "storage", "service", "foottile", "studies")
         for folder in sorted({path.parent for path in (ROOT / top).rglob("*.py")})
     ]
 
