@@ -22,7 +22,8 @@ class End:
         last_seq: the last frame in the node's journal, in the page cache of the moment; None: no
             journal.
         at_s: when, by `time.monotonic`.
-        slow_s: how long an fsync took then, beyond the usual.
+        slow_s: longest time that its frames waited for the disk, beyond the usual: the stated bound
+            of its tail remembers that.
     """
 
     how: str

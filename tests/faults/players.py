@@ -60,6 +60,8 @@ class Players:
         self.times: dict[str, float] = {}
         """How long each step took, in seconds."""
         self._rng = random.Random(story.seed + 1)
+        self._slow_s = 0.0
+        """Longest time that frames of the node's stream waited for the disk, beyond the usual."""
         self._folder = folder
         self._stack = ExitStack()
         self._begin_s = time.monotonic()
@@ -200,7 +202,7 @@ class Players:
         return list(self.witness.infos)[-1] if self.witness.infos else None
 
     def _end_node(
-        self, how: str, end: Callable[[], None], *, only: str | None = None, slow_s: float = 0.0
+        self, how: str, end: Callable[[], None], *, only: str | None = None
     ) -> str | None:
         """End the node and note what its streams had then; the newest stream's name."""
         newest = self._stream_id()
@@ -212,7 +214,8 @@ class Players:
             if stream_id not in self.facts.ends and only in (None, stream_id):
                 columns = held.get(stream_id)
                 last_seq = None if columns is None else int(columns["seq"][-1])
-                self.facts.ends[stream_id] = End(how, last_seq, at_s, slow_s)
+                self.facts.ends[stream_id] = End(how, last_seq, at_s, self._slow_s)
+        self._slow_s = 0.0
         return newest
 
     def _cut(self, machine: Machine) -> None:

@@ -94,13 +94,11 @@ class Stage(Players):
     def _power_both(self, fault: Fault) -> None:
         self._go_down(fault.length_s, self.node, self.server, how="power")
 
-    def _go_down(
-        self, length_s: float, *machines: Machine, how: str = "killed", slow_s: float = 0.0
-    ) -> None:
+    def _go_down(self, length_s: float, *machines: Machine, how: str = "killed") -> None:
         """Kill machines, or cut their power, and start them again after a while."""
         stream_id = None
         if self.node in machines:
-            stream_id = self._end_node(how, self.node.kill, slow_s=slow_s)
+            stream_id = self._end_node(how, self.node.kill)
         for machine in machines:
             machine.kill()
             if how == "power":
@@ -172,9 +170,11 @@ class Stage(Players):
         machine = self._rng.choice(self._machines())
         slow_s = 0.1 + fault.amount
         machine.slow.set_s(slow_s)
+        if machine is self.node:
+            self._slow_s = slow_s
         time.sleep(1.0 + fault.length_s)
         if self._rng.random() < 0.5:
-            self._go_down(0.0, machine, how="power", slow_s=slow_s)
+            self._go_down(0.0, machine, how="power")
         machine.slow.set_s(0.0)
 
     def _clock_of_node(self, fault: Fault) -> None:
@@ -197,6 +197,8 @@ class Stage(Players):
         self._small.fill(leave_bytes=round(64e3 * fault.amount))
         time.sleep(1.0 + fault.length_s)
         self._small.free()
+        if self.story.small_disk_of == "node":
+            self._slow_s = 1.0 + fault.length_s  # frames waited for the disk so long
         time.sleep(1.0)  # it is noticed that there is room again
 
     _full_disk_of_server = _full_disk_of_node = _full_disk
