@@ -38,23 +38,17 @@ from service.api.routes.common import (
 from service.api.routes.exports import (
     Chunks,
     DataQuery,
-    compute_export_etag,
-    export_response,
     iterate_chunks,
     make_file_stem,
-    marker_headers,
+    respond_with_export,
 )
 from service.server.server import Server
-from service.sessions.inputs import iterate_raw_frames_with_part
 from service.sessions.preview import SessionPreview
 from service.sessions.preview_frames import PreviewFrames
 from storage.clock.table import CLOCK_NAME
 from storage.formats.export import Export, make_sealed_export
 from storage.formats.markers import (
-    PLACEMENT_COLUMNS,
     PlacedMarkers,
-    place_markers,
-    place_session_markers,
 )
 from storage.formats.slice import Slice
 from storage.formats.writers.format import DrainedBuffer
@@ -111,7 +105,15 @@ async def get_data(
         require_sealed(session, f"{query.format_spec.title} is", remedy)
     if session.sha256 is not None and query.is_stored:
         return _stored_response(session, session.sha256, request, server, headers)
-    return await _export_response(session, query, request, server, headers)
+    return await respond_with_export(
+        [session],
+        lambda markers: _write_export(session, query, server, markers[0] if markers else None),
+        query,
+        request,
+        server,
+        make_file_stem(session.name, session.id, query.slice),
+        headers,
+    )
 
 
 def _stored_response(
@@ -147,40 +149,6 @@ def _stored_response(
     )
     answer.chunk_size = _CHUNK
     return answer
-
-
-async def _export_response(
-    session: Session, query: DataQuery, request: Request, server: Server, headers: dict[str, str]
-) -> Response:
-    tag = await compute_export_etag(session, query, server)
-    weak = "" if session.sha256 is not None else "W/"
-    headers |= {"ETag": f'{weak}"{tag}"'}
-    headers |= {"Cache-Control": "private, no-cache", "Accept-Ranges": "none"}
-    if has_matching_etag(request, tag):
-        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
-    markers = None
-    if query.has_markers:
-        markers = await run_in_threadpool(_place_markers, session, query, server)
-        headers |= marker_headers([markers])
-    stem = make_file_stem(session.name, session.id, query.slice)
-    return await export_response(
-        _write_export(session, query, server, markers), query, stem, headers
-    )
-
-
-def _place_markers(session: Session, query: DataQuery, server: Server) -> PlacedMarkers:
-    if not session.markers:
-        return PlacedMarkers(())
-    if session.sha256 is not None:
-        with server.sessions.open_frames(session.id, only_slices=True) as reader:
-            return place_session_markers(reader, session.markers, query.slice)
-    sources = server.recorder.collect_inputs_from_journals(session.id)
-    times = (
-        {name: getattr(frames, name) for name in PLACEMENT_COLUMNS} | {"part": columns["part"]}
-        for frames, columns in iterate_raw_frames_with_part(sources)
-    )
-    axis = sources.compute_time_axis()
-    return place_markers(session.markers, times, sources.make_clock_table(), query.slice, axis=axis)
 
 
 def _write_export(

@@ -4,21 +4,28 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import AsyncIterator, Generator
+from collections.abc import AsyncIterator, Callable, Generator
+from http import HTTPStatus
 
 import pyarrow as pa
-from fastapi import Response
+from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import Field
 from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 
 from devices.errors import UsageError
-from service.api.routes.common import SecondsQuery
+from service.api.routes.common import SecondsQuery, has_matching_etag
 from service.server.server import Server
+from service.sessions.inputs import iterate_raw_frames_with_part
 from service.version import SOFTWARE_VERSION
 from storage.clock.table import CLOCK_NAME
 from storage.formats.export import ClockName
-from storage.formats.markers import PlacedMarkers
+from storage.formats.markers import (
+    PLACEMENT_COLUMNS,
+    PlacedMarkers,
+    place_markers,
+    place_session_markers,
+)
 from storage.formats.slice import FormatOptions, Slice
 from storage.formats.writers.format import ExportFormat
 from storage.formats.writers.registry import (
@@ -129,8 +136,8 @@ _NOT_IN_NAMES = re.compile(r"[^A-Za-z0-9.-]+")
 _NAME_LENGTH = 60
 
 
-async def compute_export_etag(session: Session, query: ExportQuery, server: Server) -> str:
-    """Return an entity tag of everything that an export of a session depends on."""
+async def _describe_export(session: Session, query: ExportQuery, server: Server) -> str:
+    """Return a text of everything that an export of a session depends on."""
     beside = ""
     if query.clock_name == "server" or query.has_markers:  # markers are placed by the clocks
         beside = await run_in_threadpool(_clock_hash, session, server)
@@ -141,11 +148,10 @@ async def compute_export_etag(session: Session, query: ExportQuery, server: Serv
     else:
         recorded = server.recorder.get_ledger(session.id).recorded
         content = f"{session.id}|{session.state}|{recorded}"
-    text = f"{content}|{query.canonical_text}|{beside}|{SOFTWARE_VERSION}"
-    return hashlib.sha256(text.encode()).hexdigest()
+    return f"{content}|{query.canonical_text}|{beside}|{SOFTWARE_VERSION}"
 
 
-def marker_headers(markers: list[PlacedMarkers]) -> dict[str, str]:
+def _marker_headers(markers: list[PlacedMarkers]) -> dict[str, str]:
     """Return the header with the number of markers in the file."""
     total = sum(len(each.markers) for each in markers)
     left_out = sum(len(each.excluded) for each in markers)
@@ -163,17 +169,40 @@ def make_file_stem(name: str, id_: str, part: Slice) -> str:
     return "_".join(word for word in (name, id_, seconds) if word)
 
 
-async def export_response(
-    chunks: Chunks, query: ExportQuery, stem: str, headers: dict[str, str]
+async def respond_with_export(
+    sessions: list[Session],
+    write: Callable[[list[PlacedMarkers] | None], Chunks],
+    query: ExportQuery,
+    request: Request,
+    server: Server,
+    stem: str,
+    headers: dict[str, str],
 ) -> Response:
-    """Answer with chunks, which are closed even if the client disconnects.
+    """Answer with a file of sessions in chunks, which are closed even if the client disconnects.
 
     Args:
-        chunks: content of the file.
+        sessions: sessions in the file.
+        write: makes the chunks with the markers of each session; None: without markers.
         query: query of the request.
+        request: the request.
+        server: the server.
         stem: file name without extension.
         headers: further headers.
     """
+    texts = [await _describe_export(each, query, server) for each in sessions]
+    tag = hashlib.sha256("|".join(texts).encode()).hexdigest()
+    weak = "" if all(session.sha256 is not None for session in sessions) else "W/"
+    headers |= {"ETag": f'{weak}"{tag}"'}
+    headers |= {"Cache-Control": "private, no-cache", "Accept-Ranges": "none"}
+    if has_matching_etag(request, tag):
+        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
+    markers = None
+    if query.has_markers:
+        markers = [
+            await run_in_threadpool(_place_markers, each, query, server) for each in sessions
+        ]
+        headers |= _marker_headers(markers)
+    chunks = write(markers)
     # The first chunk now: an invalid query is then an answer, not a broken download.
     first = await run_in_threadpool(next, chunks, None)
     if first is None:
@@ -182,6 +211,21 @@ async def export_response(
     return StreamingResponse(
         iterate_chunks(chunks, first), headers=headers, media_type=query.format_spec.media_type
     )
+
+
+def _place_markers(session: Session, query: ExportQuery, server: Server) -> PlacedMarkers:
+    if not session.markers:
+        return PlacedMarkers(())
+    if session.sha256 is not None:
+        with server.sessions.open_frames(session.id, only_slices=True) as reader:
+            return place_session_markers(reader, session.markers, query.slice)
+    sources = server.recorder.collect_inputs_from_journals(session.id)
+    times = (
+        {name: getattr(frames, name) for name in PLACEMENT_COLUMNS} | {"part": columns["part"]}
+        for frames, columns in iterate_raw_frames_with_part(sources)
+    )
+    axis = sources.compute_time_axis()
+    return place_markers(session.markers, times, sources.make_clock_table(), query.slice, axis=axis)
 
 
 async def iterate_chunks(chunks: Chunks, first: bytes = b"") -> AsyncIterator[bytes]:

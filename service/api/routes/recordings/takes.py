@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import asyncio
-import hashlib
 from contextlib import ExitStack
+from functools import partial
 from http import HTTPStatus
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field
-from starlette.concurrency import run_in_threadpool
 
 from devices.errors import StateError
 from service.api.routes.common import (
     UNCHANGED,
     IdempotencyKey,
     ServerState,
-    has_matching_etag,
     make_idempotency_record,
     problem_responses,
     require_frames,
@@ -25,10 +23,8 @@ from service.api.routes.common import (
 from service.api.routes.exports import (
     Chunks,
     TakeDataQuery,
-    compute_export_etag,
-    export_response,
     make_file_stem,
-    marker_headers,
+    respond_with_export,
 )
 from service.api.routes.recordings import sessions as one
 from service.protocol.live import SessionView, View
@@ -37,7 +33,7 @@ from service.server.server import Server
 from service.server.takes import Take
 from service.user_folders import PublicText
 from storage.formats.export import make_sealed_export
-from storage.formats.markers import PlacedMarkers, place_session_markers
+from storage.formats.markers import PlacedMarkers
 from storage.formats.writers.registry import FORMATS, MULTI_SESSION_FORMATS
 from storage.sessions.folder import Session
 
@@ -192,30 +188,15 @@ async def get_take_data(
                 remedy="Stop it, or ask for each session by itself",
             )
     is_lossy = any(server.recorder.get_ledger(session.id).lossy for session in sessions)
-    tags = [await compute_export_etag(session, query, server) for session in sessions]
-    tag = hashlib.sha256("|".join(tags).encode()).hexdigest()
-    headers = {
-        "Foottile-Complete": "lossy" if is_lossy else "true",
-        "ETag": f'"{tag}"',
-        "Cache-Control": "private, no-cache",
-        "Accept-Ranges": "none",
-    }
-    if has_matching_etag(request, tag):
-        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
-    markers = None
-    if query.has_markers:
-        markers = [
-            await run_in_threadpool(_place_markers, each, query, server) for each in sessions
-        ]
-        headers |= marker_headers(markers)
-    chunks = _write_exports(sessions, query, server, markers)
-    stem = make_file_stem(sessions[0].name, f"take-{take_id}", query.slice)
-    return await export_response(chunks, query, stem, headers)
-
-
-def _place_markers(session: Session, query: TakeDataQuery, server: Server) -> PlacedMarkers:
-    with server.sessions.open_frames(session.id, only_slices=True) as reader:
-        return place_session_markers(reader, session.markers, query.slice)
+    return await respond_with_export(
+        sessions,
+        partial(_write_exports, sessions, query, server),
+        query,
+        request,
+        server,
+        make_file_stem(sessions[0].name, f"take-{take_id}", query.slice),
+        {"Foottile-Complete": "lossy" if is_lossy else "true"},
+    )
 
 
 def _write_exports(
