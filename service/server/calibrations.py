@@ -404,15 +404,9 @@ class CalibrationJobs:
             fit.log.append(rest.decode(errors="replace")[:1000])
 
 
-@dataclass(frozen=True)
-class AssignedCalibration:
-    """Assigned calibration, and the time of the assignment, server's UTC."""
+class AssignedCalibration(StrictModel):
+    """Assigned calibration, as its file has it, and the time of the assignment, server's UTC."""
 
-    calibration: Calibration
-    t_ns: int
-
-
-class _Assignment(StrictModel):
     t_ns: int
     calibration: Calibration | None
     """None: the assignment was removed."""
@@ -432,9 +426,8 @@ class CalibrationAssignment:
         self.problem: str | None = None
         """Reason why the assignment is unknown; None: it is known, or there is none."""
         try:
-            found = read_document(path, _Assignment)
-            if found.calibration is not None:
-                self.current = AssignedCalibration(found.calibration, found.t_ns)
+            found = read_document(path, AssignedCalibration)
+            self.current = None if found.calibration is None else found
         except FileNotFoundError:
             if any(path.parent.glob(path.name + ASIDE_SUFFIX + "*")):
                 self.problem = f"the calibration that was assigned is lost: {_ASSIGN_AGAIN}"
@@ -444,25 +437,14 @@ class CalibrationAssignment:
         except StorageError as error:
             self.problem = f"the calibration that was assigned cannot be read: {error}"
 
-    def store_assignment(self, calibration: Calibration, t_ns: int) -> None:
-        """Store a calibration as the assigned one, in place of the present one.
-
-        Raises:
-            StorageError: it cannot be stored; the assignment is unchanged.
-        """
-        self._store(_Assignment(t_ns=t_ns, calibration=calibration))
-        self.current, self.problem = AssignedCalibration(calibration, t_ns), None
-
-    def remove_assignment(self, t_ns: int) -> None:
-        """Remove the assignment, on the disk too: the node's own calibration is used again.
+    def store_assignment(self, calibration: Calibration | None, t_ns: int) -> None:
+        """Store the calibration to use from now on; None: the node's own again.
 
         Raises:
             StorageError: that cannot be stored; the assignment is unchanged.
         """
-        self._store(_Assignment(t_ns=t_ns, calibration=None))
-        self.current, self.problem = None, None
-
-    def _store(self, assignment: _Assignment) -> None:
         with translate_storage_errors(self._path):
             make_synced_folder(self._path.parent)
-        write_document(self._path, assignment)
+        assigned = AssignedCalibration(t_ns=t_ns, calibration=calibration)
+        write_document(self._path, assigned)
+        self.current, self.problem = (None if calibration is None else assigned), None

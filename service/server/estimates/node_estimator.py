@@ -108,10 +108,7 @@ class NodeEstimator:
         Raises:
             StorageError: that cannot be stored; nothing has changed then.
         """
-        if calibration is None:
-            self.assignment.remove_assignment(t_ns)
-        else:
-            self.assignment.store_assignment(calibration, t_ns)
+        self.assignment.store_assignment(calibration, t_ns)
         before = self.live
         self._restart()
         try:
