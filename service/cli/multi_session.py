@@ -7,6 +7,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -25,17 +26,44 @@ if TYPE_CHECKING:
 EXIT_INCOMPLETE = 3
 """Exit code: finished, but some sessions failed."""
 
-ManifestOption = Annotated[
-    Path | None,
-    typer.Option(help="CSV with a row for each session, in column session; see docs/archive.md."),
-]
-JobsOption = Annotated[
-    int | None, typer.Option(min=1, max=1024, help="Processes; default: one for each core.")
-]
-SchedulerOption = Annotated[
-    str | None,
-    typer.Option(help="Address of a Dask scheduler: run on its cluster."),
-]
+
+@dataclass(frozen=True)
+class BatchOptions:
+    """Options of a command over many sessions, which is decorated by `add_options`."""
+
+    manifest: Annotated[
+        Path | None,
+        typer.Option(
+            help="CSV with a row for each session, in column session; see docs/archive.md."
+        ),
+    ] = None
+    jobs: Annotated[
+        int | None, typer.Option(min=1, max=1024, help="Processes; default: one for each core.")
+    ] = None
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a Dask scheduler: run on its cluster.")
+    ] = None
+
+    def make_job_mapper(self) -> JobMapper:
+        """Return a mapper to processes of this machine or to a cluster.
+
+        Raises:
+            UsageError: both are named.
+        """
+        if self.jobs is not None and self.scheduler is not None:
+            raise UsageError("--jobs and --scheduler exclude each other", remedy="Name one")
+        if self.scheduler is not None:
+            from service.offline.worker_pool import map_on_cluster
+
+            return partial(map_on_cluster, scheduler_address=self.scheduler)
+        from service.offline.archive.jobs import limit_arrow_threads
+        from service.offline.worker_pool import count_available_cores, map_in_processes
+
+        return partial(
+            map_in_processes,
+            process_count=self.jobs or count_available_cores(),
+            initializer=limit_arrow_threads,
+        )
 
 
 def is_single_session(places: Sequence[str] | None, manifest: Path | None) -> bool:
@@ -56,11 +84,9 @@ def is_single_session(places: Sequence[str] | None, manifest: Path | None) -> bo
 def run_task(
     task: SessionTask,
     places: Sequence[str] | None,
-    manifest: Path | None,
+    batch: BatchOptions,
     *,
     out: str | None,
-    jobs: int | None,
-    scheduler: str | None,
     as_json: bool,
 ) -> OutcomeCounts:
     """Run a task on many sessions, print the failures and return the counts.
@@ -79,6 +105,7 @@ def run_task(
     )
     from service.offline.archive.manifest import read_rows
 
+    manifest, job_mapper = batch.manifest, batch.make_job_mapper()
     if (manifest is None) == (not places):
         raise UsageError(
             "no session is named"
@@ -86,9 +113,6 @@ def run_task(
             else "--manifest and sessions exclude each other",
             expected="sessions, folders of them, or --manifest",
         )
-    if jobs is not None and scheduler is not None:
-        raise UsageError("--jobs and --scheduler exclude each other", remedy="Name one")
-
     out = None if out is None else make_absolute(out)
 
     def list_locations() -> Iterator[SessionLocation]:
@@ -107,7 +131,7 @@ def run_task(
         command=task.command,
         list_again=list_locations,
         out=out,
-        job_mapper=make_job_mapper(jobs, scheduler),
+        job_mapper=job_mapper,
         as_json=as_json,
     )
 
@@ -164,22 +188,6 @@ def run_jobs_with_report(
         results.remove_work_folder()
     _print_summary(counts, command, out, as_json=as_json)
     return counts
-
-
-def make_job_mapper(jobs: int | None, scheduler: str | None) -> JobMapper:
-    """Return a mapper to processes of this machine or to a cluster."""
-    if scheduler is not None:
-        from service.offline.worker_pool import map_on_cluster
-
-        return partial(map_on_cluster, scheduler_address=scheduler)
-    from service.offline.archive.jobs import limit_arrow_threads
-    from service.offline.worker_pool import count_available_cores, map_in_processes
-
-    return partial(
-        map_in_processes,
-        process_count=jobs or count_available_cores(),
-        initializer=limit_arrow_threads,
-    )
 
 
 @contextmanager

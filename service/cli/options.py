@@ -11,12 +11,12 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, is_dataclass
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 from rich.console import Console
@@ -27,17 +27,7 @@ from devices.errors import UsageError, escape_control_chars
 from devices.scene.hardware_sections import EMULATED
 from devices.scene.scene_file import Scene, load_scene
 from foottile.environment import read_variable
-from service.cli.reference_options import (
-    DecimalOption,
-    EncodingOption,
-    ReferenceColumnsOption,
-    ReferenceRateOption,
-    ReferenceSignOption,
-    ReferenceUnitsOption,
-    SkipRowsOption,
-    UnitsRowOption,
-    make_reference_options,
-)
+from service.cli.reference_options import TableOptions, make_reference_options
 from service.json_output import to_json_text
 
 if TYPE_CHECKING:
@@ -201,19 +191,12 @@ def remark(message: str) -> None:
 
 @dataclass(frozen=True)
 class FootOptions:
-    """Options of an emulated foot, for commands decorated by `add_foot_options`."""
+    """Options of an emulated foot, of a command decorated by `add_options`."""
 
     load: Annotated[
         Path | None, typer.Option(help="Recorded load in place of the scene's ground.")
     ] = None
-    map_: ReferenceColumnsOption = None
-    units: ReferenceUnitsOption = None
-    sign: ReferenceSignOption = None
-    rate_hz: ReferenceRateOption = None
-    skip_rows: SkipRowsOption = None
-    units_row: UnitsRowOption = None
-    decimal: DecimalOption = None
-    encoding: EncodingOption = None
+    table: TableOptions = field(default_factory=TableOptions)
     load_scale: Annotated[float, typer.Option(help="Factor on every force of the load.")] = 1.0
     cop_scale: Annotated[float, typer.Option(help="Factor on the load's COP about its mean.")] = 1.0
     cop_offset_m: Annotated[
@@ -260,7 +243,7 @@ class FootOptions:
         if self.load is not None and scene.array.bus != EMULATED:
             raise UsageError("--load presses emulated tiles only", remedy="Add --bus emulated")
         plates = self._make_plate_files(scene)
-        stated = make_reference_options({**vars(self), "map": self.map_}, self.rate_hz)
+        stated = make_reference_options(vars(self.table), self.table.rate_hz)
         if self.load is None and stated != ReferenceOptions():
             raise UsageError(
                 "the options of a table go with --load",
@@ -305,35 +288,43 @@ class FootOptions:
 
     def to_arguments(self) -> list[str]:
         """Return these options as arguments of another command."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
         return [
-            f"--{name.removesuffix('_').replace('_', '-')}={value}"
-            for name, value in values.items()
-            if value is not None
+            f"--{name.replace('_', '-')}={value}"
+            for name, value in {**vars(self), **vars(self.table)}.items()
+            if value is not None and name != "table"
         ]
 
 
-def add_foot_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Replace the parameter `options` of a command by an option for each field of `FootOptions`."""
-    parameters = inspect.signature(FootOptions, eval_str=True).parameters.values()
-    return expand_options(command, [*parameters], lambda values: FootOptions(**values))
+def add_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Replace each parameter of a dataclass by an option for each field, also within a field."""
+    for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
+        if is_dataclass(parameter.annotation):
+            make_options = add_options(cast(Callable[..., Any], parameter.annotation))
+            parameters = inspect.signature(make_options, eval_str=True).parameters.values()
+            command = expand_options(command, name, parameters, make_options)
+    return command
 
 
 def expand_options(
-    command: Callable[..., None],
-    parameters: list[inspect.Parameter],
-    make_options: Callable[[dict[str, Any]], Any],
-) -> Callable[..., None]:
-    """Replace the parameter `options` of a command by these, from which `options` is made."""
+    command: Callable[..., Any],
+    name: str,
+    parameters: Iterable[inspect.Parameter],
+    make_options: Callable[..., Any],
+) -> Callable[..., Any]:
+    """Replace the parameter `name` of a command by these, from which its value is made."""
     own = inspect.signature(command, eval_str=True)
+    expanded: list[inspect.Parameter] = []
+    for parameter in own.parameters.values():
+        expanded += parameters if parameter.name == name else [parameter]
+    names = [parameter.name for parameter in parameters]
 
-    @wraps(command)
-    def run(**values: Any) -> None:
-        options = make_options({each.name: values.pop(each.name) for each in parameters})
-        command(**values, options=options)
+    @wraps(command, updated=())
+    def run(**values: Any) -> Any:
+        options = make_options(**{each: values.pop(each) for each in names})
+        return command(**values, **{name: options})
 
-    expanded = [p for p in own.parameters.values() if p.name != "options"] + parameters
-    run.__signature__ = own.replace(parameters=expanded)  # type: ignore[attr-defined]  # for typer
+    by_name = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in expanded]
+    run.__signature__ = own.replace(parameters=by_name)  # type: ignore[attr-defined]  # for typer
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in expanded}
     return run
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -14,55 +15,6 @@ if TYPE_CHECKING:
 
 SOLE_MAX_M = 1.0
 
-ReferenceColumnsOption = Annotated[
-    str | None,
-    typer.Option(
-        "--map",
-        metavar="NAME=COLUMN,...",
-        help="Columns of time_s, grf_n, cop_x_m, cop_y_m; - before a column inverts its sign, + "
-        "adds two columns.",
-    ),
-]
-ReferenceUnitsOption = Annotated[
-    str | None,
-    typer.Option(
-        "--units",
-        metavar="NAME=UNIT,...",
-        help="Units of grf (N, kN, mN), cop (m, cm, mm) and time (s, ms, us, ns), unless the file "
-        "states them.",
-    ),
-]
-ReferenceSignOption = Annotated[
-    str | None,
-    typer.Option(
-        "--sign",
-        help="Sign of the reference's force under load: + or -; C3D force platforms state it.",
-    ),
-]
-ReferenceRateOption = Annotated[
-    float | None,
-    typer.Option("--rate-hz", help="Sample rate of a reference without times."),
-]
-SkipRowsOption = Annotated[
-    int | None,
-    typer.Option(
-        "--skip-rows",
-        metavar="N",
-        help="Lines of a text table above its header, or above its numbers without a header.",
-    ),
-]
-UnitsRowOption = Annotated[
-    int | None,
-    typer.Option("--units-row", metavar="N", help="Line of the units, from 1."),
-]
-DecimalOption = Annotated[
-    str | None,
-    typer.Option("--decimal", metavar=",|.", help="Decimal mark of a text table."),
-]
-EncodingOption = Annotated[
-    str | None,
-    typer.Option("--encoding", metavar="NAME", help="Encoding of a text table: cp1252, cp932."),
-]
 SoleSizeOption = Annotated[
     str | None,
     typer.Option(
@@ -75,6 +27,54 @@ LagRangeOption = Annotated[
     str | None,
     typer.Option("--lag-range-s", metavar="A,B", help="Range of the lag, where several fit."),
 ]
+
+
+@dataclass(frozen=True)
+class TableOptions:
+    """Options for the columns and the layout of a reference's file."""
+
+    map: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME=COLUMN,...",
+            help="Columns of time_s, grf_n, cop_x_m, cop_y_m; - before a column inverts its sign, "
+            "+ adds two columns.",
+        ),
+    ] = None
+    units: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME=UNIT,...",
+            help="Units of grf (N, kN, mN), cop (m, cm, mm) and time (s, ms, us, ns), unless the "
+            "file states them.",
+        ),
+    ] = None
+    sign: Annotated[
+        str | None,
+        typer.Option(
+            help="Sign of the reference's force under load: + or -; C3D force platforms state it."
+        ),
+    ] = None
+    rate_hz: Annotated[
+        float | None, typer.Option(help="Sample rate of a reference without times.")
+    ] = None
+    skip_rows: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Lines of a text table above its header, or above its numbers without a header.",
+        ),
+    ] = None
+    units_row: Annotated[
+        int | None, typer.Option(metavar="N", help="Line of the units, from 1.")
+    ] = None
+    decimal: Annotated[
+        str | None, typer.Option(metavar=",|.", help="Decimal mark of a text table.")
+    ] = None
+    encoding: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Encoding of a text table: cp1252, cp932."),
+    ] = None
 
 
 def make_reference_options(stated: Mapping[str, object], rate_hz: float | None) -> ReferenceOptions:

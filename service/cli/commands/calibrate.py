@@ -20,6 +20,7 @@ from service.cli.commands.sessions import SERVER, ServerOption, find_sealed_file
 from service.cli.options import (
     CaOption,
     JsonOption,
+    add_options,
     parse_pair,
     print_json,
     remark,
@@ -28,18 +29,7 @@ from service.cli.options import (
     stderr,
     stdout,
 )
-from service.cli.reference_options import (
-    DecimalOption,
-    EncodingOption,
-    LagRangeOption,
-    ReferenceColumnsOption,
-    ReferenceRateOption,
-    ReferenceSignOption,
-    ReferenceUnitsOption,
-    SkipRowsOption,
-    UnitsRowOption,
-    make_reference_options,
-)
+from service.cli.reference_options import LagRangeOption, TableOptions, make_reference_options
 from storage.sessions.folder import FRAMES_NAME
 
 if TYPE_CHECKING:
@@ -237,6 +227,7 @@ def _assign(source: Server, node: dict[str, Any], calibration: Calibration) -> N
 
 
 @require_extra("server", "`foottile calibrate`")
+@add_options
 def calibrate_command(
     out: Annotated[Path, typer.Option(help="Calibration file to write (JSON).")],
     recordings: Annotated[
@@ -307,14 +298,8 @@ def calibrate_command(
         float,
         typer.Option(min=0.0, max=1.0, help="With --reference: uncertainty of the plate's gain."),
     ] = 0.0,
-    columns: ReferenceColumnsOption = None,
-    units: ReferenceUnitsOption = None,
-    sign: ReferenceSignOption = None,
-    rate_hz: ReferenceRateOption = None,
-    skip_rows: SkipRowsOption = None,
-    units_row: UnitsRowOption = None,
-    decimal: DecimalOption = None,
-    encoding: EncodingOption = None,
+    *,
+    table: TableOptions,
     lag_range_s: LagRangeOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -359,15 +344,6 @@ def calibrate_command(
         raise UsageError(
             "--tile, --node, --server, --assign and --yes go with --live", remedy="Add --live"
         )
-    stated = {
-        "map": columns,
-        "units": units,
-        "sign": sign,
-        "skip_rows": skip_rows,
-        "units_row": units_row,
-        "decimal": decimal,
-        "encoding": encoding,
-    }
     if reference is not None:
         if len(recordings) > 1 or plot is not None or reference_delay_ms is not None:
             raise UsageError(
@@ -376,7 +352,7 @@ def calibrate_command(
         from service.offline.mount_calibration import MountCalibrationOptions
 
         options = MountCalibrationOptions(
-            stated=make_reference_options(stated, rate_hz),
+            stated=make_reference_options(vars(table), table.rate_hz),
             lag_range_s=parse_pair(lag_range_s, "--lag-range-s"),
             per_tile=per_tile,
             shear=shear,
@@ -385,8 +361,8 @@ def calibrate_command(
         )
         _calibrate_mounted_foot(recordings[0], reference, out, options, as_json=as_json)
         return
-    for_plate = (*stated.values(), rate_hz, lag_range_s)
-    if per_tile or shear or reference_gain_sigma or any(each is not None for each in for_plate):
+    for_plate = table != TableOptions() or lag_range_s is not None
+    if per_tile or shear or reference_gain_sigma or for_plate:
         raise UsageError("these options go with --reference", remedy="Add --reference FILE")
     from service.cli.calibration_report import make_calibration_json, make_calibration_tables
     from service.estimation.effects import Parameter
@@ -434,8 +410,8 @@ def calibrate_command(
     if as_json:
         print_json(make_calibration_json(calibration))
     else:
-        for table in make_calibration_tables(calibration):
-            stdout.print(table)
+        for result in make_calibration_tables(calibration):
+            stdout.print(result)
     for serial, reason in calibration.refused.items():
         remark(f"tile {serial} refused: {reason}")
     if calibration.refused:

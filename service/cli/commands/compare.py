@@ -15,14 +15,12 @@ from devices.errors import UsageError, require_extra
 from service.cli.commands.sessions import find_sealed_file
 from service.cli.multi_session import (
     EXIT_INCOMPLETE,
-    JobsOption,
-    ManifestOption,
-    SchedulerOption,
-    make_job_mapper,
+    BatchOptions,
     run_jobs_with_report,
 )
 from service.cli.options import (
     JsonOption,
+    add_options,
     echo,
     echo_lines,
     open_result_folder,
@@ -32,16 +30,9 @@ from service.cli.options import (
     show_progress,
 )
 from service.cli.reference_options import (
-    DecimalOption,
-    EncodingOption,
     LagRangeOption,
-    ReferenceColumnsOption,
-    ReferenceRateOption,
-    ReferenceSignOption,
-    ReferenceUnitsOption,
-    SkipRowsOption,
     SoleSizeOption,
-    UnitsRowOption,
+    TableOptions,
     make_reference_options,
     parse_named_values,
 )
@@ -53,9 +44,6 @@ if TYPE_CHECKING:
 
 LIMIT_MISSED = "limit missed"
 """Verdict on a session that misses a limit."""
-_NUMBER_COLUMNS = ("rate_hz", "contact_n", "reference_sigma_n", "reference_cop_sigma_m")
-_TEXT_COLUMNS = ("map", "units", "sign", "sole_m", "lag_range_s", "cop_offset_m")
-_TEXT_LAYOUT_COLUMNS = ("skip_rows", "units_row", "decimal", "encoding")
 _NAME = re.compile(r"[\w-][\w.-]*")
 StatedOptions = Mapping[str, str | float | None]
 
@@ -77,19 +65,20 @@ def make_compare_options(stated: StatedOptions, *, remove_offset: bool) -> Compa
         lag_range_s=parse_pair(text("lag_range_s"), "--lag-range-s"),
         remove_offset=remove_offset,
         cop_offset_m=parse_pair(text("cop_offset_m"), "--cop-offset-m") or (0.0, 0.0),
-        **{name: _parse_number(stated, name) for name in _NUMBER_COLUMNS if name != "rate_hz"},
+        contact_n=_parse_number(stated, "contact_n"),
+        reference_sigma_n=_parse_number(stated, "reference_sigma_n"),
+        reference_cop_sigma_m=_parse_number(stated, "reference_cop_sigma_m"),
     )
 
 
 def compare_manifest(
     manifest: Path,
+    batch: BatchOptions,
     stated: StatedOptions,
     limits: Mapping[str, float],
     *,
     remove_offset: bool,
     out: str,
-    jobs: int | None,
-    scheduler: str | None,
     as_json: bool,
 ) -> OutcomeCounts:
     """Compare the sessions of a manifest, each with the reference of its row.
@@ -97,12 +86,11 @@ def compare_manifest(
     Args:
         manifest: CSV with columns `session` and `reference`; further non-empty cells override
             `stated`.
+        batch: processes or cluster.
         stated: options of the command.
         limits: limits by figure.
         remove_offset: option for all sessions.
         out: path or URI of the results.
-        jobs: number of processes.
-        scheduler: address of a Dask scheduler.
         as_json: print each outcome as a line of JSON on stdout.
 
     Raises:
@@ -114,14 +102,7 @@ def compare_manifest(
     make_compare_options(
         stated, remove_offset=remove_offset
     )  # an option that is wrong for all rows
-    columns = {
-        "session",
-        "reference",
-        "name",
-        *_TEXT_COLUMNS,
-        *_TEXT_LAYOUT_COLUMNS,
-        *_NUMBER_COLUMNS,
-    }
+    columns = {"session", "reference", "name", *stated}
     out = make_absolute(out)
 
     def list_rows() -> Iterator[dict[str, str]]:
@@ -132,7 +113,7 @@ def compare_manifest(
         command="compare",
         list_again=list_rows,
         out=out,
-        job_mapper=make_job_mapper(jobs, scheduler),
+        job_mapper=batch.make_job_mapper(),
         as_json=as_json,
     )
 
@@ -196,6 +177,7 @@ def _parse_number(stated: StatedOptions, name: str) -> float | None:
 
 
 @require_extra("server", "`foottile compare`")
+@add_options
 def compare_command(
     session: Annotated[
         str | None, typer.Argument(help="A sealed file, a session's folder, or an id in --data.")
@@ -215,14 +197,8 @@ def compare_command(
             "a folder in it."
         ),
     ] = None,
-    columns: ReferenceColumnsOption = None,
-    units: ReferenceUnitsOption = None,
-    sign: ReferenceSignOption = None,
-    rate_hz: ReferenceRateOption = None,
-    skip_rows: SkipRowsOption = None,
-    units_row: UnitsRowOption = None,
-    decimal: DecimalOption = None,
-    encoding: EncodingOption = None,
+    *,
+    table: TableOptions,
     sole_m: SoleSizeOption = None,
     reference_sigma_n: Annotated[
         float | None,
@@ -257,9 +233,7 @@ def compare_command(
     data: Annotated[
         Path | None, typer.Option(help="Data folder of the server; default: the user's.")
     ] = None,
-    manifest: ManifestOption = None,
-    jobs: JobsOption = None,
-    scheduler: SchedulerOption = None,
+    batch: BatchOptions,
     as_json: JsonOption = False,
 ) -> None:
     """Compare a session with a reference: a force plate, an insole, another session.
@@ -281,14 +255,7 @@ def compare_command(
         for name, text in parse_named_values(limits, "--limits").items()
     }
     stated: dict[str, str | float | None] = {
-        "map": columns,
-        "units": units,
-        "sign": sign,
-        "rate_hz": rate_hz,
-        "skip_rows": skip_rows,
-        "units_row": units_row,
-        "decimal": decimal,
-        "encoding": encoding,
+        **vars(table),
         "sole_m": sole_m,
         "lag_range_s": lag_range_s,
         "contact_n": contact_n,
@@ -297,6 +264,7 @@ def compare_command(
         "reference_cop_sigma_m": reference_cop_sigma_m,
     }
     create_figure(1.0, 1.0)  # reports a missing package early
+    manifest = batch.manifest
     if manifest is not None or session is None or reference is None:
         if manifest is None or session is not None or reference is not None or out is None:
             raise UsageError(
@@ -305,12 +273,11 @@ def compare_command(
             )
         summary = compare_manifest(
             manifest,
+            batch,
             stated,
             parsed_limits,
             remove_offset=remove_offset,
             out=out,
-            jobs=jobs,
-            scheduler=scheduler,
             as_json=as_json,
         )
         if summary.states["failed"] or summary.verdicts[LIMIT_MISSED]:

@@ -12,9 +12,7 @@ import typer
 from devices.errors import UsageError, require_extra
 from service.cli.multi_session import (
     EXIT_INCOMPLETE,
-    JobsOption,
-    ManifestOption,
-    SchedulerOption,
+    BatchOptions,
     is_single_session,
     run_task,
 )
@@ -24,6 +22,7 @@ from service.cli.options import (
     JsonOption,
     StartOption,
     UnquantizedOption,
+    add_options,
     echo,
     parse_pair,
     print_json,
@@ -40,6 +39,7 @@ if TYPE_CHECKING:
 
 
 @require_extra("server", "`foottile estimate`")
+@add_options
 def estimate_command(
     out: Annotated[
         str,
@@ -79,9 +79,8 @@ def estimate_command(
     start_s: StartOption = None,
     end_s: EndOption = None,
     unquantized: UnquantizedOption = False,
-    manifest: ManifestOption = None,
-    jobs: JobsOption = None,
-    scheduler: SchedulerOption = None,
+    *,
+    batch: BatchOptions,
     as_json: JsonOption = False,
 ) -> None:
     """Estimate a recorded session again and write it with the new estimates.
@@ -127,11 +126,9 @@ def estimate_command(
         unquantized=unquantized,
         estimator=used,
     )
-    if not is_single_session(sessions, manifest) or is_remote(out):
+    if not is_single_session(sessions, batch.manifest) or is_remote(out):
         task = replace(task, calibration=_embed_calibration(calibration))
-        summary = run_task(
-            task, sessions, manifest, out=out, jobs=jobs, scheduler=scheduler, as_json=as_json
-        )
+        summary = run_task(task, sessions, batch, out=out, as_json=as_json)
         if summary.states["failed"]:
             raise typer.Exit(EXIT_INCOMPLETE)
         return

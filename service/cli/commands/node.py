@@ -17,7 +17,7 @@ from devices.types import check_user_name
 from service.cli.options import (
     CaOption,
     FootOptions,
-    add_foot_options,
+    add_options,
     create_stop_event,
     echo,
     load_adapted_scene,
@@ -30,9 +30,8 @@ if TYPE_CHECKING:
 SERVER = "http://127.0.0.1:8000"
 
 
-@add_foot_options
+@add_options
 def node_command(
-    options: FootOptions,
     scene: Annotated[str, typer.Option(help="Scene file, or a built-in scene.")],
     server: Annotated[
         str | None,
@@ -60,6 +59,8 @@ def node_command(
     end_with_parent: Annotated[
         bool, typer.Option("--end-with-parent", hidden=True, help="End with the parent process.")
     ] = False,
+    *,
+    options: FootOptions,
 ) -> None:
     """Read an array, keep its frames on disk and send them to a server.
 

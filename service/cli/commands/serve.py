@@ -25,7 +25,7 @@ from service.cli.options import (
     CaOption,
     FootOptions,
     JsonOption,
-    add_foot_options,
+    add_options,
     check_emulated,
     create_stop_event,
     echo,
@@ -78,15 +78,16 @@ def _add_setting_options(command: Callable[..., None]) -> Callable[..., None]:
         )
     # A list that is not given may be empty.
     return expand_options(
-        command, parameters, lambda given: {k: v for k, v in given.items() if v != []}
+        command, "options", parameters, lambda **given: {k: v for k, v in given.items() if v != []}
     )
 
 
 @require_extra("server", "`foottile serve`")
 @_add_setting_options
 def serve_command(
-    options: dict[str, Any],
     config: Annotated[Path | None, typer.Option(help="TOML file with settings.")] = None,
+    *,
+    options: dict[str, Any],
 ) -> None:
     """Run the server: live view, recording, REST API.
 
@@ -180,9 +181,8 @@ _STOP_TIMEOUT_S = 8.0
 
 
 @require_extra("server", "`foottile demo`")
-@add_foot_options
+@add_options
 def demo_command(
-    options: FootOptions,
     scene: Annotated[str, typer.Option(help="Built-in scene, or a scene file.")] = "rolling",
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port; 0: any.")] = 8000,
@@ -194,6 +194,8 @@ def demo_command(
         float | None,
         typer.Option(min=0.0, max=SECONDS_MAX, help="Run time; default: until Ctrl-C."),
     ] = None,
+    *,
+    options: FootOptions,
 ) -> None:
     """Run a server and an emulated node, and print a link to the live page.
 

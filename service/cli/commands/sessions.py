@@ -14,9 +14,7 @@ from pydantic.fields import FieldInfo
 from devices.errors import UsageError, escape_control_chars
 from service.cli.multi_session import (
     EXIT_INCOMPLETE,
-    JobsOption,
-    ManifestOption,
-    SchedulerOption,
+    BatchOptions,
     is_single_session,
     run_task,
 )
@@ -26,6 +24,7 @@ from service.cli.options import (
     EndOption,
     JsonOption,
     StartOption,
+    add_options,
     echo,
     expand_options,
     print_json,
@@ -55,10 +54,10 @@ def add_format_options(command: Callable[..., None]) -> Callable[..., None]:
     parameters = [
         _make_parameter(name, field) for name, field in FormatOptions.model_fields.items()
     ]
-    return expand_options(command, parameters, _make_options)
+    return expand_options(command, "options", parameters, _make_options)
 
 
-def _make_options(values: dict[str, Any]) -> FormatOptions:
+def _make_options(**values: Any) -> FormatOptions:
     try:
         return FormatOptions(**values)
     except ValidationError as error:
@@ -240,6 +239,7 @@ def pull_command(
 
 
 @add_format_options
+@add_options
 def export_command(
     out: Annotated[str, typer.Option(help="File to write; for many sessions, a folder or URI.")],
     to: FormatOption,
@@ -277,13 +277,11 @@ def export_command(
             f"{', '.join(MULTI_SESSION_FORMATS)}.",
         ),
     ] = False,
-    manifest: ManifestOption = None,
-    jobs: JobsOption = None,
-    scheduler: SchedulerOption = None,
+    *,
+    batch: BatchOptions,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print each of many sessions as a line of JSON.")
     ] = False,
-    *,
     options: FormatOptions,
 ) -> None:
     """Write a sealed session, or a slice of it, in another format.
@@ -305,20 +303,18 @@ def export_command(
     export_options = ExportOptions(
         get_format(to).name, part, "server" if merge else clock_name, markers, options
     )
-    if merge and (manifest is not None or is_remote(out)):
+    if merge and (batch.manifest is not None or is_remote(out)):
         raise UsageError(
             "--merge with --manifest, or into a URI", remedy="Name the sessions, and a file"
         )
-    if not merge and (not is_single_session(sessions, manifest) or is_remote(out)):
+    if not merge and (not is_single_session(sessions, batch.manifest) or is_remote(out)):
         from service.offline.archive.tasks import ExportTask
 
         summary = run_task(
             ExportTask(export_options),
             sessions,
-            manifest,
+            batch,
             out=out,
-            jobs=jobs,
-            scheduler=scheduler,
             as_json=as_json,
         )
         if summary.states["failed"]:

@@ -14,7 +14,7 @@ from service.cli.options import (
     FootOptions,
     JsonOption,
     UnquantizedOption,
-    add_foot_options,
+    add_options,
     check_emulated,
     echo,
     print_json,
@@ -29,9 +29,8 @@ if TYPE_CHECKING:
 
 
 @require_extra("server", "`foottile simulate`")
-@add_foot_options
+@add_options
 def simulate_command(
-    options: FootOptions,
     scene: Annotated[str, typer.Option(help="Built-in scene, or a scene file.")],
     out: Annotated[
         Path | None, typer.Option(help="Session to write; default: SCENE.parquet here.")
@@ -55,6 +54,8 @@ def simulate_command(
     no_estimates: Annotated[bool, typer.Option("--no-estimates", help="Raw frames only.")] = False,
     unquantized: UnquantizedOption = False,
     as_json: JsonOption = False,
+    *,
+    options: FootOptions,
 ) -> None:
     """Run a scene on emulated hardware in virtual time and write the session.
 

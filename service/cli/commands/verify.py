@@ -10,15 +10,14 @@ import typer
 from devices.errors import UsageError
 from service.cli.multi_session import (
     EXIT_INCOMPLETE,
-    JobsOption,
-    ManifestOption,
-    SchedulerOption,
+    BatchOptions,
     is_single_session,
     run_task,
 )
 from service.cli.options import (
     SESSION_REMEDY,
     JsonOption,
+    add_options,
     echo,
     print_json,
     remark,
@@ -48,6 +47,7 @@ _VERDICT_SENTENCES = {
 }
 
 
+@add_options
 def verify_command(
     targets: Annotated[
         list[str] | None,
@@ -65,9 +65,8 @@ def verify_command(
         str | None,
         typer.Option(help="Folder or URI for the reports of many sessions; existing ones stay."),
     ] = None,
-    manifest: ManifestOption = None,
-    jobs: JobsOption = None,
-    scheduler: SchedulerOption = None,
+    *,
+    batch: BatchOptions,
     as_json: JsonOption = False,
 ) -> None:
     """Verify sessions and journals from their files: checksums, hashes, order and ledger.
@@ -79,8 +78,8 @@ def verify_command(
     """
     from storage.verify.data_folder import find_verdict, verify_path
 
-    if out is not None or _has_many_sessions(targets, manifest):
-        _verify_many(targets, manifest, out, jobs, scheduler, as_json=as_json)
+    if out is not None or _has_many_sessions(targets, batch.manifest):
+        _verify_many(targets, batch, out, as_json=as_json)
         return
     path = _find_path((targets or [""])[0], data)
     with show_progress(f"reading {path}"):
@@ -111,18 +110,14 @@ def _has_many_sessions(targets: list[str] | None, manifest: Path | None) -> bool
 
 def _verify_many(
     targets: list[str] | None,
-    manifest: Path | None,
+    batch: BatchOptions,
     out: str | None,
-    jobs: int | None,
-    scheduler: str | None,
     *,
     as_json: bool,
 ) -> None:
     from service.offline.archive.tasks import VerifyTask
 
-    summary = run_task(
-        VerifyTask(), targets, manifest, out=out, jobs=jobs, scheduler=scheduler, as_json=as_json
-    )
+    summary = run_task(VerifyTask(), targets, batch, out=out, as_json=as_json)
     codes = {_EXIT_CODES[verdict] for verdict in summary.verdicts if _EXIT_CODES[verdict]}
     codes |= {EXIT_INCOMPLETE} if summary.states["failed"] else set()
     if summary.verdicts["damaged"] and not as_json:

@@ -18,7 +18,8 @@ import pytest
 from devices.errors import StorageError
 from service.cli import commands
 from service.cli.main import SUMMARIES, get_command_function
-from service.cli.options import FootOptions
+from service.cli.options import FootOptions, add_options
+from service.cli.reference_options import TableOptions
 from storage.permissions import set_umask_and_create_private_folder
 from tests.service.cli.outcome import Outcome, Run
 
@@ -76,7 +77,7 @@ def kinds(annotation: Any) -> Iterator[Any]:
 
 def options(*wanted: type) -> list[tuple[str, str]]:
     """Command and option, of these types."""
-    of_foot = set(inspect.signature(FootOptions).parameters)
+    of_foot = set(inspect.signature(add_options(FootOptions)).parameters)
     found = []
     for command in SUMMARIES:
         parameters = inspect.signature(get_command_function(command), eval_str=True).parameters
@@ -274,7 +275,7 @@ def test_a_file_in_the_place_of_a_folder_is_refused_in_a_sentence(
 
 
 def test_an_option_is_passed_on_by_its_name_on_the_command_line() -> None:
-    assert "--map=grf_n=force" in FootOptions(map_="grf_n=force").to_arguments()
+    assert "--map=grf_n=force" in FootOptions(table=TableOptions(map="grf_n=force")).to_arguments()
 
 
 # --- paths that are not UTF-8 ---------------------------------------------------------------------
