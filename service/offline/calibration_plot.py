@@ -102,22 +102,12 @@ def _plot_curve(
     )
     left_n = blocks.force_n - compute_curve_through_zero_n(tile, blocks.gauge_kpa)
     for axis, centre_n in ((curve, force_n), (residual, np.zeros_like(force_n))):
-        axis.fill_between(
-            grid_kpa,
-            centre_n - new_n,
-            centre_n + new_n,
-            color="#DDDDDD",
-            linewidth=0,
-            label="95 % of new loadings",
-        )
-        axis.fill_between(
-            grid_kpa,
-            centre_n - mean_n,
-            centre_n + mean_n,
-            color="#AAAAAA",
-            linewidth=0,
-            label="95 % of the mean curve",
-        )
+        for half_n, shade, name in (
+            (new_n, "#DDDDDD", "95 % of new loadings"),
+            (mean_n, "#AAAAAA", "95 % of the mean curve"),
+        ):
+            low_n, high_n = centre_n - half_n, centre_n + half_n
+            axis.fill_between(grid_kpa, low_n, high_n, color=shade, linewidth=0, label=name)
         for loading, name, colour, marker in BRANCHES:
             rows = blocks.loading == loading
             values_n = blocks.force_n if axis is curve else left_n

@@ -13,7 +13,7 @@ from service.estimation.fitting.least_squares import (
     compute_mean_curve_half_width_95_n,
 )
 from service.estimation.records import SIGMAS_95
-from service.offline.compare.report import OUR_COLOUR, REFERENCE_COLOUR, TILE_COLOURS
+from service.offline.compare.report import OUR_COLOUR, REFERENCE_COLOUR, plot_band, plot_tiles
 from service.offline.figure_output import create_figure, render_png
 from studies.reproduce import experiments as paper
 from studies.reproduce.experiments import MUD, PRESSURE_PLATE, DomeResult
@@ -62,9 +62,7 @@ def _draw_domes(domes: Sequence[DomeResult]) -> bytes:
             compute_curve_through_zero_n(tile, grid_kpa),
             compute_mean_curve_half_width_95_n(tile, grid_kpa),
         )
-        curves.fill_between(
-            grid_kpa, force_n - half_n, force_n + half_n, color=colour, alpha=0.25, linewidth=0
-        )
+        plot_band(curves, grid_kpa, force_n, half_n, colour)
         curves.plot(grid_kpa, force_n, color=colour, linewidth=1.6, label=found.dome.name)
         blocks = found.indented_tile.strokes
         every = np.flatnonzero(blocks.gauge_kpa <= grid_kpa[-1])[::5]
@@ -124,9 +122,7 @@ def _draw_rolling(experiment: ExperimentResult) -> bytes:
         if np.isnan(ours_mm).all():  # across a row of tiles
             continue
         half_mm = SIGMAS_95 * 1e3 * pairs.columns[f"cop_sigma_{name}_m"][rows]
-        place.fill_between(
-            t_s, ours_mm - half_mm, ours_mm + half_mm, color=colour, alpha=0.3, linewidth=0
-        )
+        plot_band(place, t_s, ours_mm, half_mm, colour)
         along = "forward" if name == "x" else "to the left"
         place.plot(t_s, ours_mm, color=colour, linewidth=1.3, label=f"foot, {along}")
         theirs_mm = (
@@ -169,19 +165,9 @@ def _draw_rolling(experiment: ExperimentResult) -> bytes:
 
 
 def _draw_tiles(axis: Axes, one: TrialResult, rows: Bools, t_s: Floats) -> None:
-    force_n = one.comparison.tile_force_n[rows]
-    borne = [i for i in range(force_n.shape[1]) if np.isfinite(force_n[:, i]).any()]
-    heights_n = np.maximum(np.nan_to_num(force_n[:, borne].T), 0.0)
-    axis.stackplot(
-        t_s,
-        heights_n,
-        labels=[one.comparison.serials[i] for i in borne],
-        colors=[TILE_COLOURS[k % len(TILE_COLOURS)] for k in range(len(borne))],
-        linewidth=0,
-        alpha=0.9,
-    )
-    reference_n = one.comparison.pairs.reference_n[rows]
-    axis.plot(t_s, reference_n, "--", color="black", linewidth=1.1, label="pressure plate")
+    found = one.comparison
+    reference_n = found.pairs.reference_n[rows]
+    plot_tiles(axis, t_s, found.tile_force_n[rows], found.serials, reference_n, "pressure plate")
     axis.axhline(paper.LEG_WEIGHT_N, color="#666666", linewidth=0.8)
     axis.annotate(
         "weight of the leg",
@@ -193,7 +179,6 @@ def _draw_tiles(axis: Axes, one: TrialResult, rows: Bools, t_s: Floats) -> None:
         color="#444444",
     )
     axis.set_ylim(0.0, 12.5)
-    axis.set_ylabel("tiles, one upon\nanother, N")
     axis.legend(fontsize=8, loc="upper left", ncols=5)
 
 
@@ -207,15 +192,7 @@ def _draw_hops(experiment: ExperimentResult) -> bytes:
     t_s = pairs.t_s[rows] - _find_first_contact_s(first)
     ours_n = pairs.columns["grf_n"][rows]
     half_n = SIGMAS_95 * pairs.columns["grf_sigma_n"][rows]
-    force.fill_between(
-        t_s,
-        ours_n - half_n,
-        ours_n + half_n,
-        color=OUR_COLOUR,
-        alpha=0.3,
-        linewidth=0,
-        label="its 95 %",
-    )
+    plot_band(force, t_s, ours_n, half_n, OUR_COLOUR, "its 95 %")
     force.plot(t_s, ours_n, color=OUR_COLOUR, linewidth=1.2, label="foot")
     force.plot(
         t_s, pairs.reference_n[rows], color=REFERENCE_COLOUR, linewidth=1.0, label="force plate"
@@ -229,7 +206,7 @@ def _draw_hops(experiment: ExperimentResult) -> bytes:
         color="#EEEEEE",
         label=_LINES_N[experiment.setup is MUD],
     )
-    error.fill_between(t_s, -half_n, half_n, color=OUR_COLOUR, alpha=0.3, linewidth=0)
+    plot_band(error, t_s, np.zeros(len(t_s)), half_n, OUR_COLOUR)
     error.plot(t_s, pairs.error_n[rows], color="black", linewidth=0.8)
     error.set_ylabel("foot less\nplate, N")
     error.set_xlabel("time since first contact, s")

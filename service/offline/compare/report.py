@@ -246,7 +246,9 @@ def plot_comparison(
     t_s = pairs.t_s[rows]
     figure.suptitle(f"{title}\n{describe_shown_time(t_s, pairs.t_s)}", fontsize=11)
     _plot_grf(over_time[0], over_time[1], pairs, rows)
-    _plot_tiles(over_time[2], t_s, force_n[rows], serials, pairs.reference_n[rows])
+    reference_n = pairs.reference_n[rows]
+    count = plot_tiles(over_time[2], t_s, force_n[rows], serials, reference_n, "reference")
+    over_time[2].legend(fontsize=8, loc="upper right", ncols=max(1, (count + 2) // 2))
     _plot_cop(over_time[3], over_time[4], pairs, rows)
     for axis in over_time:
         axis.set_xlim(t_s[0], t_s[-1])
@@ -276,28 +278,30 @@ def describe_shown_time(shown_s: Floats, all_s: Floats) -> str:
 def _plot_grf(force: Axes, error: Axes, pairs: PairedFrames, rows: Bools) -> None:
     t_s, grf_n = pairs.t_s[rows], pairs.columns["grf_n"][rows]
     half_n = SIGMAS_95 * pairs.columns["grf_sigma_n"][rows]
-    _plot_band(force, t_s, grf_n, half_n, OUR_COLOUR, "ours, 95 %")
+    plot_band(force, t_s, grf_n, half_n, OUR_COLOUR, "ours, 95 %")
     force.plot(t_s, grf_n, color=OUR_COLOUR, linewidth=1.2, label="ours")
     force.plot(
         t_s, pairs.reference_n[rows], "--", color=REFERENCE_COLOUR, linewidth=1.2, label="reference"
     )
     force.set_ylabel("GRF, N")
     force.legend(fontsize=8, loc="upper right", ncols=3)
-    _plot_band(error, t_s, np.zeros(len(t_s)), half_n, OUR_COLOUR)
+    plot_band(error, t_s, np.zeros(len(t_s)), half_n, OUR_COLOUR)
     error.plot(t_s, pairs.error_n[rows], color="black", linewidth=0.8)
     error.set_ylabel("ours less\nreference, N")
 
 
-def _plot_band(
-    axis: Axes, t_s: Floats, middle: Floats, half: Floats, colour: str, label: str | None = None
+def plot_band(
+    axis: Axes, x: Floats, middle: Floats, half: Floats, colour: str, label: str | None = None
 ) -> None:
+    """Plot a band of half the width on each side of its middle."""
     low, high = middle - half, middle + half
-    axis.fill_between(t_s, low, high, color=colour, alpha=0.25, linewidth=0, label=label)
+    axis.fill_between(x, low, high, color=colour, alpha=0.25, linewidth=0, label=label)
 
 
-def _plot_tiles(
-    axis: Axes, t_s: Floats, force_n: Floats, serials: Sequence[str], reference_n: Floats
-) -> None:
+def plot_tiles(
+    axis: Axes, t_s: Floats, force_n: Floats, serials: Sequence[str], reference_n: Floats, name: str
+) -> int:
+    """Plot the forces of tiles, one upon another, and a reference; return the number of tiles."""
     borne = [i for i in range(force_n.shape[1]) if np.isfinite(force_n[:, i]).any()]
     if borne:
         # Stacked tiles sum to the GRF; negative forces cannot be stacked.
@@ -305,9 +309,9 @@ def _plot_tiles(
         colours = [TILE_COLOURS[k % len(TILE_COLOURS)] for k in range(len(borne))]
         names = [serials[i] for i in borne]
         axis.stackplot(t_s, heights_n, labels=names, colors=colours, linewidth=0, alpha=0.85)
-    axis.plot(t_s, reference_n, "--", color="black", linewidth=1.1, label="reference")
+    axis.plot(t_s, reference_n, "--", color="black", linewidth=1.1, label=name)
     axis.set_ylabel("tiles, one upon\nanother, N")
-    axis.legend(fontsize=8, loc="upper right", ncols=max(1, (len(borne) + 2) // 2))
+    return len(borne)
 
 
 def _plot_cop(place: Axes, error: Axes, pairs: PairedFrames, rows: Bools) -> None:
@@ -319,13 +323,13 @@ def _plot_cop(place: Axes, error: Axes, pairs: PairedFrames, rows: Bools) -> Non
     for k, (name, colour) in enumerate((("x", OUR_COLOUR), ("y", "#009E73"))):
         ours_mm = 1e3 * pairs.columns[f"cop_{name}_m"][rows]
         half_mm = 1e3 * SIGMAS_95 * pairs.columns[f"cop_sigma_{name}_m"][rows]
-        _plot_band(place, t_s, ours_mm, half_mm, colour)
+        plot_band(place, t_s, ours_mm, half_mm, colour)
         place.plot(t_s, ours_mm, color=colour, linewidth=1.2, label=f"ours, {name}")
         if stated:
             place.plot(t_s, theirs_mm[:, k], "--", color="black", linewidth=0.9 + 0.3 * k)
             off_mm = ours_mm - theirs_mm[:, k]
             error.plot(t_s, off_mm, color=colour, linewidth=0.9, label=name)
-            _plot_band(error, t_s, np.zeros(len(t_s)), half_mm, colour)
+            plot_band(error, t_s, np.zeros(len(t_s)), half_mm, colour)
     if stated:
         place.plot([], [], "--", color="black", label="reference")
         error.axhline(0.0, color="black", linewidth=0.6)
