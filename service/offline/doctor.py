@@ -26,7 +26,6 @@ from devices.buses.device_files import find_programs_using
 from devices.buses.i2c import I2cBus, RetryingBus
 from devices.buses.serial_line import check_latency_timer, find_stable_path, read_latency_timer_ms
 from devices.chips.dynamixel.servo_setup import BAUDRATES, FoundServo, find_servos
-from devices.chips.pressure_chip import Registers
 from devices.chips.pressure_chips import get_chip
 from devices.clock import Clock
 from devices.errors import I2cError, ServoSetupError
@@ -42,26 +41,16 @@ _MIN_NOTABLE_GAIN = 1.05
 
 
 @dataclass(frozen=True)
-class TileFinding:
-    """Finding for one tile position.
+class TileFinding(FoundTile):
+    """Finding for one tile position, also where nothing answers.
 
     Attributes:
         serial: serial in the scene; empty if the scene has no such tile.
-        mux, channel, address: its place.
-        chip: kind of its chip.
-        registers: words that the chip is identified by; None if unreadable.
         conversion_ms: measured conversion time; None if unmeasurable.
-        problem: description of the fault; empty without one.
     """
 
-    serial: str
-    mux: int
-    channel: int
-    address: int
-    chip: str
-    registers: Registers | None
-    conversion_ms: float | None
-    problem: str
+    serial: str = ""
+    conversion_ms: float | None = None
 
 
 @dataclass(frozen=True)
@@ -174,7 +163,7 @@ def diagnose_bus(
 _Place = tuple[int, int, str, int]
 
 
-def _place(tile: FoundTile | TileFinding) -> _Place:
+def _place(tile: FoundTile) -> _Place:
     return tile.mux, tile.channel, tile.chip, tile.address
 
 
@@ -186,22 +175,12 @@ def _match_tiles(
     }
     there = {_place(plug): plug for plug in plugs}
     found = [
-        TileFinding(
-            places.get(place, ""),
-            plug.mux,
-            plug.channel,
-            plug.address,
-            plug.chip,
-            plug.registers,
-            None,
-            plug.problem,
-        )
-        for place, plug in there.items()
+        TileFinding(**vars(plug), serial=places.get(place, "")) for place, plug in there.items()
     ]
     absent = [
-        TileFinding(serial, mux, channel, address, chip, None, None, "it does not answer")
-        for (mux, channel, chip, address), serial in places.items()
-        if (mux, channel, chip, address) not in there
+        TileFinding(*place, None, "it does not answer", serial)
+        for place, serial in places.items()
+        if place not in there
     ]
     return tuple(sorted((*found, *absent), key=_place))
 
