@@ -74,27 +74,9 @@ class InFlightWriter:
 
     def write_frame(self, frame: AcquiredFrame) -> None:
         """Write one frame to its row."""
-        (
-            seq,
-            t_mono_ns,
-            t_ns,
-            counts,
-            age_us,
-            force_n,
-            flags,
-            pressure_raw,
-            temperature_raw,
-            offset_us,
-            status,
-        ) = frame
-        row = self._row.pack(
-            *(seq, t_mono_ns, t_ns, counts, age_us, force_n, flags),
-            *pressure_raw,
-            *temperature_raw,
-            *offset_us,
-            *status,
-        )
-        at = self._begin + (seq % ROW_COUNT) * self._size
+        *of_frame, pressure_raw, temperature_raw, offset_us, status = frame
+        row = self._row.pack(*of_frame, *pressure_raw, *temperature_raw, *offset_us, *status)
+        at = self._begin + (frame.seq % ROW_COUNT) * self._size
         self._map[at : at + self._size] = row + zlib.crc32(row).to_bytes(4, "little")
 
     def close(self) -> None:
