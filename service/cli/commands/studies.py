@@ -65,7 +65,6 @@ def benchmark_broad(
         Exit: 3, for a missing result, or with `check_goals` a missed goal.
     """
     from service.offline.figure_output import create_figure
-    from storage.durable_files import write_atomically
     from studies.broad.arrays import BroadOptions, run_broad_benchmark
     from studies.broad.figures import (
         compare_with_goals,
@@ -97,23 +96,38 @@ def benchmark_broad(
         "models": count_models(broad.results),
         "results": [result.model_dump() for result in broad.results],
     }
-    write_atomically(folder / "broad.json", to_json_text(content).encode())
-    write_atomically(folder / "broad.md", text.encode())
-    write_atomically(folder / "broad.png", plot_broad(broad.results))
+    figures = {"broad.png": plot_broad(broad.results)}
+    write_and_print_result(folder, "broad", content, text, figures, as_json=as_json)
+    refused = [(f"array {r.number}, {f.what}", f.why) for r in broad.results for f in r.refusals]
+    for what, why in [*refused, *((f.what, f.why) for f in broad.lost_arrays)]:
+        remark(f"no result: {what}: {why}")
+    missed = [goal for goal in goals if check_goals and not goal.is_met]
+    for goal in missed:
+        remark(f"goal not met: {goal.mode}: {goal.figure}: {goal.value:.3g}")
+    if refused or broad.lost_arrays or missed:
+        raise typer.Exit(3)
+
+
+def write_and_print_result(
+    folder: Path,
+    name: str,
+    content: object,
+    text: str,
+    figures: Mapping[str, bytes],
+    *,
+    as_json: bool,
+) -> None:
+    """Write a result as JSON, Markdown and figures, and print it as JSON or text."""
+    from storage.durable_files import write_atomically
+
+    files = {f"{name}.json": to_json_text(content).encode(), f"{name}.md": text.encode(), **figures}
+    for file_name, data in files.items():
+        write_atomically(folder / file_name, data)
     if as_json:
         print_json(content)
     else:
         echo_lines(text)
-        echo(f"{folder}: broad.json, broad.md, broad.png")
-    refused = [(f"array {r.number}, {f.what}", f.why) for r in broad.results for f in r.refusals]
-    for what, why in [*refused, *((f.what, f.why) for f in broad.lost_arrays)]:
-        remark(f"no result: {what}: {why}")
-    missed = [goal for goal in goals if not goal.is_met]
-    if check_goals:
-        for goal in missed:
-            remark(f"goal not met: {goal.mode}: {goal.figure}: {goal.value:.3g}")
-    if refused or broad.lost_arrays or (check_goals and missed):
-        raise typer.Exit(3)
+        echo(f"{folder}: {', '.join(files)}")
 
 
 SCENES = ("rolling", "poppy", "mud")
@@ -231,7 +245,6 @@ def benchmark_command(
             )
         return
     from service.offline.figure_output import create_figure
-    from storage.durable_files import write_atomically
     from studies.benchmark.report import format_benchmark_report, plot_benchmark
     from studies.benchmark.run import BenchmarkOptions, run_benchmark
     from studies.estimators import get_estimator
@@ -261,25 +274,22 @@ def benchmark_command(
     with open_result_folder(out) as folder:
         with show_progress("starting") as report_step:
             result = run_benchmark(options, report_step)
-            text, png = format_benchmark_report(result), plot_benchmark(result.scenes)
-        content = to_json_text(result.as_dict())
-        write_atomically(folder / "benchmark.json", content.encode())
-        write_atomically(folder / "benchmark.md", text.encode())
-        write_atomically(folder / "benchmark.png", png)
-    if as_json:
-        print_json(result.as_dict())
-    else:
-        echo_lines(text)
-        echo(f"{folder}: benchmark.json, benchmark.md, benchmark.png")
+            text = format_benchmark_report(result)
+            figures = {"benchmark.png": plot_benchmark(result.scenes)}
+        write_and_print_result(
+            folder, "benchmark", result.as_dict(), text, figures, as_json=as_json
+        )
     for name, failure in result.failures:
         remark(f"not measured: {name}, {failure.what}: {failure.why}")
     missed = [
-        (name, goal) for name, goals in result.goals.items() for goal in goals if not goal.is_met
+        (name, goal)
+        for name, goals in result.goals.items()
+        for goal in goals
+        if check_goals and not goal.is_met
     ]
-    if check_goals:
-        for name, goal in missed:
-            remark(f"goal not met: {name}, {goal.mode}: {goal.figure}: {goal.value:.3g}")
-    if result.failures or (check_goals and missed):
+    for name, goal in missed:
+        remark(f"goal not met: {name}, {goal.mode}: {goal.figure}: {goal.value:.3g}")
+    if result.failures or missed:
         raise typer.Exit(3)
 
 
@@ -317,7 +327,6 @@ def reproduce_command(
     success, 1 failure, 2 wrong usage, 3 written, but with missing results.
     """
     from service.offline.figure_output import create_figure
-    from storage.durable_files import write_atomically
     from studies.reproduce.experiments import TRIALS
     from studies.reproduce.figures import draw_figures
     from studies.reproduce.report import format_reproduction_report
@@ -335,16 +344,7 @@ def reproduce_command(
         with show_progress("starting") as report_step:
             result = run_reproduction(options, folder, report_step)
             text, figures = format_reproduction_report(result), draw_figures(result)
-        content = to_json_text(result)
-        write_atomically(folder / "reproduce.json", content.encode())
-        write_atomically(folder / "reproduce.md", text.encode())
-        for name, png in figures.items():
-            write_atomically(folder / name, png)
-    if as_json:
-        print_json(result)
-    else:
-        echo_lines(text)
-        echo(f"{folder}: reproduce.json, reproduce.md, {', '.join(figures)}")
+        write_and_print_result(folder, "reproduce", result, text, figures, as_json=as_json)
     for name, why in result.failures.items():
         remark(f"not measured: {name}: {why}")
     if result.failures:
