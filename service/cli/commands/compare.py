@@ -38,8 +38,7 @@ from service.cli.reference_options import (
 )
 
 if TYPE_CHECKING:
-    from service.offline.archive.jobs import Job, OutcomeCounts
-    from service.offline.archive.tasks import CompareTask
+    from service.offline.archive.jobs import OutcomeCounts
     from service.offline.comparison import CompareOptions
 
 LIMIT_MISSED = "limit missed"
@@ -96,20 +95,35 @@ def compare_manifest(
     Raises:
         UsageError: as for `run_task`, or an invalid option.
     """
-    from service.offline.archive.locations import make_absolute
-    from service.offline.archive.manifest import read_rows
+    from service.offline.archive.jobs import Job
+    from service.offline.archive.locations import make_absolute, parse_session_location
+    from service.offline.archive.manifest import read_rows, resolve_path
+    from service.offline.archive.tasks import CompareTask, InvalidTask
 
-    make_compare_options(
-        stated, remove_offset=remove_offset
-    )  # an option that is wrong for all rows
+    # An option that is wrong is so for all rows.
+    make_compare_options(stated, remove_offset=remove_offset)
     columns = {"session", "reference", "name", *stated}
     out = make_absolute(out)
 
     def list_rows() -> Iterator[dict[str, str]]:
         return read_rows(manifest, columns)
 
+    def make_job(row: Mapping[str, str]) -> Job:
+        """Return the job of a row; an invalid row gives a job that fails."""
+        place = parse_session_location(row["session"])
+        if not row.get("reference"):
+            return Job(place, InvalidTask("the row names no reference", "compare"), out)
+        try:
+            name = _choose_name(row, place.session_id)
+            values = {**stated, **{name: value for name, value in row.items() if value}}
+            options = make_compare_options(values, remove_offset=remove_offset)
+            task = CompareTask(resolve_path(manifest, row["reference"]), options, dict(limits))
+        except UsageError as error:
+            return Job(place, InvalidTask(str(error), "compare"), out)
+        return Job(replace(place, session_id=name), task, out)
+
     return run_jobs_with_report(
-        (_make_job(manifest, row, stated, limits, remove_offset, out) for row in list_rows()),
+        map(make_job, list_rows()),
         command="compare",
         list_again=list_rows,
         out=out,
@@ -118,51 +132,11 @@ def compare_manifest(
     )
 
 
-def _make_job(
-    manifest: Path,
-    row: Mapping[str, str],
-    stated: StatedOptions,
-    limits: Mapping[str, float],
-    remove_offset: bool,
-    out: str,
-) -> Job:
-    """Return the job of a row; an invalid row gives a job that fails."""
-    from service.offline.archive.jobs import Job
-    from service.offline.archive.locations import parse_session_location
-    from service.offline.archive.tasks import InvalidTask
-
-    place = parse_session_location(row["session"])
-    try:
-        name = _choose_name(row, place.session_id)
-        task = _make_task(manifest, row, stated, limits, remove_offset=remove_offset)
-    except UsageError as error:
-        return Job(place, InvalidTask(str(error), "compare"), out)
-    return Job(replace(place, session_id=name), task, out)
-
-
 def _choose_name(row: Mapping[str, str], default: str) -> str:
     name = row.get("name") or default
     if not _NAME.fullmatch(name):
         raise UsageError(f"name {name!r}", expected="letters, digits, - and _")
     return name
-
-
-def _make_task(
-    manifest: Path,
-    row: Mapping[str, str],
-    stated: StatedOptions,
-    limits: Mapping[str, float],
-    *,
-    remove_offset: bool,
-) -> CompareTask:
-    from service.offline.archive.manifest import resolve_path
-    from service.offline.archive.tasks import CompareTask
-
-    if not row.get("reference"):
-        raise UsageError("the row names no reference")
-    values = {**stated, **{name: value for name, value in row.items() if value}}
-    options = make_compare_options(values, remove_offset=remove_offset)
-    return CompareTask(resolve_path(manifest, row["reference"]), options, dict(limits))
 
 
 def _parse_number(stated: StatedOptions, name: str) -> float | None:
