@@ -7,11 +7,11 @@ import inspect
 import os
 import shlex
 import sys
-from collections.abc import AsyncIterator, Callable
-from contextlib import ExitStack, asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_origin
 from urllib.parse import quote
 
 import typer
@@ -104,35 +104,61 @@ def serve_command(
 
 
 async def _run_server(settings: Settings) -> None:
-    from devices.realtime import freeze_garbage_collector
+    stop = create_stop_event()
+    with _listen(settings) as entrance:
+        async with _serve(settings, entrance):
+            await stop.wait()
+
+
+class _Entrance(NamedTuple):
+    """Socket of a server, with its logins and addresses."""
+
+    listening: socket.socket
+    logins: Logins
+    find_urls: Callable[[], list[str]]
+
+
+@contextmanager
+def _listen(settings: Settings) -> Iterator[_Entrance]:
+    """Listen, and let programs of this user on this machine find the token."""
     from service.api.access import Logins
     from service.api.address import (
-        list_own_names,
         list_urls,
         load_or_create_token,
         open_listening_socket,
         publish_token,
     )
-    from service.api.app import make_app, serve_app
-    from service.server.server import Server
     from storage.permissions import set_umask_and_create_private_folder
 
-    stop = create_stop_event()
     with open_listening_socket(settings.host, settings.port) as listening:
         set_umask_and_create_private_folder(settings.data)
-        server = Server(settings.data, unquantized=settings.no_quantize)
         token = load_or_create_token(settings.token, settings.data)
-        logins = Logins(token, is_private=settings.private)
         find_urls = partial(list_urls, listening, settings.host, settings.advertise)
-        urls = find_urls()
-        hosts = (*settings.allow_host, *list_own_names(), get_host(urls[0]))
-        app = make_app(server, logins=logins, hosts=hosts, find_urls=find_urls)
         with publish_token(listening, token):
-            async with serve_app(app, listening, settings):
-                freeze_garbage_collector()
-                print_addresses(urls, settings.data, logins, is_stored=not settings.token)
-                remark_unreachable(urls, settings.host)
-                await stop.wait()
+            yield _Entrance(listening, Logins(token, is_private=settings.private), find_urls)
+
+
+@asynccontextmanager
+async def _serve(
+    settings: Settings, entrance: _Entrance, *, is_demo: bool = False
+) -> AsyncIterator[Server]:
+    """Run a server while the block runs, and print its addresses."""
+    from devices.realtime import freeze_garbage_collector
+    from service.api.address import list_own_names
+    from service.api.app import make_app, serve_app
+    from service.server.server import Server
+
+    listening, logins, find_urls = entrance
+    server = Server(settings.data, unquantized=settings.no_quantize)
+    urls = find_urls()
+    hosts = (*settings.allow_host, *list_own_names(), get_host(urls[0]))
+    app = make_app(server, logins=logins, hosts=hosts, find_urls=find_urls)
+    async with serve_app(app, listening, settings):
+        freeze_garbage_collector()
+        is_stored = not settings.token
+        print_addresses(urls, settings.data, logins, is_stored=is_stored, is_demo=is_demo)
+        remark_unreachable(urls, settings.host)
+        yield server
 
 
 def print_addresses(
@@ -204,6 +230,7 @@ def demo_command(
     """
     import uvloop
 
+    from foottile.environment import read_token
     from service.offline.calibration_lookup import find_scene_calibration
     from service.rig.emulated_foot import RigOptions
 
@@ -217,43 +244,20 @@ def demo_command(
     if data is None:
         folder /= "demo"
     arguments.append(f"--journal={folder / 'node'}")
-    uvloop.run(_run_demo(host, port, advertise, folder, seconds, arguments))
+    settings = Settings(host=host, port=port, advertise=advertise, data=folder)
+    settings = settings.model_copy(update={"token": read_token()})
+    uvloop.run(_run_demo(settings, seconds, arguments))
 
 
-async def _run_demo(
-    host: str,
-    port: int,
-    advertise: str | None,
-    data: Path,
-    seconds: float | None,
-    node_arguments: list[str],
-) -> None:
-    from foottile.environment import read_token
-    from service.api.access import Logins
-    from service.api.address import (
-        list_urls,
-        load_or_create_token,
-        open_listening_socket,
-        publish_token,
-    )
-    from storage.permissions import set_umask_and_create_private_folder
-
+async def _run_demo(settings: Settings, seconds: float | None, node_arguments: list[str]) -> None:
     stop = create_stop_event()
-    set_umask_and_create_private_folder(data)
-    with open_listening_socket(host, port) as listening, ExitStack() as stack:
-        given_token = read_token()
-        token = load_or_create_token(given_token, data)
-        stack.enter_context(publish_token(listening, token))
-        logins = Logins(token)
-        find_urls = partial(list_urls, listening, host, advertise)
-        urls = find_urls()
+    with _listen(settings) as entrance:
+        url = entrance.find_urls()[-1]
         # First: the node finds and measures its tiles while the server starts.
-        node = await _start_node(urls[-1], token, node_arguments)
+        node = await _start_node(url, entrance.logins.token, node_arguments)
         try:
-            async with _serve_demo(listening, data, logins, find_urls) as server:
-                print_addresses(urls, data, logins, is_stored=not given_token, is_demo=True)
-                remark_unreachable(urls, host)
-                remark(f"list recordings: foottile sessions --server {urls[-1]}")
+            async with _serve(settings, entrance, is_demo=True) as server:
+                remark(f"list recordings: foottile sessions --server {url}")
                 ended = asyncio.create_task(node.wait())
                 stopped = asyncio.create_task(stop.wait())
                 done, _ = await asyncio.wait(
@@ -268,27 +272,9 @@ async def _run_demo(
                 await _stop_recording(server)
                 await _stop_node(node)  # before its server, else it would try to reconnect
                 if not stop.is_set():
-                    remark(f"ended after {seconds:g} s; data in {data}")
+                    remark(f"ended after {seconds:g} s; data in {settings.data}")
         finally:
             await _stop_node(node)
-
-
-@asynccontextmanager
-async def _serve_demo(
-    listening: socket.socket, data: Path, logins: Logins, find_urls: Callable[[], list[str]]
-) -> AsyncIterator[Server]:
-    """Run a server while the block runs."""
-    from devices.realtime import freeze_garbage_collector
-    from service.api.address import list_own_names
-    from service.api.app import make_app, serve_app
-    from service.server.server import Server
-
-    server = Server(data)
-    hosts = (*list_own_names(), get_host(find_urls()[0]))
-    app = make_app(server, hosts=hosts, logins=logins, find_urls=find_urls)
-    async with serve_app(app, listening):
-        freeze_garbage_collector()
-        yield server
 
 
 async def _start_node(url: str, token: str, arguments: list[str]) -> asyncio.subprocess.Process:
