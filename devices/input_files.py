@@ -37,14 +37,14 @@ def read_bytes(path: Path, *, bytes_max: int) -> bytes:
         return file.read(bytes_max)
 
 
-def read_text(path: Path, *, bytes_max: int = TEXT_BYTES_MAX) -> str:
+def read_text(path: Path) -> str:
     """Read all of a text file (`decode_text`).
 
     Raises:
         OSError: as for `check_regular_file`, or it cannot be read.
         UnicodeDecodeError: it is no text.
     """
-    return decode_text(read_bytes(path, bytes_max=bytes_max))
+    return decode_text(read_bytes(path, bytes_max=TEXT_BYTES_MAX))
 
 
 def decode_text(content: bytes) -> str:

@@ -74,47 +74,40 @@ PAPER_RANGE_N = (25.0, 35.0)
 """Load at which that dome saturates its chip (PAPER III-A)."""
 
 
-def compute_volume_ratio(
-    initial_kpa: float = SEAL_KPA, final_kpa: float = FULL_SCALE_KPA, exponent: float = ISOTHERMAL
-) -> float:
-    """Return V2/V1 of a bubble that goes from p1 to p2: p1 V1^k = p2 V2^k.
+def compute_volume_ratio(exponent: float = ISOTHERMAL) -> float:
+    """Return V2/V1 of a bubble that goes from its seal to full scale: p1 V1^k = p2 V2^k.
 
     Slowly, k = 1, this is Boyle's law (PAPER eq. 1): 0.8696 is left at 115 kPa, 13 % are gone. Fast
     loads reach full scale earlier: k = 1.4 leaves 0.9050.
     """
-    return float((initial_kpa / final_kpa) ** (1.0 / exponent))
+    return float((SEAL_KPA / FULL_SCALE_KPA) ** (1.0 / exponent))
 
 
-def compute_fast_to_slow_saturation_load_ratio(
-    seal_kpa: float = SEAL_KPA, exponent: float = ADIABATIC
-) -> float:
+def compute_fast_to_slow_saturation_load_ratio() -> float:
     """Return the change of volume at full scale of a fast load, relative to a slow one: 0.73.
 
     With volume proportional to force this is also the ratio of the loads ([D], estimate).
     """
-    fast = 1.0 - compute_volume_ratio(seal_kpa, exponent=exponent)
-    return fast / (1.0 - compute_volume_ratio(seal_kpa))
+    return (1.0 - compute_volume_ratio(ADIABATIC)) / (1.0 - compute_volume_ratio())
 
 
-def compute_wall_compliance_per_kpa(
-    dome: Dome, bubble_radius_mm: float = BUBBLE_RADIUS_MM
-) -> float:
+def compute_wall_compliance_per_kpa(dome: Dome) -> float:
     """Return the compliance of the wall: part of the bubble's volume for a kPa of difference.
 
     Thick sphere of an incompressible rubber, 9 b^3 / (4 E (b^3 - a^3)): 0.00124 for Vytaflex 60,
     0.00389 for Vytaflex 40, both of 11 mm ([D], estimate: half a sphere on a board is no sphere).
     """
-    a3, b3 = bubble_radius_mm**3, (dome.diameter_mm / 2) ** 3
+    a3, b3 = BUBBLE_RADIUS_MM**3, (dome.diameter_mm / 2) ** 3
     return 9.0 * b3 / (4.0 * dome.material.modulus_mpa * 1e3 * (b3 - a3))
 
 
-def compute_ambient_transmission(dome: Dome, seal_kpa: float = SEAL_KPA) -> float:
+def compute_ambient_transmission(dome: Dome) -> float:
     """Return the part of a change of the surrounding pressure that reaches the bubble.
 
     11 % in Vytaflex 60 and 28 % in Vytaflex 40, both of 11 mm ([D], estimate): weather, height, and
     the depth of mud. The gas' own stiffness is its pressure.
     """
-    given = compute_wall_compliance_per_kpa(dome) * seal_kpa
+    given = compute_wall_compliance_per_kpa(dome) * SEAL_KPA
     return given / (1.0 + given)
 
 

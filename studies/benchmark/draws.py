@@ -11,7 +11,7 @@ The first show the gain of each model for its run time, the second show its effe
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
@@ -280,19 +280,13 @@ class DrawResult:
     failures: tuple[MeasurementFailure, ...]
 
 
-def record_draw(
-    scene: Scene,
-    seconds: float | None,
-    draw: int,
-    on_progress: Callable[[str], None] = lambda message: None,
-) -> DrawRecording:
+def record_draw(scene: Scene, seconds: float | None, draw: int) -> DrawRecording:
     """Calibrate the tiles of a draw as a user would, and record the scene with them.
 
     Args:
         scene: scene to run.
         seconds: duration; None: the scene's, or `DEFAULT_SCENE_SECONDS` if it has no end.
         draw: seed of tiles and noise.
-        on_progress: called before slow steps.
 
     Raises:
         FootTileError: scene or calibration is not usable.
@@ -302,7 +296,6 @@ def record_draw(
         [tile.serial for tile in scene.tile if not tile.reference],
         parts_seed=draw,
         family=scene.emulation.family,
-        on_progress=on_progress,
     )
     return record_with_calibration(scene, seconds, draw, calibration)[0]
 
