@@ -91,11 +91,6 @@ def read_stated_and_actual_hash(path: Path) -> HashPair | None:
         return _hashes(file)
 
 
-def _compute_stated_and_actual_hash(content: bytes) -> HashPair | None:
-    """Return the stated and actual hash of a Parquet file in memory; None if it states none."""
-    return _hashes(io.BytesIO(content))
-
-
 def refuse_wrong_or_missing_file_hash(hashes: HashPair | None, *, where: str) -> None:
     """Refuse a Parquet file whose bytes have changed since it was written.
 
@@ -284,7 +279,7 @@ def parse_hashed_table(content: bytes, *, where: str) -> pa.Table:
     Raises:
         DamagedFileError: its hash is wrong or missing, or it is no table.
     """
-    refuse_wrong_or_missing_file_hash(_compute_stated_and_actual_hash(content), where=where)
+    refuse_wrong_or_missing_file_hash(_hashes(io.BytesIO(content)), where=where)
     try:
         with pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True) as file:
             # On this thread: if one of Arrow's released `content` last while the interpreter ends,

@@ -81,13 +81,9 @@ class _StdoutConsole(_SafeConsole):
         raise SystemExit(0)
 
 
-def _choose_width() -> int | None:
-    # A pipe or a file needs no line breaks.
-    return None if sys.stdout.isatty() or read_variable("COLUMNS") else 500
-
-
 # Data goes to stdout; progress and remarks to stderr, progress only on a terminal.
-stdout = _StdoutConsole(width=_choose_width())
+# A pipe or a file needs no line breaks.
+stdout = _StdoutConsole(width=None if sys.stdout.isatty() or read_variable("COLUMNS") else 500)
 stderr = _SafeConsole(stderr=True)
 
 

@@ -339,7 +339,7 @@ def _describe_limitations(
             )
     if not pairs.is_counted.all():
         notes.append("the reference is slower than ours: the frame nearest to each sample counts")
-    if _has_any_flag(pairs, EstimateFlag.ASSUMED_SCALE):
+    if (pairs.columns["estimate_flags"] & np.uint16(EstimateFlag.ASSUMED_SCALE)).any():
         notes.append("our newtons rest on an assumed scale: the calibration was not measured")
     return notes
 
@@ -349,11 +349,6 @@ def _give_advice(alignment: Alignment, options: CompareOptions) -> list[str]:
         return advise_on_scale(alignment)
     hint = "coverage is not computed: --reference-sigma-n is not given"
     return [*advise_on_scale(alignment), hint]
-
-
-def _has_any_flag(pairs: PairedFrames, bit: EstimateFlag) -> bool:
-    status: npt.NDArray[np.uint16] = pairs.columns["estimate_flags"]
-    return bool((status & np.uint16(bit)).any())
 
 
 _MISSING_FIGURE_HINTS = {

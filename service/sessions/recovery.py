@@ -236,18 +236,7 @@ class RecoveryReport:
     def is_empty_or_all_waiting(self) -> bool:
         """True if nothing was changed; sessions may wait for their node."""
         done = any(one.outcome != "waiting" for one in self.sessions)
-        made = (
-            self.removed_temporaries,
-            self.cut_bytes,
-            self.rewritten_markers,
-            self.rebuilt_sessions,
-            self.problems,
-        )
-        return not (done or any(made))
-
-
-def _ignore(_: str) -> None:
-    pass
+        return not (done or any(made for name, made in vars(self).items() if name != "sessions"))
 
 
 def recover_locked_folder(
@@ -255,7 +244,7 @@ def recover_locked_folder(
     *,
     make_sessions: bool = False,
     abandon_missing: bool = False,
-    report_step: Callable[[str], None] = _ignore,
+    report_step: Callable[[str], None] = lambda _: None,
     now: Callable[[], datetime] = lambda: datetime.now(UTC),
 ) -> RecoveryReport:
     """Complete a data folder, of a server or of a node, after a crash.

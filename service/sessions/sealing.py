@@ -30,7 +30,7 @@ from storage.sessions.metadata import (
     write_sha256_sums,
 )
 from storage.sessions.writer import SealedFileWriter
-from storage.verify.sealed_file import SealedFileReport, verify_sealed_file
+from storage.verify.sealed_file import verify_sealed_file
 
 
 def seal_session(inputs: SessionInputs, folder: Path, ledger: Ledger) -> Session:
@@ -169,7 +169,7 @@ def _session_from_files(folder: Path, what: str) -> Session | None:
         "problem": f"{what} and was rebuilt from {FRAMES_NAME}; lost are {', '.join(lost)}",
         "ledger": file.ledger,
         "frames": file.frame_count,
-        "duration_s": _duration_s(file),
+        "duration_s": sum(p.t_mono_ns_last - p.t_mono_ns_first for p in file.parts) * 1e-9,
         "bytes": path.stat().st_size,
         "sha256": compute_sha256(path),
         "calibration_id": notes.get("calibration_id"),
@@ -186,7 +186,3 @@ def _read_sidecar(read: Callable[[Path], _T], path: Path) -> _T | None:
         return read(path)
     except (FileNotFoundError, FileFormatError):
         return None
-
-
-def _duration_s(file: SealedFileReport) -> float:
-    return sum(part.t_mono_ns_last - part.t_mono_ns_first for part in file.parts) * 1e-9

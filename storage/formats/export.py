@@ -283,10 +283,10 @@ class Export:
         if has_rows or header is None:
             return
         end_s = (end_t_ns - content.begin_t_ns) * 1e-9
-        if self.selection.starts_after(end_s):
+        start_s = self.selection.start_s
+        if start_s is not None and start_s > end_s:
             raise UsageError(
-                f"the slice starts at {self.selection.start_s:g} s, and the session ends at "
-                f"{end_s:.3f} s",
+                f"the slice starts at {start_s:g} s, and the session ends at {end_s:.3f} s",
                 where=self.session_and_node_text,
                 expected="a start before the session's end",
             )

@@ -83,10 +83,6 @@ class Slice:
             rows &= t_ns < end_ns
         return rows
 
-    def starts_after(self, end_s: float) -> bool:
-        """Return whether the slice begins after `end_s`, in seconds after the first frame."""
-        return self.start_s is not None and self.start_s > end_s
-
 
 class FormatOptions(BaseModel):
     """Options of export formats. None: the format's default.

@@ -116,7 +116,7 @@ def _format_comparison_table(result: Reproduction) -> Iterator[str]:
         stated = "below 1 (III)" if setup is not MUD else "no number known here"
         rows.append(
             (
-                f"{_lower_first_letter(setup.title)}: GRF mean error, N",
+                f"{setup.title[0].lower()}{setup.title[1:]}: GRF mean error, N",
                 stated,
                 _format_figure(one, "grf_mae_n"),
             )
@@ -180,7 +180,7 @@ def _format_domes(result: Reproduction) -> Iterator[str]:
 
 def _format_experiment(result: Reproduction, one: ExperimentResult) -> Iterator[str]:
     setup = one.setup
-    yield from (f"## {setup.title}", "", *_get_experiment_texts(setup.name), "")
+    yield from (f"## {setup.title}", "", *_EXPERIMENT_TEXTS.get(setup.name, ()), "")
     yield from (f"![{setup.title}: foot and {setup.instrument}]({setup.name}.png)", "")
     names = [name for name in REPORTED_FIGURES if math.isfinite(one.figures[name].mean)]
     yield "| figure | mean over trials | " + " | ".join(t.name for t in one.trials) + " |"
@@ -223,10 +223,6 @@ _EXPERIMENT_TEXTS = {
         "it up and drags at it; the plate sees that and the domes do not.",
     ),
 }
-
-
-def _get_experiment_texts(name: str) -> Sequence[str]:
-    return _EXPERIMENT_TEXTS.get(name, ())
 
 
 def _format_references(result: Reproduction) -> Iterator[str]:
@@ -319,7 +315,3 @@ def _format_span(values: Sequence[float]) -> str:
         return "-"
     low, high = 100 * min(values), 100 * max(values)
     return f"{low:.2f} to {high:.2f} %" if len(values) > 1 else f"{low:.2f} %"
-
-
-def _lower_first_letter(title: str) -> str:
-    return title[0].lower() + title[1:]

@@ -82,7 +82,8 @@ class ChunkStore:
                     download_and_hash(f"{self._where}/{name}", path / name)
             yield path
             made = [file for file in path.iterdir() if file.name not in there]
-            for file in sorted(made, key=_is_chunk_index):
+            # Last the index of a chunk, which names its other files.
+            for file in sorted(made, key=lambda file: file.suffix == ".json"):
                 upload(f"{self._where}/{file.name}", file)
 
     def delete(self) -> None:
@@ -90,11 +91,6 @@ class ChunkStore:
         filesystem, path = open_filesystem(self._all)
         with convert_write_errors(self._all):
             filesystem.delete_dir(path)
-
-
-def _is_chunk_index(file: Path) -> bool:
-    """Return whether a file names the other files of its chunk; it must be published last."""
-    return file.suffix == ".json"
 
 
 _WORK_FOLDER_NAME = ".work"
