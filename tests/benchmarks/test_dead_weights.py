@@ -11,6 +11,7 @@ pytestmark = pytest.mark.slow
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
 
+@pytest.mark.slow(parts=8)
 def test_the_stated_interval_holds_about_95_of_100_loads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     dead_weights = importlib.import_module("dead_weights")

@@ -24,6 +24,7 @@ def flame(monkeypatch: pytest.MonkeyPatch) -> Any:
     return importlib.import_module("flame")
 
 
+@pytest.mark.slow
 def test_boxes_stand_on_who_called_them_and_are_as_wide_as_their_samples(flame: Any) -> None:
     whole = flame.tree(SAMPLES)
     trunk, _ = whole.calls.values()

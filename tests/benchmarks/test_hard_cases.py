@@ -33,6 +33,7 @@ def test_the_walk_has_steps_that_differ_and_flight_between_them(hard: ModuleType
     assert (trace.cells_n[trace.time_s % 1.2 > 0.61] == 0.0).all()
 
 
+@pytest.mark.slow
 def test_a_case_is_a_row_with_what_it_was_without_the_watch(
     hard: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -76,6 +77,7 @@ def test_a_rate_is_bounded_as_that_of_a_poisson_process(hard: ModuleType, alarms
     assert hard.most_per_hour(alarms, 4.0) == pytest.approx(exact / 4.0, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_healthy_foot_has_a_line_for_each_share_of_lost_frames(
     hard: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -48,6 +48,7 @@ MARKS = {
     "first_bar": _PROCESSES,
     "formats": _PROCESSES,
     "many_nodes": [*_PROCESSES, pytest.mark.real_time],
+    **{name: [pytest.mark.slow] for name in ("archive", "file_bytes", "query", "slices")},
 }
 SHORTER: dict[str, tuple[str, Any]] = {
     "many_nodes": ("SETTLE_S", 0.5),

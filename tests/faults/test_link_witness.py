@@ -26,6 +26,7 @@ def frame(
     return Frame(opcode, payload, fin=is_last).serialize(mask=masked)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("masked", [True, False])
 @given(
     sizes=st.lists(st.sampled_from([0, 1, 125, 126, 70_000]), max_size=5),

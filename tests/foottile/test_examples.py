@@ -40,6 +40,7 @@ def left(running: Running, node_of: NodeOf) -> Iterator[FakeNode]:
         yield node
 
 
+@pytest.mark.slow
 def test_every_python_example_runs(
     running: Running, left: FakeNode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -60,6 +61,7 @@ def test_every_python_example_runs(
     assert Path("trial.png").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_the_readme_plots_what_was_pulled_over_seconds(
     running: Running,
     left: FakeNode,

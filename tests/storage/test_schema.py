@@ -266,6 +266,7 @@ def _said(code: str) -> str:
     return done.stdout.strip()
 
 
+@pytest.mark.slow
 def test_our_arrays_do_not_load_pandas_and_it_can_be_loaded_afterwards() -> None:
     code = """
 import sys
@@ -281,6 +282,7 @@ print(len(pyarrow.Table.from_pandas(frame)), column.null_count)
     assert _said(code).split() == ["False", "2", "1"]
 
 
+@pytest.mark.slow
 def test_pandas_that_is_there_already_stays_as_it_is() -> None:
     code = """
 import pandas, pyarrow

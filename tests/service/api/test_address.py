@@ -244,7 +244,7 @@ finally:
 """
 
 
-@pytest.mark.slow
+@pytest.mark.slow(parts=8)
 @needs_networks
 @pytest.mark.process
 def test_client_and_node_reach_every_address(tmp_path: Path) -> None:

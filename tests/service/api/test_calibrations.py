@@ -275,7 +275,7 @@ def wait_for_end(running: Running, job: httpx.Response) -> dict[str, Any]:
     return ended
 
 
-@pytest.mark.slow
+@pytest.mark.slow(parts=8)
 @pytest.mark.process
 def test_a_rig_session_is_fitted_or_the_fit_has_a_reason(with_rig: Running) -> None:
     running = with_rig

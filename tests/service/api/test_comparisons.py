@@ -53,6 +53,7 @@ def get(session: Recording, path: str = "", **query: Any) -> Any:
     return content_of(session.running.http.get(f"{session.url}/comparisons{path}", params=query))
 
 
+@pytest.mark.slow
 def test_a_comparison_has_figures_limits_and_the_reference_at_any_zoom(compared: Recording) -> None:
     (item,) = get(compared)["items"]
     assert (item["name"], item["problem"], item["matches_current_data"]) == (NAME, None, True)

@@ -89,7 +89,7 @@ def person(
         yield wait_for
 
 
-@pytest.mark.slow
+@pytest.mark.slow(parts=8)
 def test_tiles_are_calibrated_in_turn_and_the_node_uses_the_result(running: Running) -> None:
     with person(running, 90.0) as wait_for:
         began = start(running, tiles=["T02", "T01"], within_percent=0.5, name="left leg")
@@ -207,7 +207,7 @@ def test_a_calibration_fails_with_its_node_or_its_recording(
     assert "has sent nothing" in wait_for_failure(running)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(parts=8)
 def test_a_refused_fit_has_its_reason(running: Running) -> None:
     with person(running, 45.0, lambda force_n: min(force_n, 40.0)) as wait_for:
         id_ = start(running)["session_id"]

@@ -53,6 +53,7 @@ def on_terminal(code: str, folder: Path, **environment: str) -> tuple[int, bytes
     return process.wait(60.0), written
 
 
+@pytest.mark.slow
 @pytest.mark.process
 @pytest.mark.parametrize("encoding", ["ascii", "cp437", "utf-8"])
 def test_a_server_announces_itself_on_any_terminal(encoding: str, tmp_path: Path) -> None:
@@ -67,6 +68,7 @@ def test_a_server_announces_itself_on_any_terminal(encoding: str, tmp_path: Path
     assert len(drawn) > 15
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_a_narrow_terminal_gets_a_hint_instead_of_the_code(tmp_path: Path) -> None:
     code, written = on_terminal(ANNOUNCE, tmp_path, COLUMNS="20", PYTHONIOENCODING="utf-8")

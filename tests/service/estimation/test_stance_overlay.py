@@ -120,6 +120,7 @@ STANCES = st.lists(
 )
 
 
+@pytest.mark.slow
 @given(STANCES)
 def test_mean_and_spread_are_of_the_curves(stances: list[npt.NDArray[np.float64]]) -> None:
     found = overlay(*make_recording(stances))

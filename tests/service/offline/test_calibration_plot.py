@@ -37,6 +37,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     return calibration, {"T01": [one.indentation for one in pressed["T01"]]}
 
 
+@pytest.mark.slow(parts=8)
 def test_a_release_and_a_tap_are_replayed_better_with_effects_than_without(bench: Bench) -> None:
     calibration, recordings = bench
     found = simulate_release_and_tap_pressure(
@@ -68,6 +69,7 @@ def test_a_recording_without_fast_loads_has_nothing_to_replay(bench: Bench) -> N
     )
 
 
+@pytest.mark.slow(parts=8)
 def test_a_soak_in_a_file_of_its_own_tells_the_same_of_warmth(bench: Bench) -> None:
     calibration, (recording,) = bench[0], bench[1]["T01"]
     soaks = recording.phase == "soak"

@@ -52,7 +52,7 @@ def test_no_built_in_scene_waits_for_the_mill(tmp_path: Path) -> None:
     assert len(list(SHIPPED_FOLDER.iterdir())) == len(TILES)  # none is left of a version before
 
 
-@pytest.mark.slow
+@pytest.mark.slow(parts=8)
 @pytest.mark.parametrize(
     "serial", [TILES[0], *(pytest.param(each, marks=pytest.mark.soak) for each in TILES[1:])]
 )

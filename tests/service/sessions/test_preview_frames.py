@@ -153,7 +153,7 @@ HAPPENS = st.one_of(
 )
 
 
-@pytest.mark.slow
+@pytest.mark.slow(parts=8)
 @settings(max_examples=30, deadline=None)
 @given(happened=st.lists(HAPPENS, min_size=5, max_size=20), tared=st.booleans(), data=st.data())
 def test_any_slice_at_any_moment_is_that_of_the_whole_in_one_go(

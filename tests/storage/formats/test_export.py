@@ -44,6 +44,7 @@ from tests.storage.formats.walks import DOCUMENT
 # --- the same in every format ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(
     every=st.sampled_from([1, 7, 20, ROWS]),

@@ -57,6 +57,7 @@ def test_a_rung_that_cannot_be_timed_is_named(recording: DrawRecording) -> None:
     assert "nonsense" in failures[0].why
 
 
+@pytest.mark.slow
 def test_a_draw_is_itself_again_and_another_draw_is_another(recording: DrawRecording) -> None:
     scene = load_scene("rolling").model_copy(update={"calibration": "paper-eq2-shape"})
     again, other = record_draw(scene, 2.0, 1), record_draw(scene, 2.0, 2)

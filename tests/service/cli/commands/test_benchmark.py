@@ -67,6 +67,7 @@ def test_goals_that_are_not_met_are_named_and_code_3_if_asked_for(run: Run, scen
     assert "| NO |" in outcome.out
 
 
+@pytest.mark.slow(parts=8)
 def test_another_estimator_is_measured_with_the_static_curve_alone(
     run: Run, scene: Path, tmp_path: Path
 ) -> None:

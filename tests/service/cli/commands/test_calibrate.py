@@ -16,6 +16,7 @@ from tests.storage.sessions.session_files import rewritten
 pytestmark = pytest.mark.slow
 
 
+@pytest.mark.slow(parts=8)
 def test_several_files_of_a_tile_are_merged_in_a_table_for_a_narrow_terminal(
     run: Run, simulate: Simulate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -31,6 +32,7 @@ def test_several_files_of_a_tile_are_merged_in_a_table_for_a_narrow_terminal(
     assert max(len(line) for line in outcome.out.splitlines()) <= 80
 
 
+@pytest.mark.slow(parts=8)
 def test_files_that_do_not_go_together_are_refused(run: Run, simulate: Simulate) -> None:
     first = simulate("1.parquet", short_rig(), "--tiles", "T01", "--seed", 1)
     simulate("again.parquet", short_rig(), "--tiles", "T01", "--seed", 1)
@@ -50,6 +52,7 @@ def test_files_that_do_not_go_together_are_refused(run: Run, simulate: Simulate)
     assert not [*Path().glob("cal.*")]
 
 
+@pytest.mark.slow(parts=8)
 def test_a_tile_without_a_curve_is_named_and_the_others_are_written(run: Run, bench: Path) -> None:
     table = pq.read_table(bench)
     force = table["reference_force_n"].to_numpy().copy()
@@ -68,6 +71,7 @@ def test_a_tile_without_a_curve_is_named_and_the_others_are_written(run: Run, be
     estimate.fails(1, "it covers T01, but not T02; T02 was refused: ")
 
 
+@pytest.mark.slow(parts=8)
 def test_calibrate_prints_each_tiles_fit_and_draws_it(run: Run, bench: Path) -> None:
     outcome = run("calibrate", bench, "--out", "cal.json", "--plot", "cal.png", "--json")
     printed = outcome.printed()

@@ -106,7 +106,7 @@ def test_another_load_lies_within_the_interval_that_five_weights_state(run: Run)
         assert half_n.mean() < 0.25 * true_n[settled].mean(), mass_g
 
 
-@pytest.mark.slow
+@pytest.mark.slow(parts=8)
 def test_the_command_guides_through_the_weights_and_writes_the_calibration(
     run: Run, running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:

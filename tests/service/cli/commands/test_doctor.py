@@ -105,6 +105,7 @@ def test_a_stuck_bus_is_a_failure_in_one_line(doctor: Doctor, kind: str, word: s
     assert "Traceback" not in outcome.err
 
 
+@pytest.mark.slow
 def test_more_channels_than_allowed_at_once_is_no_schedule(run: Run) -> None:
     found = json.loads(run("doctor", "--scene", "grid", "--json").out)
     assert found["rates_hz"]["simultaneous"] is None

@@ -30,7 +30,7 @@ def is_fitting(process: subprocess.Popen[bytes], folder: Path) -> bool:
 
 
 @pytest.mark.process
-@pytest.mark.slow
+@pytest.mark.slow(parts=8)
 @pytest.mark.parametrize(
     ("arguments", "has_begun"),
     [

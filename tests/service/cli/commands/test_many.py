@@ -39,6 +39,7 @@ def report(out: Path, command: str) -> list[dict[str, object]]:
     return [json.loads(line) for line in lines]
 
 
+@pytest.mark.slow
 def test_many_sessions_are_estimated_each_into_its_folder(
     run: Run, data: Path, tmp_path: Path
 ) -> None:
@@ -85,7 +86,7 @@ def test_a_damaged_session_among_many_gives_exit_code_1(run: Run, data: Path) ->
     assert "pull a damaged session again" in done.out.lower()
 
 
-@pytest.mark.slow
+@pytest.mark.slow(parts=8)
 @pytest.mark.process
 def test_an_interrupted_and_then_killed_client_goes_on_and_leaves_the_same_files(
     run: Run, made: Path, tmp_path: Path

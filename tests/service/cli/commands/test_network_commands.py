@@ -132,7 +132,7 @@ def test_a_second_server_on_the_same_port_or_folder_is_refused(
     done.fails(1, "another foottile server uses this data folder")
 
 
-@pytest.mark.slow
+@pytest.mark.slow(parts=8)
 def test_a_demo_prints_one_link_that_logs_a_browser_in_and_commands_need_no_token(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -170,6 +170,7 @@ def test_a_demo_ends_by_itself_after_its_seconds(tmp_path: Path) -> None:
     assert "ended after 1 s" in (tmp_path / "stderr.txt").read_text()
 
 
+@pytest.mark.slow
 def test_settings_come_from_option_environment_and_file_in_that_order(
     run: Run, tmp_path: Path
 ) -> None:

@@ -62,7 +62,7 @@ class Lab:
         raise FootTileError(f"node {trial.name} has ended by itself, with code 1")
 
 
-@pytest.mark.slow
+@pytest.mark.slow(parts=8)
 def test_a_trial_that_fails_twice_fails_alone_with_exit_code_3(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

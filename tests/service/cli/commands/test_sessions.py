@@ -79,6 +79,7 @@ def test_a_session_has_the_columns_that_were_asked_for(
     assert names.index("pressure_raw_0") < (names.index("gauge_kpa_0") if groups[1:] else 99)
 
 
+@pytest.mark.slow(parts=8)
 def test_a_quiet_dome_from_rig_to_estimate_gives_the_true_force(run: Run) -> None:
     Path("rig.toml").write_text(short_rig().split("[emulation]")[0] + QUIET)
     assert run("simulate", "--scene", "rig.toml", "--out", "rig.parquet").code == 0

@@ -32,6 +32,7 @@ def test_each_frame_in_order_is_a_line_of_csv_or_json(
         assert seqs == list(range(seqs[0], seqs[0] + 40))
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_a_stream_without_a_message(
     running: Running, tared: FakeNode, foottile: Start
 ) -> None:
@@ -43,6 +44,7 @@ def test_ctrl_c_ends_a_stream_without_a_message(
     assert not process.err
 
 
+@pytest.mark.slow
 def test_a_stream_without_a_reader_ends_without_a_message(
     running: Running, tared: FakeNode, tmp_path: Path
 ) -> None:
@@ -77,6 +79,7 @@ def test_a_wrong_request_ends_with_one_line_and_a_code(
         assert len(outcome.err.splitlines()) == 1, (arguments, outcome.err)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sink", "code", "reason"), [("> /dev/full", 1, "No space left on device"), (">&-", 0, "")]
 )

@@ -103,7 +103,7 @@ def make_eventful_frames(seed: int) -> tuple[FrameBatch, list[int]]:
     return frames, [int(row >= 38) for row in range(ROWS)]
 
 
-@pytest.mark.slow
+@pytest.mark.slow(parts=8)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_full_ladder_is_within_a_nanonewton(plan: EstimationPlan, seed: int) -> None:
     frames, run = make_eventful_frames(seed)

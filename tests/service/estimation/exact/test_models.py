@@ -78,6 +78,7 @@ def test_rubber_is_within_a_nanonewton(
     assert digits.apart(found[:, None], expected) < GOAL
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(
     part=st.sampled_from([0.0, 1e-9, 0.08, 0.4]),

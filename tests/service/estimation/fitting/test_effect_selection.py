@@ -102,6 +102,7 @@ def test_the_delay_of_a_tile_is_found_beside_its_effects(late_s: float) -> None:
     assert np.abs(off_by_sigmas(effects)).max() < 4.5
 
 
+@pytest.mark.slow(parts=8)
 def test_the_same_recording_gives_the_same_effects(known: list[Effects]) -> None:
     assert fit_effects(record(seed=0)) == known[0]
 

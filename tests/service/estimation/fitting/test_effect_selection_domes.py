@@ -82,6 +82,7 @@ def test_a_dome_with_a_delay_keeps_its_gas(serial: str, late_s: float) -> None:
     assert effects.late_s.value == pytest.approx(late_s, abs=200e-6)
 
 
+@pytest.mark.slow(parts=8)
 @pytest.mark.parametrize("gamma_tau_s", [0.036, 0.012])
 @pytest.mark.parametrize("seed", [0, *(pytest.param(other, marks=soak) for other in (1, 2))])
 def test_a_gas_that_cools_as_fast_as_the_rubber_creeps_is_found(
@@ -103,6 +104,7 @@ def test_a_gas_that_cools_as_fast_as_the_rubber_creeps_is_found(
     assert total == pytest.approx(0.11, rel=0.5)
 
 
+@pytest.mark.slow(parts=8)
 def test_a_quick_gas_is_found_beside_flowing_rubber() -> None:
     # Its time and gamma compensate each other: neither is known well.
     part = replace(
@@ -122,6 +124,7 @@ def test_a_quick_gas_is_found_beside_flowing_rubber() -> None:
     assert effects.hysteresis.flow is not None
 
 
+@pytest.mark.slow(parts=8)
 def test_creep_over_seconds_is_no_flow() -> None:
     part = replace(
         draw_dome("T01", 0),
@@ -135,6 +138,7 @@ def test_creep_over_seconds_is_no_flow() -> None:
     assert sum(p.value for p in effects.rubber.part) == pytest.approx(0.033, abs=0.015)
 
 
+@pytest.mark.slow(parts=8)
 @pytest.mark.parametrize(
     ("parts", "times_s", "terms"),
     [

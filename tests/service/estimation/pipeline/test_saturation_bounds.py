@@ -132,6 +132,7 @@ def run_domes(kind: str, lag_ms: float) -> list[Run]:
     return runs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lag_ms", [0.0, 10.0, 100.0])
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_interval_after_an_unseen_load_covers_the_truth(kind: str, lag_ms: float) -> None:

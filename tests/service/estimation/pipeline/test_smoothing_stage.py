@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 
 import numpy as np
+import pytest
 
 from devices.arrays import Floats
 from devices.jit import jit_cached
@@ -65,6 +66,7 @@ def smooth_apart(forces_n: np.ndarray) -> np.ndarray:
     return np.concatenate([smooth(column[:, None]) for column in forces_n.T], axis=1)
 
 
+@pytest.mark.slow
 def test_a_bend_below_a_tiles_noise_is_found_in_the_sum() -> None:
     # 25 ms of a load whose bend is below the noise of every tile.
     t_s = 1e-9 * PERIOD_NS * np.arange(400)

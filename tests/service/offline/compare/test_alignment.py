@@ -52,7 +52,7 @@ def covered(seeds: range, seconds: float) -> dict[str, float]:
     return {name: count / len(seeds) for name, count in hits.items()}
 
 
-@pytest.mark.slow
+@pytest.mark.slow(parts=8)
 def test_intervals_have_the_truth_about_as_often_as_they_say() -> None:
     # Of 20 draws at 95 % fewer than 15 have it once in 3000; `benchmarks/compare_alignment.py`
     # draws a thousand.

@@ -8,6 +8,7 @@ import pytest
 from service.offline.compare.block_covariance import assign_blocks, compute_fit_uncertainty
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("telling", [(0, 8000), (0, 700), (3000, 4500)])
 def test_the_variance_of_independent_noise_is_the_textbooks(telling: tuple[int, int]) -> None:
     # In some hundred samples is all that tells of the slope, as in a single stance.

@@ -222,7 +222,7 @@ def test_a_summary_is_of_a_second_at_most_although_frames_come_slower_than_they_
     assert (frame["n"] - 1) * period_ns <= SUMMARY_NS + 5 * period_ns
 
 
-@pytest.mark.slow
+@pytest.mark.slow(parts=8)
 @pytest.mark.parametrize("frames_sent", [1000, 20_000])
 def test_a_client_that_never_takes_stays_bounded(frames_sent: int) -> None:
     """Of three frames two are lost, and there are notices: what is kept does not grow with time."""
