@@ -8,10 +8,9 @@ from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
-import pyarrow as pa
 from anyio import CapacityLimiter
 from fastapi import APIRouter, Header, Query, Request, Response
-from pydantic import BaseModel, Field, create_model
+from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 
 from devices.arrays import Floats
@@ -28,7 +27,6 @@ from service.api.static_files import ARROW_STREAM, encode_arrow_stream
 from service.server.server import Server
 from service.sessions.stances import load_stances, overlay_stances
 from storage.sessions.folder import Session
-from storage.sessions.stances import STANCE_SCHEMA
 
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 
@@ -38,15 +36,31 @@ _DIGITS = 6
 """Decimal places in SI units: micrometres and micronewtons."""
 
 
-_PYTHON_TYPES: dict[pa.DataType, Any] = {pa.float64(): float, pa.bool_(): bool}
-_FIELDS: dict[str, Any] = {
-    field.name: (kind | None if field.nullable else kind, ...)
-    for field in STANCE_SCHEMA
-    for kind in (_PYTHON_TYPES.get(field.type, int),)
-}
-StanceView: Any = create_model(
-    "StanceView", __doc__="Stance (docs/formats.md); unknown values are null.", **_FIELDS
-)
+class StanceView(BaseModel):
+    """Stance (docs/formats.md); unknown values are null."""
+
+    number: int
+    part: int
+    begin_t_ns: int
+    end_t_ns: int
+    duration_s: float
+    duration_sigma_s: float | None
+    peak_grf_n: float | None
+    peak_t_ns: int | None
+    peak_sigma_n: float | None
+    impulse_n_s: float | None
+    impulse_sigma_n_s: float | None
+    cop_x_first_m: float | None
+    cop_x_last_m: float | None
+    cop_x_range_m: float | None
+    cop_x_range_sigma_m: float | None
+    frames: int
+    unknown_frames: int
+    missing_frames: int
+    estimate_flags: int
+    begun: bool
+    ended: bool
+    is_whole: bool
 
 
 @router.get(
