@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +14,8 @@ Ints = npt.NDArray[np.int64]
 Times = npt.NDArray[np.int64]
 """Instants or durations in nanoseconds: int64, because float64 rounds UTC to 200 ns."""
 Bools = npt.NDArray[np.bool_]
+Columns = Mapping[str, npt.NDArray[Any]]
+"""Columns of a table by name, n rows each."""
 
 
 @dataclass(frozen=True)

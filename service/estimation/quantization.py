@@ -25,7 +25,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Floats
+from devices.arrays import Columns, Floats
 from service.estimation.models.denoise import PAST_NS, WINDOW_READINGS_MAX
 from service.estimation.models.static import compute_forces
 from service.estimation.pipeline.plan import EstimationPlan
@@ -41,8 +41,6 @@ _STEP_MIN = 2.0**-500
 _ROUNDED_DOWN = frozenset({"grf_lower_bound_n"})
 """Columns that are rounded down: a rounded lower bound remains a lower bound."""
 _BY_TILE = frozenset({"gauge_kpa", "force_n", "force_sigma_n"})
-
-Columns = Mapping[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Floats, Times
+from devices.arrays import Columns, Floats, Times
 
 OVERLAY_COLUMNS = ("grf_n", "cop_x_m", "cop_y_m")
 """Columns of estimates in the overlay."""
-
-Columns = Mapping[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True)

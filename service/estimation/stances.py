@@ -7,7 +7,7 @@ have been lifted: the stance is cut there, and another one begins.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Floats, Times
+from devices.arrays import Columns, Floats, Times
 from devices.flags import EstimateFlag
 from service.estimation import CONTACT_UNKNOWN, LONG_GAP_NS
 from service.estimation.records import SIGMAS_95
@@ -46,8 +46,6 @@ COP_SHARE_MIN = 0.8
 """Least share of a stance's frames with a COP, for an uncertainty of the COP's range."""
 _SLOPE_SIGMAS = 2.0
 """Least change of the GRF over `EDGE_NS` for a slope, in its sigmas."""
-
-Columns = Mapping[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True)

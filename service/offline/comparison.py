@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from devices.arrays import Floats
+from devices.arrays import Columns, Floats
 from devices.errors import ComparisonError, FileFormatError, UsageError
 from devices.flags import EstimateFlag
 from service.json_output import to_json_text
@@ -25,7 +25,6 @@ from service.offline.compare.alignment import (
 from service.offline.compare.error_figures import ComparisonErrors, compute_errors
 from service.offline.compare.paired_frames import (
     COMPARED_COLUMNS,
-    Columns,
     PairedFrames,
     ReferenceSignals,
     TrialMarker,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Floats, Ints
+from devices.arrays import Columns, Floats, Ints
 from devices.errors import FileFormatError
 from devices.flags import EstimateFlag
 from devices.frames import FrameBatch
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 PLATE_COLUMN = "true_plate_n"
 """Truth column of a mounted foot's calibration: the plate's force instead of the domes' sum."""
-
-Columns = Mapping[str, npt.NDArray[Any]]
 
 
 PULL_SIGMAS = 4.0

@@ -25,14 +25,13 @@ from service.estimation.calibration import Calibration
 from service.estimation.estimate import Estimator, ModelEstimator
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from service.estimation.quantization import Quantization
-from service.estimation.records import Estimates
+from service.estimation.records import Columns, Estimates
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded_windows import RECOGNITION_SPAN_NS, compute_recording_tare
 from service.estimation.tare_recovery import remove_recovery
 from storage.schema import ROUNDING_STEP_KEY
 
 Extra = Mapping[str, npt.NDArray[Any]]
-Columns = dict[str, npt.NDArray[Any]]
 _ESTIMATED = tuple(f.name for f in fields(Estimates) if f.name not in ("seq", "t_ns"))
 
 ROWS_PER_STEP = 1024

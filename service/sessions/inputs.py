@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Columns
 from devices.errors import FootTileError, require_extra
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation import OFFLINE_LAG_MS
@@ -198,8 +198,6 @@ def _empty_array(session: Session) -> ArrayInfo:
         models=(),
     )
 
-
-Columns = Mapping[str, npt.NDArray[Any]]
 
 TARE_LOST = (
     "a tare is damaged and lost: where it may have been in force, forces are not known (bit 512 of "

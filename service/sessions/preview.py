@@ -23,12 +23,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from devices.arrays import Columns
 from devices.errors import FootTileError, StateError, StorageError
 from devices.frames import FrameBatch
 from service.estimation import LIVE_LAG_MS
 from service.estimation.compilation import is_compiling
 from service.sessions.estimate_stream import EstimateOptions, EstimateStream
-from service.sessions.inputs import Columns, SessionInputs, iterate_raw_frames_with_part
+from service.sessions.inputs import SessionInputs, iterate_raw_frames_with_part
 from service.sessions.overview import BinnedSlice
 from storage.durable_files import ScratchBlock, ScratchFile
 from storage.formats.slice import Slice

@@ -10,9 +10,10 @@ from collections.abc import Iterator
 from itertools import chain
 from typing import Any
 
+from devices.arrays import Columns
 from devices.errors import UsageError
 from devices.frames import FrameBatch
-from service.sessions.inputs import Columns, SessionInputs, iterate_raw_frames_with_part
+from service.sessions.inputs import SessionInputs, iterate_raw_frames_with_part
 from service.sessions.preview import SessionPreview
 from storage.formats.export import FrameSource, make_one_pass_frame_source
 from storage.formats.slice import Slice

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy.special import stdtrit
 from scipy.stats import bootstrap
 
-from devices.arrays import Bools, Floats, Times
+from devices.arrays import Bools, Columns, Floats, Times
 from service.estimation.stances import STANCE_INPUT_COLUMNS
 from service.offline.accuracy import MIN_GRF_N
 from service.offline.compare.alignment import Alignment
@@ -29,8 +29,6 @@ MAX_SAME_RATE_RATIO = 1.05
 """Largest ratio of time steps that count as the same rate."""
 MIN_FLIGHT_FRAMES = 50
 """Least number of flight frames to estimate the zero."""
-
-Columns = Mapping[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.compilation import is_compiling
 from service.estimation.models.static import StaticParams, compute_forces
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
+from service.estimation.records import Columns
 from service.estimation.tare.automatic import (
     HISTORY_NS,
     FlightTareResult,
@@ -31,7 +32,7 @@ from service.estimation.tare.automatic import (
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded_windows import TareFrames, compute_recording_tare
 from service.estimation.tare_recovery import remove_recovery
-from service.sessions.estimate_stream import Columns, EstimateOptions, EstimateRun, EstimateStream
+from service.sessions.estimate_stream import EstimateOptions, EstimateRun, EstimateStream
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,11 @@ from typing import Literal
 from devices.errors import StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
+from service.estimation.records import Columns
 from service.protocol.link import Hello
 from service.server.calibrations import CalibrationAssignment
 from service.server.estimates.live_estimator import EpochHistory, EstimateEpoch, LiveEstimator
 from service.server.estimates.tare_controller import TareController
-from service.sessions.estimate_stream import Columns
 from service.sessions.tares import TareHistory
 from storage.intervals import Intervals
 from storage.journal.journal import Journal

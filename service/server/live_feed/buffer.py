@@ -13,11 +13,11 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 
 from devices.frames import FrameBatch
+from service.estimation.records import Columns
 from service.server.estimates.node_estimator import EstimatedBatch
 from service.server.live_feed.events import EncodeCache, FrameRows, slice_batch
 from service.server.node import ServerNode
 from service.server.streams import ServerStream
-from service.sessions.estimate_stream import Columns
 from storage.intervals import NO_END, Intervals, Losses
 
 _BUFFER_BYTES_MAX = 8 << 20

@@ -18,13 +18,13 @@ from devices.arrays import Ints
 from devices.errors import DamagedFramesError
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
+from service.estimation.records import Columns
 from service.protocol.link import EarlierStream, Hello
 from service.protocol.live import Policy
 from service.server.live_feed.buffer import FeedBuffer
 from service.server.live_feed.events import Position
 from service.server.live_feed.reader import FeedReader
 from service.server.node import ServerNode
-from service.sessions.estimate_stream import Columns
 from storage.intervals import NO_END, Intervals
 from storage.schema import wire_schema
 from storage.wire import encode_frames
