@@ -270,7 +270,19 @@ def _step(
     until, due_ns = foot_state.release_row, foot_state.newest_ns - foot_params.lag_ns
     while until < foot_state.sample_row and (is_final or buffer.t_mono_ns[until] <= due_ns):
         until += 1
-    return _estimate_due_rows(params, foot_state, tile_states, buffer, until)
+    # Only here: callees have no reference counts, and so do not allocate.
+    n, tiles = until - foot_state.release_row, len(tile_states)
+    output = (
+        np.empty(n, np.uint64),
+        np.empty(n, np.int64),
+        np.empty((3, n, tiles)),
+        np.empty((grf_cop.N_COLUMNS, n)),
+        np.empty(n, np.uint8),
+        np.empty(n, np.uint16),
+    )
+    windows, forces = np.empty(denoise.SCRATCH_SHAPE), np.zeros(tiles, TILE_FORCE)
+    _estimate_due_rows(params, foot_state, tile_states, buffer, windows, forces, output)
+    return output
 
 
 @jit_inlined
@@ -279,27 +291,20 @@ def _estimate_due_rows(
     foot_state: FootState,
     tile_states: RecordArray[TileState],
     buffer: FrameBuffer,
-    until: int,
-) -> KernelOutput:
-    """Estimate the rows up to `until`, whose look-ahead is complete."""
+    windows: Floats,
+    forces: RecordArray[TileForce],
+    output: KernelOutput,
+) -> None:
+    """Estimate the next rows, as many as `output` has; their look-ahead is complete."""
     foot_params, count = params.foot[0], len(tile_states)
-    n = until - foot_state.release_row
-    seq, t_ns = np.empty(n, np.uint64), np.empty(n, np.int64)
-    by_tile = np.full((3, n, count), math.nan)
-    by_frame = np.full((grf_cop.N_COLUMNS, n), math.nan)
-    contact, flags = np.empty(n, np.uint8), np.empty(n, np.uint16)
-    out, windows = np.empty(grf_cop.N_COLUMNS), denoise.allocate_scratch()
-    forces: RecordArray[TileForce] = np.zeros(count, TILE_FORCE)
+    seq, t_ns, by_tile, by_frame, contact, flags = output
     # Without look-ahead the next frame is not there, and may be of the same instant.
     look_ns = foot_params.lookahead_ns if foot_params.waits_for_next == 1 else -1
     rows = (foot_state.release_row, foot_state.release_row)
-    for k in range(n):
-        i, end, lookahead_ns = (
-            foot_state.release_row,
-            foot_state.sample_row,
-            foot_params.lookahead_ns,
-        )
-        row = buffer.rows[i]
+    end, lookahead_ns = foot_state.sample_row, foot_params.lookahead_ns
+    for k in range(len(seq)):
+        i = foot_state.release_row
+        row, out = buffer.rows[i], by_frame[:, k]
         out[:] = math.nan
         if foot_params.has_denoise == 1:
             rows = denoise.find_oldest_and_newest_window_rows(
@@ -327,16 +332,15 @@ def _estimate_due_rows(
             _compute_cop_positions(params, buffer.samples[i], out)
         for j in range(count):
             by_tile[_GAUGE, k, j] = buffer.samples[i, j].gauge_kpa
+            by_tile[_FORCE, k, j] = by_tile[_SIGMA, k, j] = math.nan
             if params.tiles[j].is_load_bearing == 1:
                 by_tile[_FORCE, k, j], by_tile[_SIGMA, k, j] = _force_or_bound(forces[j])
-        by_frame[:, k] = out
         seq[k], t_ns[k] = row.seq, row.t_ns
         contact[k] = foot_state.is_contact if is_known else CONTACT_UNKNOWN
         flags[k] = (
             row.flags | (_COP_MASKED if masked else 0) | (_AFTER_SATURATION if unsettled else 0)
         )
         foot_state.release_row += 1
-    return seq, t_ns, by_tile, by_frame, contact, flags
 
 
 @jit_inlined

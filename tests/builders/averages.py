@@ -36,7 +36,7 @@ def denoised(
     """
     n, tiles = values.shape
     out = np.full((4, n, tiles), math.nan)
-    columns, scratch, rows = (values, sigmas, t_ns, run), denoise.allocate_scratch(), (0, 0)
+    columns, scratch, rows = (values, sigmas, t_ns, run), np.empty(denoise.SCRATCH_SHAPE), (0, 0)
     for i in range(n):
         rows = denoise.find_oldest_and_newest_window_rows(frame_t_ns, i, 0, n, rows, look_ns)
         for j in range(tiles):

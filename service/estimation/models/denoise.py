@@ -45,11 +45,9 @@ ALL_ROWS: WindowRows = (0, 1 << 62, 0, 1 << 62)
 SampleColumns = tuple[Floats, Floats, Times, Ints]
 """Values (n, columns), NaN where there is none; standard deviation of each and its instant, both
 (n, columns); and (n,) the number of the gapless run that a frame belongs to."""
-WindowScratch = tuple[Floats, Floats, Floats]
-"""Work arrays of `denoise_sample`, from `allocate_scratch`: values of all smaller windows, their
-variances, and 1 for a parabola."""
-WINDOWS_MAX = 4 * len(WINDOW_REACHES) + 1
-"""Largest number of windows around a sample."""
+SCRATCH_SHAPE = (3, 4 * len(WINDOW_REACHES) + 1)
+"""Shape of the work array of `denoise_sample`: values of all smaller windows, of which there are no
+more, their variances, and 1 for a parabola."""
 WindowMoments = tuple[float, float, float, float, float, float, float, float]
 """Sums over samples: their number, the first four powers of their times, their values, and these
 times time and its square. Eight numbers that stay in registers."""
@@ -64,12 +62,6 @@ class WindowDifference(Protocol):
     """Standard deviation of that difference by noise."""
     smoothing_error_n: float
     """Load that averaging removes, estimated."""
-
-
-@jit_cached
-def allocate_scratch() -> WindowScratch:
-    """Allocate the work arrays of `denoise_sample`."""
-    return np.empty(WINDOWS_MAX), np.empty(WINDOWS_MAX), np.empty(WINDOWS_MAX)
 
 
 @jit_inlined
@@ -111,7 +103,7 @@ def denoise_sample(
     rows: tuple[int, int],
     variance_inflation: Floats,
     within: WindowRows,
-    scratch: WindowScratch,
+    scratch: Floats,
 ) -> tuple[tuple[float, float, float, float], WindowRows]:
     """Denoise the value of row `i`, column `j`, which must exist.
 
@@ -124,7 +116,7 @@ def denoise_sample(
         variance_inflation: (`WINDOW_READINGS_MAX` + 1,), variance of a mean of n readings over that
             of white noise.
         within: rows that windows may reach: `ALL_ROWS`, or those of the sum of tiles.
-        scratch: from `allocate_scratch`.
+        scratch: (`SCRATCH_SHAPE`), overwritten.
 
     Returns:
         The value; its variance in units of that of a single value: remaining noise, and curvature
@@ -136,7 +128,7 @@ def denoise_sample(
     oldest, newest = rows
     sigma = sigmas[i, j]
     # Times relative to `at_ns`, in milliseconds.
-    kept_values, kept_variances, kept_bent = scratch
+    kept_values, kept_variances, kept_bent = scratch[0], scratch[1], scratch[2]
     line_low, line_high, bent_low, bent_high = within
     nothing = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     moments = _add_sample(nothing, (t_ns[i, j] - at_ns) * 1e-6, values[i, j])
@@ -238,13 +230,13 @@ def estimate_smoothing_errors(tiles: RecordArray[WindowDifference]) -> None:
 
 @jit_inlined
 def _is_in_agreement(
-    kept: WindowScratch, stored: int, value: float, of_noise: float, bent: bool, most: float
+    kept: Floats, stored: int, value: float, of_noise: float, bent: bool, most: float
 ) -> bool:
     """Return whether a window's value agrees with the first `stored` of shorter ones.
 
     A shorter line is not a part of a longer parabola: their noise is treated as independent.
     """
-    values, variances, were_bent = kept
+    values, variances, were_bent = kept[0], kept[1], kept[2]
     apart = 0
     for m in range(stored):  # all of them, several at a time: to stop at one would cost more
         difference, variance = value - values[m], variances[m]

@@ -57,7 +57,7 @@ def compute_forces_and_after_saturation(
     buffer: FrameBuffer,
     i: int,
     rows: tuple[int, int],
-    windows: denoise.WindowScratch,
+    windows: Floats,
     forces: RecordArray[TileForce],
 ) -> bool:
     """Compute the tiles' forces in row `i`, into `forces`; return whether AFTER_SATURATION applies.
@@ -154,7 +154,7 @@ def denoise_forces_and_scale_noise(
     buffer: FrameBuffer,
     i: int,
     rows: tuple[int, int],
-    windows: denoise.WindowScratch,
+    windows: Floats,
     forces: RecordArray[TileForce],
 ) -> None:
     """Replace the forces of row `i` by denoised ones.

@@ -44,7 +44,7 @@ def smooth(forces_n: Floats) -> Floats:
 @jit_cached
 def _average_all(params: KernelParams, buffer: FrameBuffer, out: Floats) -> None:
     forces: RecordArray[TileForce] = np.zeros(len(params.tiles), TILE_FORCE)
-    rows, windows = (0, 0), denoise.allocate_scratch()
+    rows, windows = (0, 0), np.empty(denoise.SCRATCH_SHAPE)
     for i in range(len(out)):
         rows = denoise.find_oldest_and_newest_window_rows(
             buffer.t_mono_ns, i, 0, len(out), rows, 100_000_000
