@@ -23,13 +23,14 @@ import numba
 import numpy as np
 from numba.core import serialize
 from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.registry import cpu_target
 
 F = TypeVar("F", bound=Callable[..., Any])
 _thread_state = threading.local()
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 _CALLEE_OPTIONS: dict[str, Any] = {"no_cpython_wrapper": True, "_nrt": False}
 """Options of functions for compiled callers, which contain their code: no wrapper for Python, and
-no reference counts of arrays, since the callers have some. With no file either, all models take a
+no reference counts of arrays, which their callers keep. With no file either, all models take a
 third less to compile."""
 
 
@@ -70,8 +71,19 @@ def jit_inlined(function: F) -> F:
 def _jit(function: F, *, forceinline: bool) -> F:
     dispatcher: Any = numba.njit(forceinline=forceinline, **_OPTIONS)(function)
     callee: Any = numba.njit(forceinline=forceinline, **_OPTIONS, **_CALLEE_OPTIONS)(function)
-    dispatcher.get_call_template = callee.get_call_template
-    dispatcher.get_overload = callee.get_overload
+
+    def get_overload(argument_types: Any) -> Any:
+        returned = callee.overloads[argument_types].signature.return_type
+        if cpu_target.target_context.data_model_manager[returned].contains_nrt_meminfo():
+            # Without reference counts it would be freed too early; numba refuses only new arrays.
+            raise numba.TypingError(
+                f"{function.__qualname__} returns {returned}: what compiled code calls returns no "
+                "array; let the caller pass one to fill"
+            )
+        return callee.get_overload(argument_types)
+
+    # What compiled callers ask for. Without these they would take `dispatcher` itself.
+    dispatcher.get_call_template, dispatcher.get_overload = callee.get_call_template, get_overload
     if not has_cache_folder():
         return cast("F", dispatcher)
     with contextlib.suppress(RuntimeError):  # no cache folder: no home, read-only installation
@@ -143,7 +155,8 @@ class _ChecksummedFiles(IndexDataCacheFile):
 
 def _hash_code(function: Callable[..., Any]) -> str:
     """Hash a function's code, all compiled functions that it calls, and their constants."""
-    digest, seen, left = hashlib.sha256(repr(_OPTIONS).encode()), set(), [function]
+    options = repr((_OPTIONS, _CALLEE_OPTIONS))
+    digest, seen, left = hashlib.sha256(options.encode()), set(), [function]
     while left:
         each = left.pop()
         if each in seen:

@@ -6,11 +6,13 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numba
 import numba.core.caching
 import numba.core.config
 import numpy as np
 import pytest
 
+from devices.arrays import Floats
 from devices.jit import jit_cached
 
 
@@ -153,3 +155,35 @@ def test_a_function_is_compiled_again_if_a_callee_or_a_constant_has_changed(
     assert jit_cached(scaled)(1.0) == 6.0
     monkeypatch.setitem(globals(), name, value)
     assert jit_cached(scaled)(1.0) == expected
+
+
+def same(rows: Floats) -> Any:
+    return rows
+
+
+def pair(rows: Floats) -> Any:
+    return rows[0], rows[1]
+
+
+def copied(rows: Floats) -> Any:
+    return rows.copy()
+
+
+def summed(rows: Floats) -> Any:
+    return (rows[0] + rows[1])[0]
+
+
+@pytest.mark.usefixtures("cache")
+@pytest.mark.parametrize("function", [same, pair, copied, summed])
+def test_a_callee_that_returns_or_makes_an_array_is_refused(
+    function: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Its references are not counted: it would be freed too early, or never.
+    monkeypatch.setitem(globals(), "inner", jit_cached(function))
+    with pytest.raises(numba.TypingError, match=r"return|NRT required"):
+        jit_cached(calling)(np.ones((2, 3)))
+
+
+def calling(rows: Floats) -> int:
+    inner(rows)  # type: ignore[arg-type]  # another function, in the test
+    return 0
