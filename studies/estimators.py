@@ -20,7 +20,7 @@ from service.estimation.estimate import Estimator, ModelEstimator
 from service.estimation.models.static import compute_forces
 from service.estimation.pipeline.plan import SIGNIFICANCE_SIGMAS, EstimationPlan
 from service.estimation.pipeline.smoothing_stage import BOUND_SIGMAS
-from service.estimation.records import Columns, Estimates
+from service.estimation.records import ColumnDict, Estimates
 
 TIME_CONSTANT_S = 0.005  # two or three readings: short against a footstep
 
@@ -35,7 +35,7 @@ class LowPassEstimator:
         unknown_n = np.full(len(plan.load_bearing_columns), np.nan)  # there the low-pass starts
         tiles = plan.info.tiles
         # The last smoothed forces; their instant in ns, and contact; the last temperatures.
-        self._state: Columns = {"force_n": unknown_n, "last": np.zeros(2, np.int64)}
+        self._state: ColumnDict = {"force_n": unknown_n, "last": np.zeros(2, np.int64)}
         self._state["held"] = np.full(len(tiles), NOT_READ, get_raw_type(tiles))
         self._state["held_ns"] = np.zeros(len(tiles), np.int64)
 
@@ -87,12 +87,12 @@ class LowPassEstimator:
     def finish(self) -> None:
         """Return None: no estimate waits."""
 
-    def state_dict(self) -> Columns:
+    def state_dict(self) -> ColumnDict:
         """Return a copy of the state for `from_state`."""
         return {name: column.copy() for name, column in self._state.items()}
 
     @classmethod
-    def from_state(cls, plan: EstimationPlan, state: Columns) -> Self:
+    def from_state(cls, plan: EstimationPlan, state: ColumnDict) -> Self:
         """Make an estimator that continues from a state; ValueError if it is of another plan."""
         new = cls(plan)
         for name, memory in new._state.items():

@@ -80,7 +80,7 @@ PROC = Path("/proc")
 
 
 def find_programs_using(device_path: str) -> tuple[str, ...]:
-    """Return the programs that have the file at `path` open, as "NAME (process N)".
+    """Return the programs that have the file at `device_path` open, as "NAME (process N)".
 
     Only processes that this user may inspect: a service's own ones, or all for root.
     """

@@ -11,7 +11,7 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, is_dataclass
 from functools import wraps
@@ -292,7 +292,7 @@ class FootOptions:
 
 
 def add_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Replace each parameter of a dataclass by an option for each field, also within a field."""
+    """Replace parameters whose type is a dataclass by options for its fields, nested ones too."""
     for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
         if is_dataclass(parameter.annotation):
             make_options = add_options(cast(Callable[..., Any], parameter.annotation))
@@ -304,7 +304,7 @@ def add_options(command: Callable[..., Any]) -> Callable[..., Any]:
 def expand_options(
     command: Callable[..., Any],
     name: str,
-    parameters: Iterable[inspect.Parameter],
+    parameters: Collection[inspect.Parameter],
     make_options: Callable[..., Any],
 ) -> Callable[..., Any]:
     """Replace the parameter `name` of a command by these, from which its value is made."""

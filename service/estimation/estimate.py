@@ -43,7 +43,12 @@ from service.estimation.pipeline.state import (
     compact_or_grow_buffer,
     make_frame_buffer,
 )
-from service.estimation.records import Columns, Estimates, RecordArray, view_records_as_bytes
+from service.estimation.records import (
+    ColumnDict,
+    Estimates,
+    RecordArray,
+    view_records_as_bytes,
+)
 
 _COP_MASKED = int(EstimateFlag.COP_MASKED)
 _AFTER_SATURATION = int(EstimateFlag.AFTER_SATURATION)
@@ -64,7 +69,7 @@ _COLUMNS = (
     "tile_flags",
     "frame_flags",
 )
-"""Columns of frames, in the order of the parameters of `_step`."""
+"""ColumnDict of frames, in the order of the parameters of `_step`."""
 _COUNTS = slice(_COLUMNS.index("pressure_raw"), _COLUMNS.index("temperature_raw") + 1)
 _WORD_BYTES = 2  # of the words in which compiled code takes counts
 _ROW_FIELDS = ("release_row", "sample_row", "end_row")
@@ -98,12 +103,12 @@ class Estimator(Protocol):
     def finish(self) -> Estimates | None:
         """Return the estimates that still wait for their look-ahead; None if there are none."""
 
-    def state_dict(self) -> Columns:
+    def state_dict(self) -> ColumnDict:
         """Return a copy of the state for `from_state`."""
         ...
 
     @classmethod
-    def from_state(cls, plan: EstimationPlan, state: Columns) -> Self:
+    def from_state(cls, plan: EstimationPlan, state: ColumnDict) -> Self:
         """Make an estimator that continues from a state, with the bits of an uninterrupted one.
 
         Raises:
@@ -157,7 +162,7 @@ class ModelEstimator:
         nothing = FrameBatch(**allocate_columns(0, len(self._tile_states), np.dtype(np.uint16)))
         return self._step(nothing, is_final=True)
 
-    def state_dict(self) -> Columns:
+    def state_dict(self) -> ColumnDict:
         """Return a copy of the state for `from_state`, records as bytes; compacts the buffer."""
         self._compact_buffer(0)  # drops rows that nothing reaches back to
         return {
@@ -166,7 +171,7 @@ class ModelEstimator:
         }
 
     @classmethod
-    def from_state(cls, plan: EstimationPlan, state: Columns) -> Self:
+    def from_state(cls, plan: EstimationPlan, state: ColumnDict) -> Self:
         """Make an estimator that continues from a state, with the bits of an uninterrupted one.
 
         Args:
@@ -198,11 +203,11 @@ class ModelEstimator:
         output = _step(self.plan.params, *states, self._buffer, is_final, *columns)
         return _make_estimates(output, self._unmeasured)
 
-    def _state_columns(self) -> Columns:
+    def _state_columns(self) -> ColumnDict:
         end = int(self._foot_state["end_row"][0])
         rows = {name: column[:end] for name, column in self._buffer._asdict().items()}
         states = {"foot_state": self._foot_state, "tile_states": self._tile_states}
-        return cast("Columns", {**states, **rows})
+        return cast("ColumnDict", {**states, **rows})
 
     def _compact_buffer(self, new_rows: int) -> None:
         due, sample, end = (int(self._foot_state[name][0]) for name in _ROW_FIELDS)

@@ -26,7 +26,8 @@ import numpy.typing as npt
 
 from devices.arrays import ArrayRecord, Floats, Times
 
-Columns = dict[str, npt.NDArray[Any]]
+ColumnDict = dict[str, npt.NDArray[Any]]
+"""Columns by name that a function fills: of estimates, or of an estimator's state."""
 R_co = TypeVar("R_co", covariant=True)
 
 

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from devices.acquisition import Acquisition
 from devices.array.schedules import ScheduleChoice
 from devices.array.startup import prepare_array
+from devices.arrays import Columns
 from devices.buses.i2c import open_bus
 from devices.chips.dynamixel.position_sources import VirtualTimeServoSource
 from devices.chips.dynamixel.servo_setup import open_servo
@@ -38,7 +39,6 @@ from service.rig.rig import make_array_info, open_reference_sensor, open_scene_r
 from service.sessions.estimate_stream import (
     EstimateOptions,
     EstimateStream,
-    Extra,
     make_estimate_metadata,
 )
 from storage.sessions.writer import SealedFileWriter
@@ -141,7 +141,7 @@ class EmulatedRun:
             lead_end_ns=begin_ns + round(options.foot.lead_s * 1e9),
         )
 
-    def run_frames(self) -> Iterator[tuple[FrameBatch, Extra]]:
+    def run_frames(self) -> Iterator[tuple[FrameBatch, Columns]]:
         """Yield frames with the emulation's columns: requested truth, and the indenter's notes."""
         indenter = self.world.indenter
         batches = self.acquisition.acquire_batches(lambda: self._clock.now_ns() >= self.end_ns)
@@ -184,7 +184,7 @@ def run_simulation(
     flagged: Counter[tuple[int, str]] = Counter()
     with ExitStack() as stack:
         simulation = EmulatedRun(options, stack)
-        pieces: Iterator[tuple[FrameBatch, Extra]] = simulation.run_frames()
+        pieces: Iterator[tuple[FrameBatch, Columns]] = simulation.run_frames()
         stream = None
         if make_estimate_options is not None:
             stream = EstimateStream(simulation.info, make_estimate_options())

@@ -405,7 +405,7 @@ class CalibrationJobs:
 
 
 class AssignedCalibration(StrictModel):
-    """Assigned calibration, as its file has it, and the time of the assignment, server's UTC."""
+    """Assignment of a calibration as its file has it; without one the node's own is in use."""
 
     t_ns: int
     calibration: Calibration | None

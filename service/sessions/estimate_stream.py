@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from functools import partial
 from itertools import chain
@@ -17,6 +17,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from devices.arrays import Columns
 from devices.chips.pressure_chips import Compensation
 from devices.errors import TareError, UsageError
 from devices.flags import FrameFlag
@@ -25,13 +26,12 @@ from service.estimation.calibration import Calibration
 from service.estimation.estimate import Estimator, ModelEstimator
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from service.estimation.quantization import Quantization
-from service.estimation.records import Columns, Estimates
+from service.estimation.records import ColumnDict, Estimates
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded_windows import RECOGNITION_SPAN_NS, compute_recording_tare
 from service.estimation.tare_recovery import remove_recovery
 from storage.schema import ROUNDING_STEP_KEY
 
-Extra = Mapping[str, npt.NDArray[Any]]
 _ESTIMATED = tuple(f.name for f in fields(Estimates) if f.name not in ("seq", "t_ns"))
 
 ROWS_PER_STEP = 1024
@@ -60,11 +60,11 @@ class EstimateRun:
         self.plan = plan
         self._make_estimator = estimator
         self._estimator = estimator(plan)
-        self._waiting: deque[tuple[FrameBatch, Extra]] = deque()
+        self._waiting: deque[tuple[FrameBatch, Columns]] = deque()
 
-    def state_dict(self) -> Columns:
+    def state_dict(self) -> ColumnDict:
         """Return the state, with the frames that wait for their look-ahead."""
-        waiting: Columns = {}
+        waiting: ColumnDict = {}
         if self._waiting:
             frames = FrameBatch.concatenate([frames for frames, _ in self._waiting])
             waiting = {f"held/{name}": column for name, column in vars(frames).items()}
@@ -76,7 +76,10 @@ class EstimateRun:
 
     @classmethod
     def from_state(
-        cls, plan: EstimationPlan, state: Columns, estimator: type[Estimator] = ModelEstimator
+        cls,
+        plan: EstimationPlan,
+        state: ColumnDict,
+        estimator: type[Estimator] = ModelEstimator,
     ) -> Self:
         """Create a run from the state of another one, as `Estimator.from_state`."""
         new = cls(plan, estimator)
@@ -86,8 +89,8 @@ class EstimateRun:
         return new
 
     def feed_frames(
-        self, frames: FrameBatch, carried_columns: Extra
-    ) -> Iterator[tuple[FrameBatch, Columns]]:
+        self, frames: FrameBatch, carried_columns: Columns
+    ) -> Iterator[tuple[FrameBatch, ColumnDict]]:
         """Add the next frames; yield those whose estimates are due, in order.
 
         One batch per `ROWS_PER_STEP` frames, since each batch has a fixed cost.
@@ -101,7 +104,7 @@ class EstimateRun:
             self._waiting.append((rows, rows_of))
             yield from _pair_with_frames(self._waiting, self._estimator.process_frames(rows))
 
-    def flush(self) -> Iterator[tuple[FrameBatch, Columns]]:
+    def flush(self) -> Iterator[tuple[FrameBatch, ColumnDict]]:
         """Yield the frames that still wait for their look-ahead: no more frames will come."""
         last = self._estimator.finish()
         self._estimator = self._make_estimator(self.plan)
@@ -138,8 +141,8 @@ class EstimateStream:
         self.make_plan(Tare(nothing, nothing, nothing, nothing, 0, 0.0, 0.0, 0, "interval"))
 
     def estimate_batches(
-        self, batches: Iterable[tuple[FrameBatch, Extra]], *, is_final: bool = True
-    ) -> Iterator[tuple[FrameBatch, Columns]]:
+        self, batches: Iterable[tuple[FrameBatch, Columns]], *, is_final: bool = True
+    ) -> Iterator[tuple[FrameBatch, ColumnDict]]:
         """Yield frames with their extra columns and estimates, rounded, in order, every frame once.
 
         Args:
@@ -153,7 +156,7 @@ class EstimateStream:
         for frames, columns in self._estimate(iter(batches), ends=is_final):
             yield frames, self.rounding.round_to_steps(columns)
 
-    def state_dict(self) -> Columns:
+    def state_dict(self) -> ColumnDict:
         """Return the whole state, to resume from.
 
         Raises:
@@ -164,7 +167,7 @@ class EstimateStream:
         content = [self.plan.tare.as_dict(), self._tare_changes, self._last_t_mono_ns]
         return {"stream": np.array(json.dumps(content)), **self._run.state_dict()}
 
-    def load_state(self, state: Columns) -> None:
+    def load_state(self, state: ColumnDict) -> None:
         """Resume from the state of another stream with the same array and options.
 
         Raises:
@@ -179,7 +182,7 @@ class EstimateStream:
             self.make_plan(self.tare), state, self._options.estimator
         )
 
-    def find_tare_in_first_frames(self, batches: Iterable[tuple[FrameBatch, Extra]]) -> Tare:
+    def find_tare_in_first_frames(self, batches: Iterable[tuple[FrameBatch, Columns]]) -> Tare:
         """Find the tare that `estimate_batches` would use; read no more than needed.
 
         Raises:
@@ -188,8 +191,8 @@ class EstimateStream:
         return self._find_tare([frames for frames, _ in self._read_until_tare(iter(batches))])
 
     def _estimate(
-        self, pieces: Iterator[tuple[FrameBatch, Extra]], *, ends: bool
-    ) -> Iterator[tuple[FrameBatch, Columns]]:
+        self, pieces: Iterator[tuple[FrameBatch, Columns]], *, ends: bool
+    ) -> Iterator[tuple[FrameBatch, ColumnDict]]:
         run = self._run
         if run is None:
             if self._options.tares:
@@ -234,10 +237,10 @@ class EstimateStream:
         return later[0] if later else None
 
     def _read_until_tare(
-        self, pieces: Iterator[tuple[FrameBatch, Extra]]
-    ) -> list[tuple[FrameBatch, Extra]]:
+        self, pieces: Iterator[tuple[FrameBatch, Columns]]
+    ) -> list[tuple[FrameBatch, Columns]]:
         """Read batches until the tare's interval has passed."""
-        batches: list[tuple[FrameBatch, Extra]] = []
+        batches: list[tuple[FrameBatch, Columns]] = []
         for piece in pieces:
             batches.append(piece)
             if self._has_tare_interval(batches):
@@ -268,7 +271,7 @@ class EstimateStream:
             self._info, options.calibration, tare, models=options.models, lag_ms=options.lag_ms
         )
 
-    def _has_tare_interval(self, taken: list[tuple[FrameBatch, Extra]]) -> bool:
+    def _has_tare_interval(self, taken: list[tuple[FrameBatch, Columns]]) -> bool:
         first, newest = taken[0][0], taken[-1][0]
         since_ns = int(newest.t_ns[-1] - first.t_ns[0])
         if self._options.tare_s is not None:
@@ -278,19 +281,19 @@ class EstimateStream:
         return since_ns > RECOGNITION_SPAN_NS
 
 
-def _strip_prefix(prefix: str, state: Columns) -> Columns:
+def _strip_prefix(prefix: str, state: ColumnDict) -> ColumnDict:
     """Return the columns with a prefix, without it."""
     return {n.removeprefix(prefix): column for n, column in state.items() if n.startswith(prefix)}
 
 
 def _pair_with_frames(
-    waiting: deque[tuple[FrameBatch, Extra]], estimates: Estimates
-) -> Iterator[tuple[FrameBatch, Columns]]:
+    waiting: deque[tuple[FrameBatch, Columns]], estimates: Estimates
+) -> Iterator[tuple[FrameBatch, ColumnDict]]:
     """Yield the oldest waiting frames with their estimates, as many as there are.
 
     One batch per run of consecutive numbers: subscribers see a gap between two batches.
     """
-    pieces: list[tuple[FrameBatch, Extra]] = []
+    pieces: list[tuple[FrameBatch, Columns]] = []
     first = end = 0
     while end < len(estimates):
         frames, extra = waiting.popleft()
@@ -310,8 +313,8 @@ def _pair_with_frames(
 
 
 def _join_batches(
-    pieces: list[tuple[FrameBatch, Extra]], estimates: Estimates
-) -> tuple[FrameBatch, Columns]:
+    pieces: list[tuple[FrameBatch, Columns]], estimates: Estimates
+) -> tuple[FrameBatch, ColumnDict]:
     frames, extra = pieces[0]
     if len(pieces) > 1:
         extra = {name: np.concatenate([extra[name] for _, extra in pieces]) for name in extra}

@@ -11,6 +11,7 @@ import numba.core.caching
 import numba.core.config
 import numpy as np
 import pytest
+from numba.core.errors import NumbaError
 
 from devices.arrays import Floats
 from devices.jit import jit_cached
@@ -180,7 +181,7 @@ def test_a_callee_that_returns_or_makes_an_array_is_refused(
 ) -> None:
     # Its references are not counted: it would be freed too early, or never.
     monkeypatch.setitem(globals(), "inner", jit_cached(function))
-    with pytest.raises(numba.TypingError, match=r"return|NRT required"):
+    with pytest.raises(NumbaError, match=r"return|NRT required"):
         jit_cached(calling)(np.ones((2, 3)))
 
 

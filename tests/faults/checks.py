@@ -18,6 +18,8 @@ from tests.faults.facts import Facts
 from tests.faults.link_witness import Columns
 
 _SYNC_S, _BATCH_S = 0.5, 0.05
+_WAIT_SLACK_S = 1.0
+"""A disk that works again is tried within a second."""
 _STOP_S = 0.03
 """Frames that were on the link so long before the stop were surely taken before it."""
 _GOOD, _DAMAGED, _LOSSY = 0, 1, 3
@@ -243,8 +245,13 @@ def _losses_are_allowed(facts: Facts) -> Iterator[str]:
         allowed = bound if end is not None and end.how == "power" else 0
         if sum(lost.values()) > allowed:
             yield f"part {number} lost {lost}, where {allowed} may be: {end}"
-        if tail > allowed:
-            yield f"part {number}: max_lost_tail_frames {tail} is more than {allowed}: {end}"
+        # The stated bound remembers how long frames had to wait before.
+        stated = allowed
+        if allowed and end is not None and end.longest_wait_s:
+            waited_s = end.longest_wait_s + _WAIT_SLACK_S
+            stated = max(allowed, math.ceil(facts.rate_hz * (waited_s + _BATCH_S)))
+        if tail > stated:
+            yield f"part {number}: max_lost_tail_frames {tail} is more than {stated}: {end}"
         seen = facts.witness.last_seq(stream_id, _safely_before_stop_s(facts))
         known = [seq for seq in (seen, _taken_by_node(facts, stream_id)) if seq is not None]
         if known and not full and part["seq_last"] + tail < max(known):

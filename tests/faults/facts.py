@@ -22,14 +22,16 @@ class End:
         last_seq: the last frame in the node's journal, in the page cache of the moment; None: no
             journal.
         at_s: when, by `time.monotonic`.
-        slow_s: longest time that its frames waited for the disk, beyond the usual: the stated bound
-            of its tail remembers that.
+        slow_s: how long an fsync took then, beyond the usual.
+        longest_wait_s: longest time that frames of the stream had waited for the disk, beyond the
+            usual; the stated bound of its tail remembers that.
     """
 
     how: str
     last_seq: int | None
     at_s: float
     slow_s: float = 0.0
+    longest_wait_s: float = 0.0
 
 
 @dataclass

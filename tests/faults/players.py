@@ -60,8 +60,9 @@ class Players:
         self.times: dict[str, float] = {}
         """How long each step took, in seconds."""
         self._rng = random.Random(story.seed + 1)
-        self._slow_s = 0.0
-        """Longest time that frames of the node's stream waited for the disk, beyond the usual."""
+        self._slow_s = self._longest_wait_s = 0.0
+        """How long an fsync of the node takes now, and the longest wait of its stream's frames,
+        beyond the usual."""
         self._folder = folder
         self._stack = ExitStack()
         self._begin_s = time.monotonic()
@@ -214,8 +215,10 @@ class Players:
             if stream_id not in self.facts.ends and only in (None, stream_id):
                 columns = held.get(stream_id)
                 last_seq = None if columns is None else int(columns["seq"][-1])
-                self.facts.ends[stream_id] = End(how, last_seq, at_s, self._slow_s)
-        self._slow_s = 0.0
+                self.facts.ends[stream_id] = End(
+                    how, last_seq, at_s, self._slow_s, self._longest_wait_s
+                )
+        self._longest_wait_s = self._slow_s
         return newest
 
     def _cut(self, machine: Machine) -> None:

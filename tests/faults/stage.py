@@ -172,10 +172,12 @@ class Stage(Players):
         machine.slow.set_s(slow_s)
         if machine is self.node:
             self._slow_s = slow_s
+            self._longest_wait_s = max(self._longest_wait_s, slow_s)
         time.sleep(1.0 + fault.length_s)
         if self._rng.random() < 0.5:
             self._go_down(0.0, machine, how="power")
         machine.slow.set_s(0.0)
+        self._slow_s = 0.0
 
     def _clock_of_node(self, fault: Fault) -> None:
         self._step_clock(self.node, fault)
@@ -198,7 +200,7 @@ class Stage(Players):
         time.sleep(1.0 + fault.length_s)
         self._small.free()
         if self.story.small_disk_of == "node":
-            self._slow_s = 1.0 + fault.length_s  # frames waited for the disk so long
+            self._longest_wait_s = max(self._longest_wait_s, 1.0 + fault.length_s)
         time.sleep(1.0)  # it is noticed that there is room again
 
     _full_disk_of_server = _full_disk_of_node = _full_disk

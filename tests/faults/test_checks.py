@@ -154,9 +154,9 @@ def lossy(facts: Facts) -> None:
     facts.verify_code = 3
 
 
-def cut_off(facts: Facts, by: int, tail: int) -> None:
+def cut_off(facts: Facts, by: int, tail: int, longest_wait_s: float = 0.0) -> None:
     """The node's power failed: the first part ends earlier, and its tail is open."""
-    facts.ends[STREAMS[0]] = End("power", FRAMES - 1, 5.0)
+    facts.ends[STREAMS[0]] = End("power", FRAMES - 1, 5.0, longest_wait_s=longest_wait_s)
     shorter(facts, by, tail)
 
 
@@ -167,6 +167,13 @@ def test_a_good_round_has_no_findings(facts: Facts) -> None:
 def test_a_stated_loss_of_a_power_cut_is_no_finding(facts: Facts) -> None:
     cut_off(facts, by=30, tail=50)
     assert findings(facts) == []
+
+
+def test_a_bound_remembers_an_earlier_wait_for_the_disk_and_a_loss_does_not(facts: Facts) -> None:
+    cut_off(facts, by=30, tail=80, longest_wait_s=2.0)
+    assert findings(facts) == []
+    without(facts, gone=range(70, 150))
+    assert any("lost {'corrupt': 80}, where 5" in finding for finding in findings(facts))
 
 
 def _without_the_second_stream(facts: Facts) -> None:

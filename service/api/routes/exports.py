@@ -190,7 +190,9 @@ async def respond_with_export(
         headers: further headers.
     """
     texts = [await _describe_export(each, query, server) for each in sessions]
-    tag = hashlib.sha256("|".join(texts).encode()).hexdigest()
+    tag = "".join(hashlib.sha256(text.encode()).hexdigest() for text in texts)
+    if len(sessions) > 1:
+        tag = hashlib.sha256(tag.encode()).hexdigest()
     weak = "" if all(session.sha256 is not None for session in sessions) else "W/"
     headers |= {"ETag": f'{weak}"{tag}"'}
     headers |= {"Cache-Control": "private, no-cache", "Accept-Ranges": "none"}

@@ -105,22 +105,26 @@ def serve_command(
 
 async def _run_server(settings: Settings) -> None:
     stop = create_stop_event()
-    with _listen(settings) as entrance:
-        async with _serve(settings, entrance):
+    with _listen(settings) as listening_server:
+        async with _serve(settings, listening_server):
             await stop.wait()
 
 
-class _Entrance(NamedTuple):
-    """Socket of a server, with its logins and addresses."""
+class _ListeningServer(NamedTuple):
+    """Server that holds its data folder and socket, and does not answer yet."""
 
+    server: Server
     listening: socket.socket
     logins: Logins
     find_urls: Callable[[], list[str]]
 
 
 @contextmanager
-def _listen(settings: Settings) -> Iterator[_Entrance]:
-    """Listen, and let programs of this user on this machine find the token."""
+def _listen(settings: Settings) -> Iterator[_ListeningServer]:
+    """Listen, lock the data folder, and let programs of this user find its token there.
+
+    The folder is locked first: a second server must not change the token of the first.
+    """
     from service.api.access import Logins
     from service.api.address import (
         list_urls,
@@ -128,28 +132,29 @@ def _listen(settings: Settings) -> Iterator[_Entrance]:
         open_listening_socket,
         publish_token,
     )
+    from service.server.server import Server
     from storage.permissions import set_umask_and_create_private_folder
 
     with open_listening_socket(settings.host, settings.port) as listening:
         set_umask_and_create_private_folder(settings.data)
+        server = Server(settings.data, unquantized=settings.no_quantize)
         token = load_or_create_token(settings.token, settings.data)
         find_urls = partial(list_urls, listening, settings.host, settings.advertise)
         with publish_token(listening, token):
-            yield _Entrance(listening, Logins(token, is_private=settings.private), find_urls)
+            logins = Logins(token, is_private=settings.private)
+            yield _ListeningServer(server, listening, logins, find_urls)
 
 
 @asynccontextmanager
 async def _serve(
-    settings: Settings, entrance: _Entrance, *, is_demo: bool = False
+    settings: Settings, listening_server: _ListeningServer, *, is_demo: bool = False
 ) -> AsyncIterator[Server]:
-    """Run a server while the block runs, and print its addresses."""
+    """Let a server answer while the block runs, and print its addresses."""
     from devices.realtime import freeze_garbage_collector
     from service.api.address import list_own_names
     from service.api.app import make_app, serve_app
-    from service.server.server import Server
 
-    listening, logins, find_urls = entrance
-    server = Server(settings.data, unquantized=settings.no_quantize)
+    server, listening, logins, find_urls = listening_server
     urls = find_urls()
     hosts = (*settings.allow_host, *list_own_names(), get_host(urls[0]))
     app = make_app(server, logins=logins, hosts=hosts, find_urls=find_urls)
@@ -251,12 +256,12 @@ def demo_command(
 
 async def _run_demo(settings: Settings, seconds: float | None, node_arguments: list[str]) -> None:
     stop = create_stop_event()
-    with _listen(settings) as entrance:
-        url = entrance.find_urls()[-1]
+    with _listen(settings) as listening_server:
+        url = listening_server.find_urls()[-1]
         # First: the node finds and measures its tiles while the server starts.
-        node = await _start_node(url, entrance.logins.token, node_arguments)
+        node = await _start_node(url, listening_server.logins.token, node_arguments)
         try:
-            async with _serve(settings, entrance, is_demo=True) as server:
+            async with _serve(settings, listening_server, is_demo=True) as server:
                 remark(f"list recordings: foottile sessions --server {url}")
                 ended = asyncio.create_task(node.wait())
                 stopped = asyncio.create_task(stop.wait())

@@ -14,6 +14,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from devices.arrays import Columns
 from devices.errors import CalibrationError, FileFormatError, TareError, UsageError
 from devices.frames import ArrayInfo, FrameBatch
 from devices.scene.emulation_sections import PartFamily
@@ -23,7 +24,7 @@ from service.estimation.estimate import Estimator, ModelEstimator
 from service.estimation.pipeline.plan import EstimationPlan, compute_settling_time_s
 from service.estimation.tare.tare import Tare
 from service.offline.calibration_lookup import EMULATED_RIG, find_calibration
-from service.sessions.estimate_stream import EstimateOptions, Extra
+from service.sessions.estimate_stream import EstimateOptions
 from storage.formats.slice import Slice
 from storage.schema import INDENTER_COLUMNS, PART_COLUMNS, TRUTH_COLUMNS
 from storage.sessions.reader import SealedFileReader
@@ -59,7 +60,7 @@ class EstimateRequest:
     estimator: type[Estimator] = ModelEstimator
 
 
-BatchWithColumns = tuple[FrameBatch, Extra]
+BatchWithColumns = tuple[FrameBatch, Columns]
 _READ_MARGIN_NS = 1_000_000_000
 """Time read behind the part beyond the look-ahead: a frame may need its successor."""
 

@@ -24,7 +24,7 @@ from service.estimation.estimate import ModelEstimator
 from service.estimation.model_sensitivity import OmittedModelEffect
 from service.estimation.pipeline.params import MODEL_NAMES
 from service.estimation.pipeline.plan import EstimationPlan
-from service.estimation.records import Columns
+from service.estimation.records import ColumnDict
 from service.offline.estimate.preparation import (
     CHUNK_FRAMES,
     BatchWithColumns,
@@ -394,7 +394,7 @@ def _resume_stream(
     if before:
         path = _verify_file(folder, before[-1], "npz")
         with np.load(path, allow_pickle=False) as kept:
-            columns: Columns = dict(kept)
+            columns: ColumnDict = dict(kept)
         try:
             stream.load_state(columns)
         except (KeyError, ValueError) as error:

@@ -21,7 +21,7 @@ from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.compilation import is_compiling
 from service.estimation.models.static import StaticParams, compute_forces
 from service.estimation.pipeline.plan import EstimationPlan, make_plan
-from service.estimation.records import Columns
+from service.estimation.records import ColumnDict
 from service.estimation.tare.automatic import (
     HISTORY_NS,
     FlightTareResult,
@@ -107,7 +107,7 @@ class EstimateEpoch:
     tare: Tare | None
     seq: int = 0
     t_ns: int | None = None
-    state: Columns | None = None
+    state: ColumnDict | None = None
     seen_seq: int | None = None
 
     def count_rows_before(self, frames: FrameBatch) -> int:
@@ -216,7 +216,7 @@ class LiveEstimator:
         """Time since which all estimates are without contact; None: not yet."""
         self._run: EstimateRun | None = None
         self._recent: deque[FrameBatch] = deque()
-        self._flushed: list[tuple[FrameBatch, Columns]] = []
+        self._flushed: list[tuple[FrameBatch, ColumnDict]] = []
         self._estimated_t_ns: int | None = None
         self._has_epoch = False
         self.epochs = EpochHistory()
@@ -259,7 +259,9 @@ class LiveEstimator:
         previous.set_tare(None)
         self._recent, self._flushed = previous._recent, previous._flushed
 
-    def estimate_or_pass_frames(self, frames: FrameBatch) -> Iterator[tuple[FrameBatch, Columns]]:
+    def estimate_or_pass_frames(
+        self, frames: FrameBatch
+    ) -> Iterator[tuple[FrameBatch, ColumnDict]]:
         """Add the next frames; yield the frames that are due, with or without estimates."""
         seen_seq = int(self._recent[-1].seq[-1]) if self._recent else -1
         self._recent.append(frames)
@@ -395,7 +397,7 @@ class LiveEstimator:
             )
         return self.calibration
 
-    def _update_contact(self, frames: FrameBatch, columns: Columns) -> None:
+    def _update_contact(self, frames: FrameBatch, columns: ColumnDict) -> None:
         t_ns = frames.t_ns
         before_t_ns = self._estimated_t_ns if self._estimated_t_ns is not None else int(t_ns[0])
         may_have_contact = columns["contact"] != 0  # in contact, or unknown

@@ -17,7 +17,7 @@ from typing import Literal
 from devices.errors import StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
-from service.estimation.records import Columns
+from service.estimation.records import ColumnDict
 from service.protocol.link import Hello
 from service.server.calibrations import CalibrationAssignment
 from service.server.estimates.live_estimator import EpochHistory, EstimateEpoch, LiveEstimator
@@ -28,7 +28,7 @@ from storage.journal.journal import Journal
 
 log = logging.getLogger("foottile.nodes")
 
-EstimatedBatch = tuple[FrameBatch, Columns]
+EstimatedBatch = tuple[FrameBatch, ColumnDict]
 """Frames with their estimates by column; no columns without estimates."""
 _ENDED_STREAMS_MAX = 16
 """Number of ended streams whose epochs are kept."""

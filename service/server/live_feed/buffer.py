@@ -13,7 +13,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 
 from devices.frames import FrameBatch
-from service.estimation.records import Columns
+from service.estimation.records import ColumnDict
 from service.server.estimates.node_estimator import EstimatedBatch
 from service.server.live_feed.events import EncodeCache, FrameRows, slice_batch
 from service.server.node import ServerNode
@@ -159,7 +159,7 @@ class FeedBuffers:
             memory.add_batches(node.stream_id, batches)
 
 
-def _size_bytes(frames: FrameBatch, columns: Columns) -> int:
+def _size_bytes(frames: FrameBatch, columns: ColumnDict) -> int:
     of_all = (*vars(frames).values(), *columns.values())
     return _BATCH_OVERHEAD_BYTES + sum(int(column.nbytes) for column in of_all)
 

@@ -123,13 +123,15 @@ def test_sessions_are_listed_from_a_server_and_from_a_folder(
 
 @pytest.mark.real_time
 def test_a_second_server_on_the_same_port_or_folder_is_refused(
-    run: Run, demo: Demo, tmp_path: Path
+    run: Run, demo: Demo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     port = demo.url.rsplit(":", 1)[1]
     done = run("serve", "--port", port, "--data", str(tmp_path / "other"))
     done.fails(1, f"port {port}", "--port")
+    monkeypatch.delenv("FOOTTILE_TOKEN")
     done = run("serve", "--port", "0", "--data", str(demo.data))
     done.fails(1, "another foottile server uses this data folder")
+    assert not (demo.data / "token").exists(), "it would be the first server's to make one"
 
 
 @pytest.mark.slow(parts=8)

@@ -18,7 +18,7 @@ from devices.arrays import Ints
 from devices.errors import DamagedFramesError
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
-from service.estimation.records import Columns
+from service.estimation.records import ColumnDict
 from service.protocol.link import EarlierStream, Hello
 from service.protocol.live import Policy
 from service.server.live_feed.buffer import FeedBuffer
@@ -264,7 +264,7 @@ class World:
         return self._loop.run(reader.next_event())
 
 
-def bits(columns: Columns, row: int) -> tuple[float, ...]:
+def bits(columns: ColumnDict, row: int) -> tuple[float, ...]:
     """Estimates of a frame; equal if their bits are, or both are not known."""
     values = [np.atleast_1d(columns[name][row]) for name in sorted(columns)]
     return tuple(
