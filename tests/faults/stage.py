@@ -172,7 +172,8 @@ class Stage(Players):
         machine.slow.set_s(slow_s)
         if machine is self.node:
             self._slow_s = slow_s
-            self._longest_wait_s = max(self._longest_wait_s, slow_s)
+            # Frames that come while one fsync runs wait for the next one, too.
+            self._longest_wait_s = max(self._longest_wait_s, 2 * slow_s)
         time.sleep(1.0 + fault.length_s)
         if self._rng.random() < 0.5:
             self._go_down(0.0, machine, how="power")
