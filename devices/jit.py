@@ -29,9 +29,8 @@ F = TypeVar("F", bound=Callable[..., Any])
 _thread_state = threading.local()
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 _CALLEE_OPTIONS: dict[str, Any] = {"no_cpython_wrapper": True, "_nrt": False}
-"""Options of functions for compiled callers, which contain their code: no wrapper for Python, and
-no reference counts of arrays, which their callers keep. All models take a third less to compile so,
-and with no file for each callee."""
+"""Options of a function in its compiled callers: no wrapper for Python, and no reference counts, as
+the callers keep the arrays. Compiling all models takes a third less time so."""
 
 
 class NotCompiledError(Exception):

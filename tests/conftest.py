@@ -72,12 +72,9 @@ def is_of_this_run(item: pytest.Item) -> bool:
     return TURN is None or hashlib.sha256(name.encode()).digest()[7] % parts == int(TURN) % parts
 
 
-def pytest_collection_finish() -> None:
-    gc.enable()
-
-
+@pytest.hookimpl(tryfirst=True)  # a worker's own loop ends the call
 def pytest_runtestloop() -> None:
-    gc.enable()  # a process that only hands out tests does not finish a collection
+    gc.enable()
 
 
 def pytest_report_header() -> str | None:

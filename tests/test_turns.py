@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Collection
 from pathlib import Path
 from types import SimpleNamespace
@@ -43,6 +44,10 @@ def test_tests_of_the_same_parameters_are_played_together(monkeypatch: pytest.Mo
             for name in ("test_one", "test_two")
         )
         assert first == second
+
+
+def test_the_search_for_garbage_is_on_while_tests_run() -> None:
+    assert gc.isenabled()
 
 
 def _play(

@@ -69,7 +69,7 @@ _COLUMNS = (
     "tile_flags",
     "frame_flags",
 )
-"""ColumnDict of frames, in the order of the parameters of `_step`."""
+"""Columns of frames, in the order of the parameters of `_step`."""
 _COUNTS = slice(_COLUMNS.index("pressure_raw"), _COLUMNS.index("temperature_raw") + 1)
 _WORD_BYTES = 2  # of the words in which compiled code takes counts
 _ROW_FIELDS = ("release_row", "sample_row", "end_row")

@@ -30,6 +30,7 @@ import hashlib
 import hmac
 import json
 import math
+import re
 import secrets
 from typing import Annotated, Any, Literal, Self
 
@@ -105,13 +106,18 @@ _REASONS_MAX = 32
 _WARNINGS_MAX = 1000
 UNCERTAINTY_MAX_NS = 60_000_000_000
 """Longest round trip, halved, of a usable probe."""
-STREAM_ID_PATTERN = r"[0-9a-f]{32}"
+_STREAM_ID = re.compile(r"[0-9a-f]{32}")
 _SeqOrEnd = Annotated[int, Field(ge=0, le=NO_END)]
 """Frame number, or the end after the last possible one."""
 
-StreamId = Annotated[str, Field(pattern=f"^{STREAM_ID_PATTERN}$")]
+StreamId = Annotated[str, Field(pattern=f"^{_STREAM_ID.pattern}$")]
 """Id of a stream."""
 _Hex256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+def is_stream_id(text: str) -> bool:
+    """Return whether a text is an id of a stream: 32 hex digits."""
+    return _STREAM_ID.fullmatch(text) is not None
 
 
 def _check_rising(pairs: tuple[tuple[int, int | None], ...]) -> tuple[tuple[int, int | None], ...]:
@@ -168,7 +174,7 @@ class Proof(StrictModel):
 
     type: Literal["proof"] = "proof"
     proof: _Hex256 | None = None
-    """`make_proof`."""
+    """HMAC of the challenge, by `make_proof`."""
     secret: _Hex256 | None = None
     """The secret itself: at first contact, or where a person has to accept this machine."""
 

@@ -7,7 +7,6 @@ assigned on the server.
 from __future__ import annotations
 
 import logging
-import re
 from collections import deque
 from collections.abc import Mapping
 from functools import cache
@@ -23,7 +22,7 @@ from devices.errors import (
     StorageError,
 )
 from devices.frames import ArrayInfo, FrameBatch
-from service.protocol.link import STREAM_ID_PATTERN, Hello, StreamNumbers
+from service.protocol.link import Hello, StreamNumbers, is_stream_id
 from service.server.estimates.node_estimator import EstimatedBatch, NodeEstimator
 from service.server.streams import ServerStream
 from service.sessions.parts import NodeFacts, NodeReport, SessionStream
@@ -76,7 +75,6 @@ class FrameRateMeter:
 
 log = logging.getLogger("foottile.nodes")
 
-STREAM_ID_RULE = re.compile(STREAM_ID_PATTERN)
 HELLO_NAME = "hello.json"
 
 
@@ -121,7 +119,7 @@ class ServerNode:
         self._rate_meter = FrameRateMeter()
         self._problems: list[str] = []
         for path in sorted(journals.glob("*")):
-            if STREAM_ID_RULE.fullmatch(path.name):
+            if is_stream_id(path.name):
                 try:
                     self.streams[path.name] = stream = ServerStream.open_stored(path)
                     self._problems += stream.problems

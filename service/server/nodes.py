@@ -33,8 +33,9 @@ from service.protocol.link import (
     compute_fingerprint,
     generate_secret,
     is_proof_valid,
+    is_stream_id,
 )
-from service.server.node import HELLO_NAME, STREAM_ID_RULE, ServerNode
+from service.server.node import HELLO_NAME, ServerNode
 from storage.documents import read_document
 from storage.durable_files import translate_storage_errors, try_set_aside_and_describe
 from storage.permissions import SECRETS_NAME, read_secrets_or_empty, write_secrets
@@ -177,7 +178,7 @@ def is_valid_node_name(name: str) -> bool:
 def _check_hello(hello: Hello) -> None:
     streams = [hello.array_info, *(each.array_info for each in hello.earlier)]
     for info in streams:
-        if not is_valid_node_name(info.node) or not STREAM_ID_RULE.fullmatch(info.stream_id):
+        if not is_valid_node_name(info.node) or not is_stream_id(info.stream_id):
             raise LinkError(
                 f"node {info.node[:80]!r} with stream_id {info.stream_id[:80]!r}",
                 expected="a name of letters, digits, '.', '_' and '-', and 32 hex digits",

@@ -47,9 +47,7 @@ from service.sessions.preview import SessionPreview
 from service.sessions.preview_frames import PreviewFrames
 from storage.clock.table import CLOCK_NAME
 from storage.formats.export import Export, make_sealed_export
-from storage.formats.markers import (
-    PlacedMarkers,
-)
+from storage.formats.markers import PlacedMarkers
 from storage.formats.slice import Slice
 from storage.formats.writers.format import DrainedBuffer
 from storage.formats.writers.registry import FORMATS

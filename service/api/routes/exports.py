@@ -136,8 +136,8 @@ _NOT_IN_NAMES = re.compile(r"[^A-Za-z0-9.-]+")
 _NAME_LENGTH = 60
 
 
-async def _describe_export(session: Session, query: ExportQuery, server: Server) -> str:
-    """Return a text of everything that an export of a session depends on."""
+async def _hash_export(session: Session, query: ExportQuery, server: Server) -> bytes:
+    """Return a hash of everything that an export of a session depends on."""
     beside = ""
     if query.clock_name == "server" or query.has_markers:  # markers are placed by the clocks
         beside = await run_in_threadpool(_clock_hash, session, server)
@@ -148,7 +148,8 @@ async def _describe_export(session: Session, query: ExportQuery, server: Server)
     else:
         recorded = server.recorder.get_ledger(session.id).recorded
         content = f"{session.id}|{session.state}|{recorded}"
-    return f"{content}|{query.canonical_text}|{beside}|{SOFTWARE_VERSION}"
+    text = f"{content}|{query.canonical_text}|{beside}|{SOFTWARE_VERSION}"
+    return hashlib.sha256(text.encode()).digest()
 
 
 def _marker_headers(markers: list[PlacedMarkers]) -> dict[str, str]:
@@ -189,10 +190,8 @@ async def respond_with_export(
         stem: file name without extension.
         headers: further headers.
     """
-    texts = [await _describe_export(each, query, server) for each in sessions]
-    tag = "".join(hashlib.sha256(text.encode()).hexdigest() for text in texts)
-    if len(sessions) > 1:
-        tag = hashlib.sha256(tag.encode()).hexdigest()
+    hashes = [await _hash_export(each, query, server) for each in sessions]
+    tag = hashlib.sha256(b"".join(hashes)).hexdigest()
     weak = "" if all(session.sha256 is not None for session in sessions) else "W/"
     headers |= {"ETag": f'{weak}"{tag}"'}
     headers |= {"Cache-Control": "private, no-cache", "Accept-Ranges": "none"}

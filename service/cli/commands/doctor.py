@@ -113,7 +113,7 @@ def _make_json(
 ) -> dict[str, object]:
     return {
         "bus": name,
-        "tiles": [{"serial": tile.serial, **asdict(tile)} for tile in diagnosis.tiles],
+        "tiles": [asdict(tile) for tile in diagnosis.tiles],
         "scl_hz": diagnosis.scl_hz,
         "asked_scl_hz": diagnosis.configured_scl_hz,
         "transaction_us": diagnosis.transaction_overhead_s * 1e6,

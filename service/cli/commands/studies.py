@@ -97,7 +97,7 @@ def benchmark_broad(
         "results": [result.model_dump() for result in broad.results],
     }
     figures = {"broad.png": plot_broad(broad.results)}
-    write_and_print_result(folder, "broad", content, text, figures, as_json=as_json)
+    _write_and_print_result(folder, "broad", content, text, figures, as_json=as_json)
     refused = [(f"array {r.number}, {f.what}", f.why) for r in broad.results for f in r.refusals]
     for what, why in [*refused, *((f.what, f.why) for f in broad.lost_arrays)]:
         remark(f"no result: {what}: {why}")
@@ -108,7 +108,7 @@ def benchmark_broad(
         raise typer.Exit(3)
 
 
-def write_and_print_result(
+def _write_and_print_result(
     folder: Path,
     name: str,
     content: object,
@@ -276,7 +276,7 @@ def benchmark_command(
             result = run_benchmark(options, report_step)
             text = format_benchmark_report(result)
             figures = {"benchmark.png": plot_benchmark(result.scenes)}
-        write_and_print_result(
+        _write_and_print_result(
             folder, "benchmark", result.as_dict(), text, figures, as_json=as_json
         )
     for name, failure in result.failures:
@@ -344,7 +344,7 @@ def reproduce_command(
         with show_progress("starting") as report_step:
             result = run_reproduction(options, folder, report_step)
             text, figures = format_reproduction_report(result), draw_figures(result)
-        write_and_print_result(folder, "reproduce", result, text, figures, as_json=as_json)
+        _write_and_print_result(folder, "reproduce", result, text, figures, as_json=as_json)
     for name, why in result.failures.items():
         remark(f"not measured: {name}: {why}")
     if result.failures:

@@ -46,8 +46,8 @@ SampleColumns = tuple[Floats, Floats, Times, Ints]
 """Values (n, columns), NaN where there is none; standard deviation of each and its instant, both
 (n, columns); and (n,) the number of the gapless run that a frame belongs to."""
 SCRATCH_SHAPE = (3, 4 * len(WINDOW_REACHES) + 1)
-"""Shape of the work array of `denoise_sample`: values of all smaller windows, of which there are no
-more, their variances, and 1 for a parabola."""
+"""Shape of the work array of `denoise_sample`: rows of values, of variances, and of ones for
+parabolas; a column for each smaller window, at most so many."""
 WindowMoments = tuple[float, float, float, float, float, float, float, float]
 """Sums over samples: their number, the first four powers of their times, their values, and these
 times time and its square. Eight numbers that stay in registers."""

@@ -74,8 +74,10 @@ class RecomputedFrames:
         self._run: EstimateRun | None = None
         self._extended_to: tuple[int, bool] | None = None
         self._frames: Iterator[FrameBatch] = iter(())
-        self._to_come: deque[EstimateEpoch] = deque()
-        self._due: deque[EstimatedBatch] = deque()
+        self._epochs: deque[EstimateEpoch] = deque()
+        """Epochs that begin behind the last estimated frame."""
+        self._due_batches: deque[EstimatedBatch] = deque()
+        """Estimated frames that are not returned yet."""
 
     def _find_first_seq(self) -> int:
         """Return the first frame to estimate: that of an epoch, or so early that models settle."""
@@ -111,7 +113,7 @@ class RecomputedFrames:
         if self._extended_to == (last_seq, is_final):
             return False
         self._extended_to = last_seq, is_final
-        self._to_come = deque(filter(self._is_to_come, self._list_epochs(last_seq)))
+        self._epochs = deque(filter(self._is_to_come, self._list_epochs(last_seq)))
         self._frames = self._journal.read_frames(self._next_seq, last_seq)
         return True
 
@@ -145,10 +147,10 @@ class RecomputedFrames:
     def _estimate(self, frames: FrameBatch) -> Iterator[EstimatedBatch]:
         """Yield the frames that are due with these, with their estimates."""
         rest = frames
-        while self._to_come and (count := self._to_come[0].count_rows_before(rest)) < len(rest):
+        while self._epochs and (count := self._epochs[0].count_rows_before(rest)) < len(rest):
             yield from self._feed_run(rest.slice_rows(0, count))
             rest = rest.slice_rows(count, len(rest))
-            epoch = self._to_come.popleft()
+            epoch = self._epochs.popleft()
             # A state has the frames that wait for their look-ahead, unless others came between.
             has_waiting = self._last_fed is not None and self._last_fed[0] == epoch.seen_seq
             if self._run is not None and not has_waiting:
@@ -175,9 +177,9 @@ class RecomputedFrames:
             StorageError: it cannot be read.
         """
         while True:
-            if not self._due and not self._estimate_next_frames():
+            if not self._due_batches and not self._estimate_next_frames():
                 return None
-            frames, columns = self._due.popleft()
+            frames, columns = self._due_batches.popleft()
             begin = int(np.searchsorted(frames.seq, self.position.seq))
             end = min(len(frames), begin + ROWS_AT_ONCE)
             # Return consecutive frames only.
@@ -185,26 +187,26 @@ class RecomputedFrames:
             if len(steps):
                 end = begin + int(steps[0]) + 1
             if end < len(frames):
-                self._due.appendleft(slice_batch((frames, columns), end, len(frames)))
+                self._due_batches.appendleft(slice_batch((frames, columns), end, len(frames)))
             if begin < end:
                 self.position = Position(self.position.stream_id, int(frames.seq[end - 1]) + 1)
                 return slice_batch((frames, columns), begin, end)
 
     def _estimate_next_frames(self) -> bool:
         """Estimate the next frames of the journal until some are due; return whether any are."""
-        while not self._due:
+        while not self._due_batches:
             frames = next(self._frames, None)
             if frames is None:
                 _, is_final = self._extended_to or (0, False)
                 if is_final and self._run is not None:
-                    self._due.extend(self._run.flush())
-                return bool(self._due)
-            self._due.extend(self._estimate(frames))
+                    self._due_batches.extend(self._run.flush())
+                return bool(self._due_batches)
+            self._due_batches.extend(self._estimate(frames))
         return True
 
     def put_back(self, rows: EstimatedBatch) -> None:
         """Take back the rows that `next_rows` returned last; they are the next."""
-        self._due.appendleft(rows)
+        self._due_batches.appendleft(rows)
         self.position = Position(self.position.stream_id, int(rows[0].seq[0]))
 
 
