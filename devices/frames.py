@@ -207,6 +207,8 @@ class TileInfo(StrictModel):
     """Kind of its pressure chip (`devices.chips.pressure_chips`)."""
     address: Annotated[int, Field(ge=0, le=0x7F)]
     registers: ChipRegisters
+    settings: ChipRegisters = ()
+    """Words that a chip is set up by; an MPL115A2 has none."""
     x_m: Metres
     y_m: Metres
     z_m: Metres

@@ -116,7 +116,7 @@ MEASURED_COLUMNS = (
     _frame_column("seq", "1", "number of the frame in its stream"),
     _frame_column("t_mono_ns", "ns", "CLOCK_MONOTONIC of the node at the sample of the first tile"),
     _frame_column("t_ns", "ns", "the same instant in UTC since 1970"),
-    _frame_column("pressure_raw", "counts", "raw pressure counts, falling with pressure", NOT_READ),
+    _frame_column("pressure_raw", "counts", "raw pressure counts of the chip", NOT_READ),
     _frame_column("temperature_raw", "counts", "raw temperature counts of the chip", NOT_READ),
     _frame_column("sample_offset_us", "us", "sample instant of the tile minus t_ns"),
     _frame_column("servo_counts", "counts", "newest servo position", NO_SERVO_COUNTS),

@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import replace
 
 from devices.array.bus_recovery import BusMonitor
-from devices.array.schedules import BusTiming
+from devices.array.schedules import BusTiming, count_read_bits
 from devices.array.tile import Scan, TileHealth, TileIo
 from devices.chips.pressure_chip import Counts
 from devices.clock import Clock
@@ -103,6 +103,8 @@ class PlausibilityCheck:
                 scan.add_flag(tile, TileFlag.IMPLAUSIBLE)
             return counts
         third = self._reread(scan, tile, with_temperature)
+        if third == again and self._tile_io.are_free_running[tile]:
+            return third  # a conversion may have ended behind the first reading
         self._disturbed_until_ns = self._clock.now_ns() + DISTURBED_NS
         self._health[tile].fault_counts["disturbed"] += 1
         scan.add_flag(tile, TileFlag.RETRIED)
@@ -123,10 +125,10 @@ class PlausibilityCheck:
     def _verify_identity(self, scan: Scan, tile: int) -> None:
         """Verify by the registers that only this tile is connected; else flag it."""
         health = self._health[tile]
-        found = None
+        is_own = False
         with scan.charge_retry(self._clock), suppress(NoAcknowledgeError):
-            found = self._tile_io.read_registers(tile)
-        if found != health.registers:
+            is_own = self._tile_io.is_set_up(tile)
+        if not is_own:
             self._tile_io.router.invalidate_cache()
             scan.add_flag(tile, TileFlag.IMPLAUSIBLE)
             health.mark_lost(self._clock.now_ns())
@@ -173,8 +175,15 @@ class ConversionMonitor:
         self._tile_io = tile_io
         self._clock = clock
         self._health = health
-        whole = replace(timing, bytes_per_read=max(chip.counts_bytes for chip in tile_io.chips))
-        self._longest_ns = [chip.conversion_max_ns for chip in tile_io.chips]
+        reads = [
+            chip.compute_read_bytes(tile.settings)[1]
+            for tile, chip in zip(tile_io.tiles, tile_io.chips, strict=True)
+        ]
+        whole = replace(timing, read_bits=max(count_read_bits(*each) for each in reads))
+        self._longest_ns = [
+            chip.compute_conversion_ns(tile.settings)[1]
+            for tile, chip in zip(tile_io.tiles, tile_io.chips, strict=True)
+        ]
         self._wires_ns = round((whole.convert_s + whole.read_s) * 1e9)
         self._suspects: list[int] = []
         self._slow_due_ns = 0
@@ -186,7 +195,7 @@ class ConversionMonitor:
         Raises:
             I2cError: the tile does not answer.
         """
-        if self._health[tile].is_slow:
+        if self._health[tile].is_slow or self._tile_io.chips[tile].has_status:
             return
         self._tile_io.connect_tile(tile)
         pressure_raw, temperature_raw = self._tile_io.read_counts(tile, with_temperature=True)
@@ -195,6 +204,8 @@ class ConversionMonitor:
 
     def queue_trial(self, tile: int) -> None:
         """Queue a tile for a trial: it may be read too early."""
+        if self._tile_io.chips[tile].has_status:
+            return  # a repeated reading is known as one
         if tile not in self._suspects and not self._health[tile].is_slow:
             self._suspects.append(tile)
 

@@ -11,8 +11,10 @@ every transaction may have a fixed overhead, every sleep an overshoot.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from statistics import fmean
 from typing import Protocol, get_args
 
 from devices.array.tile import Scan
@@ -92,17 +94,22 @@ SCHEDULES: Mapping[ScheduleName, Schedule] = {
 
 SELECT_BITS = 20  # START, address, mask, STOP
 CONVERT_BITS = 29  # START, address, register, data, STOP
+ADDRESS_BITS = 29
+"""SCL periods before a read takes its data: START, address, register, START, address."""
 _READ_BITS = 30  # START, address, register, repeated START, address, STOP
 _BYTE_BITS = 9  # eight bits and the acknowledge
+
+BROADCASTS: tuple[ScheduleName, ...] = ("simultaneous", "per_mux")
+"""Schedules that start several tiles by one command, which a free-running part does not need."""
 
 PREFERENCE: tuple[ScheduleName, ...] = ("simultaneous", "per_mux", "pipelined", "sequential")
 """Order of preference among equally fast schedules: least skew first."""
 _AS_FAST = 0.995  # rates within half a percent count as equal
 
 
-def count_read_bits(n_bytes: float) -> float:
-    """Return the SCL periods of a read of `n_bytes` from a register."""
-    return _READ_BITS + _BYTE_BITS * n_bytes
+def count_read_bits(*n_bytes: float) -> float:
+    """Return the SCL periods of reads of `n_bytes` each from a register."""
+    return sum(_READ_BITS + _BYTE_BITS * n for n in n_bytes)
 
 
 @dataclass(frozen=True)
@@ -113,7 +120,14 @@ class BusTiming:
         scl_hz: real bus clock.
         conversions_s: wait for each tile's conversion, in tile order.
         muxes: mux address of each tile.
-        bytes_per_read: bytes of a sample; a mean if temperature is decimated, or chips differ.
+        channels: channel of each tile; None: each has its own.
+        addresses: I2C address of each tile; a command reaches those of one. None: all have one.
+        free_running: whether each tile converts by itself; None: none does.
+        read_bits: SCL periods of the reads of a sample; a mean if temperature is decimated, or
+            chips differ.
+        reads_per_sample: number of these reads, likewise.
+        bits_per_conversion: SCL periods of each further conversion that a free-running tile has
+            stored when it is read, likewise.
         transaction_overhead_s: overhead of one transaction beyond its bits.
         sleep_overshoot_s: overshoot of a sleep.
     """
@@ -121,9 +135,25 @@ class BusTiming:
     scl_hz: float
     conversions_s: tuple[float, ...]
     muxes: tuple[int, ...]
-    bytes_per_read: float = 4.0
+    read_bits: float = _READ_BITS + 4 * _BYTE_BITS
     transaction_overhead_s: float = 0.0
     sleep_overshoot_s: float = 0.0
+    reads_per_sample: float = 1.0
+    channels: tuple[int, ...] | None = None
+    addresses: tuple[int, ...] | None = None
+    free_running: tuple[bool, ...] | None = None
+    bits_per_conversion: float = 0.0
+
+    @property
+    def commanded(self) -> tuple[bool, ...]:
+        """True for each tile whose conversion is started by a command."""
+        return tuple(not free for free in self.free_running or (False,) * len(self.muxes))
+
+    @property
+    def selects(self) -> tuple[bool, ...]:
+        """True for each tile whose channel has to be selected after the tile before it."""
+        places = [*zip(self.muxes, self.channels or range(len(self.muxes)), strict=True)]
+        return tuple(place != places[i - 1] for i, place in enumerate(places))
 
     @property
     def select_s(self) -> float:
@@ -137,8 +167,8 @@ class BusTiming:
 
     @property
     def read_s(self) -> float:
-        """Duration of one read of a tile's sample."""
-        return count_read_bits(self.bytes_per_read) / self.scl_hz + self.transaction_overhead_s
+        """Duration of the reads of a tile's sample."""
+        return self.read_bits / self.scl_hz + self.reads_per_sample * self.transaction_overhead_s
 
     @property
     def tile_counts_by_mux(self) -> tuple[int, ...]:
@@ -148,21 +178,54 @@ class BusTiming:
 
 def compute_frame_s(schedule: ScheduleName, timing: BusTiming) -> float:
     """Compute the frame period of a schedule, in seconds."""
+    frame_s = _compute_frame_s(schedule, timing)
+    if timing.bits_per_conversion:
+        # A longer frame finds more conversions, which take longer to read.
+        for _ in range(_ROUNDS):
+            further = fmean(count_conversions(frame_s, each) - 1 for each in timing.conversions_s)
+            bits = timing.read_bits + further * timing.bits_per_conversion
+            frame_s = _compute_frame_s(schedule, replace(timing, read_bits=bits))
+    return frame_s
+
+
+_ROUNDS = 8
+_STORED_MAX = 32  # of a part's FIFO
+_RARE = 0.05  # part of the frames that may have one more
+
+
+def count_conversions(frame_s: float, conversion_s: float) -> int:
+    """Return the number of conversions that a free-running part ends in nearly every frame."""
+    return min(max(1, math.ceil(frame_s / conversion_s - _RARE)), _STORED_MAX)
+
+
+def _compute_frame_s(schedule: ScheduleName, timing: BusTiming) -> float:
     n, m = len(timing.muxes), len(timing.tile_counts_by_mux)
     s, c, r = timing.select_s, timing.convert_s, timing.read_s
     waits = [wait + timing.sleep_overshoot_s for wait in timing.conversions_s]
+    turns = [
+        wait + r + c if begins else max(wait, r)
+        for wait, begins in zip(waits, timing.commanded, strict=True)
+    ]
     if n == 1:  # the mux stays selected, and nothing overlaps the wait
-        return c + waits[0] + r
+        return turns[0]
+    selects, closes = sum(timing.selects), m if m > 1 else 0
+    busy = (selects + closes) * s + n * r + sum(timing.commanded) * c
     if schedule == "sequential":
-        return n * (s + c + r) + sum(waits) + (m * s if m > 1 else 0.0)
-    if schedule == "simultaneous" or (schedule == "per_mux" and m == 1):
-        # The first select, and the closing of the other muxes, are hidden in the wait.
-        return m * s + c + max(*waits, m * s) + n * r + (n - 1) * s + (m - 1) * s
+        waited = sum(w for w, begins in zip(waits, timing.commanded, strict=True) if begins)
+        return max(busy + waited, *turns)
     if schedule == "pipelined":
-        busy = n * (s + c + r) + (m * s if m > 1 else 0.0)
-        return max(busy, max(waits) + r + c)
+        return max(busy, *turns)
+    c *= len(set(timing.addresses or (0,)))
+    if schedule == "simultaneous" or m == 1:
+        # The first select, and the closing of the other muxes, are hidden in the wait.
+        return m * s + c + max(*waits, m * s) + n * r + (max(1, selects) - 1 + m - 1) * s
     start = 2 * s + c  # open a mux, convert, close it
-    reads = [count * (s + r) + s for count in timing.tile_counts_by_mux]
+    reads = []
+    for mux in sorted(set(timing.muxes)):
+        ours = [
+            select for select, of in zip(timing.selects, timing.muxes, strict=True) if of == mux
+        ]
+        reads.append(sum(ours) * s + len(ours) * r + s)
     return max(m * start + sum(reads), max(waits) + start + max(reads))
 
 
@@ -172,15 +235,19 @@ def compute_turns_s(timing: BusTiming) -> tuple[float, ...]:
     t_s, alone = 0.0, len(timing.muxes) == 1
     for i, mux in enumerate(timing.muxes):
         leaves = mux != timing.muxes[i - 1]  # the first tile comes after the last one
-        t_s += 0.0 if alone else (1 + leaves) * timing.select_s
+        t_s += 0.0 if alone else (timing.selects[i] + leaves) * timing.select_s
         turns.append(t_s)
-        t_s += timing.read_s + timing.convert_s
+        t_s += timing.read_s + timing.convert_s * timing.commanded[i]
     return tuple(turns)
 
 
 def compute_rates_hz(timing: BusTiming) -> dict[ScheduleName, float]:
-    """Compute the frame rate of every schedule."""
-    return {name: 1.0 / compute_frame_s(name, timing) for name in get_args(ScheduleName)}
+    """Compute the frame rate of every schedule that suits the tiles."""
+    return {
+        name: 1.0 / compute_frame_s(name, timing)
+        for name in get_args(ScheduleName)
+        if name not in BROADCASTS or all(timing.commanded)
+    }
 
 
 def count_broadcast_channels(schedule: ScheduleName, muxes: Sequence[int]) -> int:

@@ -12,9 +12,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
 
-from devices.array.schedules import CONVERT_BITS, count_read_bits
+from devices.array.schedules import ADDRESS_BITS, CONVERT_BITS, count_read_bits
 from devices.buses.i2c import I2cBus, i2c_msg
-from devices.chips.pressure_chip import Counts, PressureChip, Registers
+from devices.chips.pressure_chip import (
+    ChipDriver,
+    ChipSettings,
+    Counts,
+    PressureChip,
+    Registers,
+)
 from devices.chips.pressure_chips import PRESSURE_CHIPS, get_chip
 from devices.chips.tca9548a import ADDRESSES, CHANNELS, MuxRouter, Tca9548a
 from devices.clock import Clock
@@ -35,8 +41,9 @@ reading. It is loaded last."""
 _MARGIN = 1.004
 """Allowance for the drift of a part's clock; a larger drift is detected while running."""
 
-_ADDRESS_BITS = 29
-"""SCL periods before a read takes its data: START, address, register, START, address."""
+_STATUS_CONVERSIONS = 48
+"""Conversions that are timed where a status tells their end. The first of free-running ones may
+have ended earlier."""
 
 _SCL_READS = 100
 _UNDISTURBED = 0.1
@@ -64,7 +71,7 @@ def _identify_tile(bus: I2cBus, router: MuxRouter, tile: TileSection) -> TileInf
     where = f"tile {tile.serial} (mux 0x{tile.mux:02x} channel {tile.channel})"
     try:
         router.connect_single_channel(tile.mux, tile.channel)
-        registers = _start_up_and_identify(bus, chip, tile.chip_address, where)
+        registers = _identify_and_start_up(bus, chip, tile.chip_address, tile.chip_settings, where)
     except NoAcknowledgeError as error:
         raise TileSetupError(
             f"does not answer: {error}",
@@ -78,18 +85,24 @@ def _identify_tile(bus: I2cBus, router: MuxRouter, tile: TileSection) -> TileInf
         chip=chip.name,
         address=tile.chip_address,
         registers=registers,
+        settings=tile.chip_settings,
         x_m=tile.x_m,
         y_m=tile.y_m,
         z_m=tile.z_m,
         reference=tile.reference,
-        conversion_ms=chip.conversion_typical_ns / 1e6,
+        conversion_ms=chip.compute_conversion_ns(tile.chip_settings)[0] / 1e6,
     )
 
 
-def _start_up_and_identify(bus: I2cBus, chip: PressureChip, address: int, where: str) -> Registers:
+def _identify_and_start_up(
+    bus: I2cBus, chip: PressureChip, address: int, settings: Registers, where: str
+) -> Registers:
     driver = chip.make_driver(bus, address)
-    driver.start_up()
-    return driver.identify(where=where)
+    registers = driver.identify(
+        where=where
+    )  # first: another chip at this address is not written to
+    driver.start_up(settings)
+    return registers
 
 
 @dataclass(frozen=True)
@@ -133,8 +146,12 @@ def find_tiles_on_all_channels(bus: I2cBus) -> tuple[FoundTile, ...]:
         place = (mux, channel, chip.name, address)
         try:
             router.connect_single_channel(mux, channel)
-            registers = _start_up_and_identify(
-                bus, chip, address, f"mux 0x{mux:02x} channel {channel}"
+            registers = _identify_and_start_up(
+                bus,
+                chip,
+                address,
+                chip.encode_settings(ChipSettings()),
+                f"mux 0x{mux:02x} channel {channel}",
             )
             plugs.append(FoundTile(*place, registers))
         except NoAcknowledgeError:
@@ -214,9 +231,16 @@ def measure_conversion_ns(
     router.connect_single_channel(tile.mux, tile.channel)
     chip = get_chip(tile.chip)
     driver = chip.make_driver(bus, tile.address)
-    settled_ns = chip.conversion_max_ns + _SPARE_NS
+    typical_ns, longest_ns = chip.compute_conversion_ns(tile.settings)
+    if chip.has_status:
+        return _measure_by_status(driver, clock, longest_ns, chip.is_free_running(tile.settings))
+    settled_ns = longest_ns + _SPARE_NS
 
-    wires_ns = round(1e9 * (CONVERT_BITS + count_read_bits(chip.counts_bytes)) / wires.scl_hz)
+    wires_ns = round(
+        1e9
+        * (CONVERT_BITS + count_read_bits(*chip.compute_read_bytes(tile.settings)[1]))
+        / wires.scl_hz
+    )
     wires_ns += round(2e9 * wires.transaction_overhead_s)
 
     def convert_and_read(delay_ns: int) -> tuple[Counts, int]:
@@ -254,21 +278,42 @@ def measure_conversion_ns(
                 return None
         return None if in_time >= _SAME_MAX else known_ns
 
-    delay_ns = _bisect_conversion_ns(chip, finished_within)
+    delay_ns = _bisect_conversion_ns(typical_ns, longest_ns, finished_within)
     if delay_ns is None:
         return None
-    waits_ns = round((delay_ns + _ADDRESS_BITS * 1e9 / wires.scl_hz) * _MARGIN)
-    return min(chip.conversion_max_ns, waits_ns)
+    waits_ns = round((delay_ns + ADDRESS_BITS * 1e9 / wires.scl_hz) * _MARGIN)
+    return min(longest_ns, waits_ns)
+
+
+def _measure_by_status(
+    driver: ChipDriver, clock: Clock, longest_ns: int, is_free_running: bool
+) -> int | None:
+    """Measure a conversion of a part with a status: the mean of free ones, else the longest."""
+    ended_ns: list[int] = []
+    took_ns: list[int] = []
+    for _ in range(_STATUS_CONVERSIONS):
+        begin_ns = clock.now_ns()
+        if not is_free_running:
+            driver.start_conversion()
+        while not driver.has_new_counts():
+            if clock.now_ns() - begin_ns > 2 * longest_ns:
+                return None
+        ended_ns.append(clock.now_ns())
+        took_ns.append(ended_ns[-1] - begin_ns)
+    if is_free_running:
+        mean_ns = (ended_ns[-1] - ended_ns[1]) / (len(ended_ns) - 2)
+        return min(longest_ns, round(mean_ns * _MARGIN))
+    return min(longest_ns, round(max(took_ns) * _MARGIN))
 
 
 def _bisect_conversion_ns(
-    chip: PressureChip, finished_within: Callable[[int, int], int | None]
+    typical_ns: int, longest_ns: int, finished_within: Callable[[int, int], int | None]
 ) -> int | None:
-    if finished_within(chip.conversion_max_ns, _NEVER_NS) is None:
+    if finished_within(longest_ns, _NEVER_NS) is None:
         return None
-    unfinished_ns = chip.conversion_typical_ns // _SHORTEST_DIVISOR
-    finished_ns = chip.conversion_max_ns
-    while finished_ns - unfinished_ns > chip.conversion_typical_ns // _RESOLUTION_DIVISOR:
+    unfinished_ns = typical_ns // _SHORTEST_DIVISOR
+    finished_ns = longest_ns
+    while finished_ns - unfinished_ns > typical_ns // _RESOLUTION_DIVISOR:
         middle_ns = (unfinished_ns + finished_ns) // 2
         waited_ns = finished_within(middle_ns, finished_ns)
         if waited_ns is None:

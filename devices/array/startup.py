@@ -7,7 +7,14 @@ from dataclasses import dataclass, replace
 from statistics import fmean
 
 from devices.array.bus_recovery import BusRecovery, RecoveryResult, recover_bus
-from devices.array.schedules import BusTiming, ScheduleChoice, choose_schedule, compute_frame_s
+from devices.array.schedules import (
+    BROADCASTS,
+    BusTiming,
+    ScheduleChoice,
+    choose_schedule,
+    compute_frame_s,
+    count_read_bits,
+)
 from devices.array.self_test import (
     WireTiming,
     identify_tiles,
@@ -203,9 +210,16 @@ def choose_scene_schedule(
         requested_rate_hz: frame rate, instead of the scene's.
 
     Raises:
-        SceneError: the schedule does not suit a reference sensor.
+        SceneError: the schedule does not suit a reference sensor, or tiles that run freely.
     """
     requested = schedule or scene.array.schedule
+    if (has_reference or requested in BROADCASTS) and not all(timing.commanded):
+        beside = "beside a reference sensor" if has_reference else f"in schedule {requested!r}"
+        raise SceneError(
+            f"tiles that convert by themselves {beside}, which starts all at once",
+            where="tile",
+            expected='tiles with mode = "forced"',
+        )
     if has_reference and requested in ("auto", "simultaneous"):
         return ScheduleChoice(
             "simultaneous", "the reference force is read while all tiles convert at once"
@@ -270,15 +284,34 @@ def compute_bus_timing(
         conversions_ns = [round(array.wait_ms * 1e6)] * len(tiles)
     chips = [get_chip(tile.chip) for tile in tiles]
     waits_ns = [
-        chip.conversion_max_ns if known is None else known
-        for chip, known in zip(chips, conversions_ns, strict=True)
+        chip.compute_conversion_ns(tile.settings)[1] if known is None else known
+        for tile, chip, known in zip(tiles, chips, conversions_ns, strict=True)
     ]
-    alone_bytes = fmean(chip.pressure_bytes for chip in chips)
-    whole_bytes = fmean(chip.counts_bytes for chip in chips)
+    reads = [
+        chip.compute_read_bytes(tile.settings) for tile, chip in zip(tiles, chips, strict=True)
+    ]
+    part = 1 / array.temperature_every
     return BusTiming(
         scl_hz=wires.scl_hz,
         conversions_s=tuple(wait_ns * 1e-9 for wait_ns in waits_ns),
         muxes=tuple(tile.mux for tile in tiles),
-        bytes_per_read=alone_bytes + (whole_bytes - alone_bytes) / array.temperature_every,
+        channels=tuple(tile.channel for tile in tiles),
+        addresses=tuple(tile.address for tile in tiles),
+        free_running=tuple(
+            chip.is_free_running(tile.settings) for tile, chip in zip(tiles, chips, strict=True)
+        ),
+        read_bits=fmean(
+            (1 - part) * count_read_bits(*alone) + part * count_read_bits(*whole)
+            for alone, whole in reads
+        ),
+        bits_per_conversion=fmean(
+            count_read_bits(chip.bytes_per_conversion) - count_read_bits(0)
+            if chip.is_free_running(tile.settings)
+            else 0.0
+            for tile, chip in zip(tiles, chips, strict=True)
+        ),
+        reads_per_sample=fmean(
+            (1 - part) * len(alone) + part * len(whole) for alone, whole in reads
+        ),
         transaction_overhead_s=wires.transaction_overhead_s,
     )

@@ -19,7 +19,7 @@ from devices.chips.pressure_chip import Counts, Registers
 from devices.chips.pressure_chips import get_chip
 from devices.chips.tca9548a import MuxRouter
 from devices.clock import Clock
-from devices.errors import BusFaultError
+from devices.errors import BusFaultError, NoAcknowledgeError
 from devices.flags import TileFlag
 from devices.frames import NOT_READ, TileInfo
 
@@ -37,6 +37,12 @@ class TileIo:
             for tile, chip in zip(tiles, self.chips, strict=True)
         }
         self._drivers = [drivers[tile.chip, tile.address] for tile in tiles]
+        self.are_free_running = tuple(
+            chip.is_free_running(tile.settings)
+            for tile, chip in zip(tiles, self.chips, strict=True)
+        )
+        self.silent_tiles: tuple[int, ...] = ()
+        """Tiles whose address nobody acknowledged at the last start of conversions."""
         self._masks: dict[tuple[int, ...], dict[int, int]] = {
             (i,): {tile.mux: 1 << tile.channel} for i, tile in enumerate(tiles)
         }
@@ -46,10 +52,24 @@ class TileIo:
         self.router.connect_channels(self._masks[(tile,)])
 
     def start_conversions(self, tiles: Sequence[int]) -> None:
-        """Start a conversion in all of `tiles` at once."""
-        self.router.connect_channels(self._masks_of(tuple(tiles)))
-        for driver in dict.fromkeys(self._drivers[i] for i in tiles):
-            driver.start_conversion()
+        """Start a conversion in all of `tiles` at once; free-running ones start theirs.
+
+        A silent kind of part does not keep the others from starting.
+        """
+        self.silent_tiles = ()
+        started = [i for i in tiles if not self.are_free_running[i]]
+        if not started:
+            return
+        self.router.connect_channels(self._masks_of(tuple(started)))
+        silence: NoAcknowledgeError | None = None
+        for driver in dict.fromkeys(self._drivers[i] for i in started):
+            try:
+                driver.start_conversion()
+            except NoAcknowledgeError as error:
+                silence = error
+                self.silent_tiles += tuple(i for i in started if self._drivers[i] is driver)
+        if silence is not None:
+            raise silence
 
     def read_counts(self, tile: int, with_temperature: bool) -> Counts:
         """Return `pressure_raw` and `temperature_raw` (or `NOT_READ`) of a connected tile."""
@@ -64,7 +84,25 @@ class TileIo:
 
     def start_up(self, tile: int) -> None:
         """Prepare a connected tile after power-up."""
-        self._drivers[tile].start_up()
+        self._drivers[tile].start_up(self.tiles[tile].settings)
+
+    def is_set_up(self, tile: int) -> bool:
+        """Return whether a quick look finds a connected tile's part, and its settings."""
+        return self._drivers[tile].is_set_up_as(
+            self.tiles[tile].registers, self.tiles[tile].settings
+        )
+
+    def has_new_counts(self, tile: int) -> bool:
+        """Return whether a connected tile ended a conversion since this was last asked."""
+        return self._drivers[tile].has_new_counts()
+
+    def read_new_pressures(self, tile: int, at_once: int) -> list[int]:
+        """Read the pressures of a connected free-running tile since this was last called."""
+        return self._drivers[tile].read_new_pressures(at_once)
+
+    def read_temperature(self, tile: int) -> int:
+        """Read the temperature of a connected tile alone."""
+        return self._drivers[tile].read_temperature()
 
     def read_registers(self, tile: int) -> Registers:
         """Read the registers of a connected tile, once."""
@@ -92,6 +130,58 @@ class TileIo:
             self._masks[tiles] = masks
         return self._masks[tiles]
 
+
+class ConversionClock:
+    """Clock of a free-running part, followed by the number of its conversions in each read.
+
+    Of n conversions since the read before, the first ended behind that one, the last before this
+    one, and the next ends behind this one. Reads come at another interval than conversions, so now
+    and then n is not one: then these bounds leave little room, and two such reads give the period.
+    """
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = self._measured_ns = float(period_ns)
+        self._end_ns = 0.0
+        self._last_read_ns: tuple[int, int] | None = None
+        self._fixed_ns: float | None = None
+        self._counted = 0
+
+    def count_conversions(self, count: int, begin_ns: int, end_ns: int) -> int:
+        """Count the conversions in a read; return the estimated end of the last one.
+
+        Args:
+            count: conversions that ended since the last read.
+            begin_ns: begin of this read.
+            end_ns: its end.
+        """
+        last, self._last_read_ns = self._last_read_ns, (begin_ns, end_ns)
+        if last is None or count > _CONVERSIONS_MAX:
+            self._end_ns, self._fixed_ns = begin_ns - self._period_ns / 2, None
+            return round(self._end_ns)
+        low_ns = max(last[0] + (count - 1) * self._period_ns, begin_ns - self._period_ns)
+        high_ns = min(end_ns, last[1] + count * self._period_ns)
+        self._end_ns = min(max(self._end_ns + count * self._period_ns, low_ns), high_ns)
+        self._counted += count
+        if high_ns - low_ns < _NARROW * self._period_ns:
+            self._end_ns = (low_ns + high_ns) / 2
+            if self._fixed_ns is not None and self._counted >= _COUNTED_MIN:
+                period_ns = (self._end_ns - self._fixed_ns) / self._counted
+                if abs(period_ns / self._measured_ns - 1) < _RATE_ERROR_MAX:
+                    self._period_ns = period_ns
+            if self._fixed_ns is None or self._counted >= _COUNTED_MAX:
+                self._fixed_ns, self._counted = self._end_ns, 0
+        return round(self._end_ns)
+
+
+_CONVERSIONS_MAX = 16
+"""Conversions in a read from which some may have been lost in the part's FIFO of 32."""
+_NARROW = 0.25
+"""Part of the period to which bounds must leave the end of a conversion to fix it."""
+_COUNTED_MIN, _COUNTED_MAX = 200, 4000
+"""Conversions between two fixed ends that give the period: a shorter time is less exact, a longer
+one late when the period changes."""
+_RATE_ERROR_MAX = 0.01
+"""Largest relative error of a measured period; a larger one is a miscount."""
 
 _BUS_FAULTS_MAX = 2  # each may cost the adapter's timeout, 30 ms
 

@@ -15,14 +15,18 @@ from functools import partial
 from devices.array.bus_recovery import BusMonitor, BusRecovery
 from devices.array.plausibility import ConversionMonitor, PlausibilityCheck
 from devices.array.schedules import (
+    ADDRESS_BITS,
     SCHEDULES,
     BusTiming,
     check_broadcast_channels,
     compute_frame_s,
     compute_turns_s,
+    count_conversions,
+    count_read_bits,
 )
-from devices.array.tile import Scan, TileHealth, TileIo
+from devices.array.tile import ConversionClock, Scan, TileHealth, TileIo
 from devices.buses.i2c import I2cBus
+from devices.chips.pressure_chip import Counts
 from devices.clock import Clock
 from devices.errors import BusFaultError, NoAcknowledgeError, TileSetupError
 from devices.flags import TileFlag
@@ -64,8 +68,8 @@ class TileReconnector:
         """Return whether the registers are the tile's own; mark another part as replaced."""
         health = self._health[tile]
         self._tile_io.connect_tile(tile)
-        self._tile_io.start_up(tile)
         if self._tile_io.read_registers(tile) == health.registers:
+            self._tile_io.start_up(tile)
             health.is_replaced = False
             return True
         # A flipped bit, in the reading or the select before it, must not look like another part.
@@ -75,6 +79,7 @@ class TileReconnector:
             self._tile_io.connect_tile(tile)
             readings.add(self._tile_io.identify(tile))
         if readings == {health.registers}:
+            self._tile_io.start_up(tile)
             health.is_replaced = False
             return True
         # Equal, plausible readings of other registers: another part.
@@ -93,6 +98,8 @@ _BUDGET_MIN_NS = 500_000
 """Retry budget: an eighth of a frame, but at least one reading and one check of coefficients."""
 _LEARN_NS, _FORGET_NS = 10_000, 2_000
 """Largest increase, and fixed decrease, of a tile's learnt turn in each frame."""
+_REPEATS_MAX = 10
+"""Repeated readings of a chip with a status from which its part is set up anew."""
 _DISTURBED_BUDGETS = 4
 """Factor of the retry budget on a line with flipped bits: correct readings before rate."""
 
@@ -139,11 +146,15 @@ class TileArray:
         self.health = tuple(TileHealth(tile) for tile in tiles)
         self._clock = clock
         self._tile_io = TileIo(bus, tiles)
+        self._conversions_ns = [round(tile.conversion_ms * 1e6) for tile in tiles]
         self.sample_delay_ns = tuple(
-            round(tile.conversion_ms * 1e6) // chip.sample_delay_divisor
-            for tile, chip in zip(tiles, self._tile_io.chips, strict=True)
+            chip.compute_sample_delay_ns(tile.settings, conversion_ns)
+            for tile, chip, conversion_ns in zip(
+                tiles, self._tile_io.chips, self._conversions_ns, strict=True
+            )
         )
-        """Delay from the STOP of a tile's CONVERT to the assumed sample instant of its pressure."""
+        """Delay from a conversion's begin, at the STOP of a CONVERT, to its assumed sample instant.
+        """
         self.bus_monitor = BusMonitor(self._tile_io.router, clock, recovery)
         self._plausibility = PlausibilityCheck(self._tile_io, clock, self.health, self.bus_monitor)
         self._reconnector = TileReconnector(self._tile_io, clock, self.health)
@@ -167,6 +178,15 @@ class TileArray:
         self._started_ns = [clock.now_ns()] * len(tiles)
         self._is_converting = [False] * len(tiles)
         self._last_counts = [(NOT_READ, NOT_READ)] * len(tiles)
+        self._repeat_counts = [0] * len(tiles)
+        self._read_ns = list(self._started_ns)
+        # The part is read when its address has passed.
+        self._bit_ns = 1e9 / timing.scl_hz
+        self._address_ns = round(ADDRESS_BITS * self._bit_ns)
+        self._conversions_per_frame = [
+            count_conversions(self._frame_ns * 1e-9, each_s) for each_s in timing.conversions_s
+        ]
+        self._conversion_clocks = [ConversionClock(each_ns) for each_ns in self._conversions_ns]
         self._busy_since_ns = 0
         self._frame_index = 0
 
@@ -250,14 +270,20 @@ class TileArray:
         ):
             # A mux that does not answer must not keep the others from starting.
             silent = self._tile_io.router.refused_address
-            gone = [i for i in called if silent in (None, self.tiles[i].mux)]
+            gone = [
+                i
+                for i in called
+                if self.tiles[i].mux == silent
+                or (silent is None and i in self._tile_io.silent_tiles)
+            ]
             for i in gone:
                 scan.add_flag(i, TileFlag.NO_ANSWER)
                 self.health[i].mark_lost(self._clock.now_ns())
             called = () if scan.is_abandoned else tuple(i for i in called if i not in gone)
         now_ns = self._clock.now_ns()
         for i in tiles:
-            self._started_ns[i] = now_ns
+            # The next conversion of a free-running part ends a conversion's time after its read.
+            self._started_ns[i] = self._read_ns[i] if self._tile_io.are_free_running[i] else now_ns
             # A lost tile may have missed the broadcast.
             self._is_converting[i] = i in called and self.health[i].is_present
 
@@ -307,17 +333,32 @@ class TileArray:
             or health.is_temperature_due(self._clock.now_ns())
         )
         counts = (NOT_READ, NOT_READ)
+        is_repeated = False
 
         def transfers() -> None:
-            nonlocal counts
+            nonlocal counts, is_repeated
             self._tile_io.connect_tile(tile)
             self._wait_for_conversion(scan, ready_ns)
+            if self._tile_io.are_free_running[tile]:
+                counts = self._read_free_conversions(scan, tile, with_temperature)
+                is_repeated = counts[0] == NOT_READ
+                return
             counts = self._tile_io.read_counts(tile, with_temperature)
+            is_repeated = (
+                self._tile_io.chips[tile].has_status
+                and counts == self._last_counts[tile]
+                and not self._tile_io.has_new_counts(tile)
+            )
 
         answers = self._run_with_retry(scan, [tile], transfers)
         self._is_converting[tile] = False
         self._last_counts[tile] = counts
-        if answers:
+        self._repeat_counts[tile] = self._repeat_counts[tile] + 1 if is_repeated else 0
+        if is_repeated:
+            scan.add_flag(tile, TileFlag.NOT_CONVERTED)
+            if self._repeat_counts[tile] >= _REPEATS_MAX:
+                health.mark_lost(self._clock.now_ns())  # it is set up anew when it is looked for
+        elif answers:
             may_ask = self._may_retry(scan, tile)
             self._plausibility.check_reading(
                 scan, tile, counts, with_temperature=with_temperature, may_retry=may_ask
@@ -325,6 +366,25 @@ class TileArray:
         else:
             scan.add_flag(tile, TileFlag.NO_ANSWER)
             health.mark_lost(self._clock.now_ns())
+
+    def _read_free_conversions(self, scan: Scan, tile: int, with_temperature: bool) -> Counts:
+        """Read the last conversion of a free-running tile, and follow its clock."""
+        begin_ns = self._read_ns[tile] = self._clock.now_ns()
+        # As many as a frame has, and one that tells that there is no more.
+        at_once = self._conversions_per_frame[tile] + 1
+        pressures = self._tile_io.read_new_pressures(tile, at_once)
+        # A read that was full is followed by another one, here an empty one.
+        reads = 2 if pressures and len(pressures) % at_once == 0 else 1
+        n_bytes = at_once * self._tile_io.chips[tile].bytes_per_conversion
+        data_ns = round(reads * count_read_bits(n_bytes) * self._bit_ns) - self._address_ns
+        ended_ns = self._conversion_clocks[tile].count_conversions(
+            len(pressures), begin_ns + self._address_ns, self._clock.now_ns() - data_ns
+        )
+        scan.convert_stop_ns[tile] = ended_ns - self._conversions_ns[tile]
+        if not pressures:
+            return NOT_READ, NOT_READ
+        temperature_raw = self._tile_io.read_temperature(tile) if with_temperature else NOT_READ
+        return pressures[-1], temperature_raw
 
     # Retries
 

@@ -15,7 +15,13 @@ import numpy.typing as npt
 
 from devices.arrays import Floats
 from devices.buses.i2c import I2cBus, i2c_msg
-from devices.chips.pressure_chip import Counts, PressureChip, PressureLaw, Registers
+from devices.chips.pressure_chip import (
+    ChipSettings,
+    Counts,
+    PressureChip,
+    PressureLaw,
+    Registers,
+)
 from devices.errors import TileSetupError, UsageError
 from devices.flags import TileFlag
 
@@ -32,6 +38,10 @@ PRESSURE_MAX_KPA = 115.0
 """Upper end of the specified range, 50 to 115 kPa: the full scale of Pcomp (DS eq. 2)."""
 
 COUNTS_MAX = 1023
+
+CONVERSION_TYPICAL_NS = 1_600_000
+CONVERSION_MAX_NS = 3_000_000
+"""DS table 10."""
 
 TADC_PER_KELVIN = -5.35
 """Counts of `tadc` per kelvin (Linux' mpl115 driver, Freescale's answer; hardware.md 1.3)."""
@@ -132,8 +142,16 @@ class Mpl115a2:
         self._point_at_coefficients = i2c_msg.write(address, [REGISTER_COEFFICIENTS])
         self._coefficients = i2c_msg.read(address, 8)
 
-    def start_up(self) -> None:
+    def start_up(self, settings: Registers) -> None:
         """Return at once: a part works as soon as it has its supply."""
+
+    def is_set_up_as(self, registers: Registers, settings: Registers) -> bool:
+        """Return whether the registers are a part's own."""
+        return self.read_registers() == registers
+
+    def has_new_counts(self) -> bool:
+        """Return True: the chip cannot tell."""
+        return True
 
     def start_conversion(self) -> None:
         """Start one conversion of pressure and temperature in every connected part."""
@@ -153,6 +171,14 @@ class Mpl115a2:
         self._bus.transfer(self._point_at_counts, self._padc)
         padc = int.from_bytes(bytes(self._padc), "big") >> 6
         return None if padc in (0, COUNTS_MAX) else padc
+
+    def read_new_pressures(self, at_once: int) -> list[int]:
+        """Return none: no part runs freely."""
+        return []
+
+    def read_temperature(self) -> int:
+        """Read `tadc`, behind `padc`."""
+        return self.read_counts()[1]
 
     def classify_counts(self, padc: int, tadc: int) -> int:
         """Return the tile flag of counts that no working part gives; 0 if they are possible."""
@@ -194,6 +220,16 @@ class Mpl115a2:
         return registers
 
 
+def _refuse_settings(settings: ChipSettings) -> Registers:
+    if settings not in (ChipSettings(), ChipSettings(mode="forced")):
+        raise UsageError(
+            f"oversampling = {settings.oversampling}, filter = {settings.filter}, mode = "
+            f"{settings.mode}",
+            expected="none of these keys: an mpl115a2 has no settings, and converts on command",
+        )
+    return ()
+
+
 MPL115A2 = PressureChip(
     name="mpl115a2",
     addresses=(ADDRESS,),
@@ -206,19 +242,21 @@ MPL115A2 = PressureChip(
     # Within some 5 K: the data sheet states no scale (hardware.md 1.3).
     temperature_raw_at_25_degc=472.0,
     temperature_raw_usual=500.0,
-    conversion_typical_ns=1_600_000,
-    conversion_max_ns=3_000_000,  # DS table 10
-    # Pressure is sampled in the first part of a conversion (DS table 7); a quarter is assumed, as
-    # the instant is not stated (hardware.md 1.4).
-    sample_delay_divisor=4,
-    pressure_bytes=2,
-    counts_bytes=4,
+    bytes_per_conversion=0,
+    has_status=False,
     readable_register=REGISTER_COEFFICIENTS,
     # 1.7 % of a healthy part's readings are so far off (noise 0.165 kPa with outliers, hardware.md
     # 1.3), and none is beyond the second.
     jump_kpa=0.5,
     far_jump_kpa=1.5,
     jump_temperature_counts=5,  # a kelvin (hardware.md 8)
+    encode_settings=_refuse_settings,
+    is_free_running=lambda _: False,
+    compute_read_bytes=lambda _: ((2,), (4,)),
+    compute_conversion_ns=lambda _: (CONVERSION_TYPICAL_NS, CONVERSION_MAX_NS),
+    # Pressure is sampled in the first part of a conversion (DS table 7); a quarter is assumed, as
+    # the instant is not stated (hardware.md 1.4).
+    compute_sample_delay_ns=lambda _, conversion_ns: conversion_ns // 4,
     make_law=lambda registers: Coefficients.from_words(registers).make_law(),
     make_driver=Mpl115a2,
 )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,17 @@ Registers = tuple[int, ...]
 """Words that a part is identified by; opaque to all but its driver."""
 Counts = tuple[int, int]
 """Counts of pressure and temperature."""
+
+
+class ChipSettings(NamedTuple):
+    """Settings of a chip in a scene."""
+
+    oversampling: int = 1
+    """Number of samples of the pressure in a conversion."""
+    filter: int = 0
+    """Coefficient of the chip's own low-pass; 0: none."""
+    mode: Literal["continuous", "forced"] | None = None
+    """Conversions that the part starts by itself, or on command; None: as is usual for the chip."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +80,12 @@ class ChipDriver(Protocol):
     Every method may raise `I2cError`.
     """
 
-    def start_up(self) -> None:
-        """Prepare a part after power-up."""
+    def start_up(self, settings: Registers) -> None:
+        """Prepare a part after power-up.
+
+        Raises:
+            TileSetupError: it does not take its settings.
+        """
 
     def identify(self, *, where: str) -> Registers:
         """Read a part's registers repeatedly, check them, and return them.
@@ -82,14 +97,30 @@ class ChipDriver(Protocol):
     def read_registers(self) -> Registers:
         """Read a part's registers once, without a check."""
 
+    def is_set_up_as(self, registers: Registers, settings: Registers) -> bool:
+        """Return whether a quick look at a part finds these; it goes on converting."""
+
     def start_conversion(self) -> None:
         """Start one conversion of pressure and temperature in every connected part."""
+
+    def has_new_counts(self) -> bool:
+        """Return whether a conversion has ended since the last call; always without a status."""
 
     def read_counts(self) -> Counts:
         """Read the counts of the last finished conversion."""
 
     def read_pressure(self) -> int | None:
         """Read the pressure counts alone, which saves bus time; None if they prove nothing."""
+
+    def read_new_pressures(self, at_once: int) -> list[int]:
+        """Read the pressure of each conversion of a free-running part since the last call.
+
+        Args:
+            at_once: pressures of one transfer; one that is full is followed by another.
+        """
+
+    def read_temperature(self) -> int:
+        """Read the temperature counts of the last finished conversion alone."""
 
     def classify_counts(self, pressure_raw: int, temperature_raw: int) -> int:
         """Return the tile flag of counts just read that no working part gives; 0 for others."""
@@ -111,16 +142,21 @@ class PressureChip:
         temperature_raw_at_25_degc: temperature counts at 25 degC; an estimate where the chip is not
             calibrated for it.
         temperature_raw_usual: temperature counts of a foot in use.
-        conversion_typical_ns: typical time of a conversion.
-        conversion_max_ns: longest time, for a part that is not measured.
-        sample_delay_divisor: conversion time over the delay from its start to the sample instant.
-        pressure_bytes: bytes of a read of the pressure alone.
-        counts_bytes: bytes of a read of pressure and temperature.
+        has_status: True if the chip tells whether a conversion has ended.
         readable_register: first of twelve registers whose reading changes nothing.
         jump_kpa: distance from the median of the last three readings above which a healthy part's
             reading is rare, so that it is read again.
         far_jump_kpa: distance beyond any outlier of a healthy part: its identity is verified.
         jump_temperature_counts: change from frame to frame that no healthy part shows.
+        encode_settings: encodes a scene's settings of a tile for the driver; raises `UsageError`.
+        is_free_running: returns whether a part with these settings starts conversions by itself.
+        compute_read_bytes: computes the bytes of each read of a sample from settings: of the
+            pressure alone, and with the temperature.
+        bytes_per_conversion: bytes of each further conversion that a free-running part has stored.
+        compute_conversion_ns: computes the typical and the longest time of a conversion from
+            settings.
+        compute_sample_delay_ns: computes the delay from the begin of a conversion to its sample
+            instant, from settings and measured time.
         make_law: makes a part's law from its registers.
         make_driver: makes the driver of the parts at an address of a bus.
     """
@@ -135,15 +171,17 @@ class PressureChip:
     counts_per_kelvin: float
     temperature_raw_at_25_degc: float
     temperature_raw_usual: float
-    conversion_typical_ns: int
-    conversion_max_ns: int
-    sample_delay_divisor: int
-    pressure_bytes: int
-    counts_bytes: int
+    bytes_per_conversion: int
+    has_status: bool
     readable_register: int
     jump_kpa: float
     far_jump_kpa: float
     jump_temperature_counts: int
+    encode_settings: Callable[[ChipSettings], Registers]
+    is_free_running: Callable[[Registers], bool]
+    compute_read_bytes: Callable[[Registers], tuple[tuple[int, ...], tuple[int, ...]]]
+    compute_conversion_ns: Callable[[Registers], tuple[int, int]]
+    compute_sample_delay_ns: Callable[[Registers, int], int]
     make_law: Callable[[Registers], PressureLaw]
     make_driver: Callable[[I2cBus, int], ChipDriver]
 

@@ -7,8 +7,10 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from devices.chips.dynamixel.protocol import FIRMWARES
+from devices.chips.pressure_chip import ChipSettings, Registers
 from devices.chips.pressure_chips import PRESSURE_CHIPS
 from devices.chips.tca9548a import ADDRESSES, CHANNELS
+from devices.errors import UsageError
 from devices.types import Identifier
 
 # A quantity beyond a million is a typing error or a wrong unit.
@@ -73,6 +75,22 @@ class TileSection(SceneSection):
     address: int | None = None
     """Its I2C address; absent: the usual one of its kind."""
 
+    oversampling: int = 1
+    """Number of samples that the chip takes of a pressure; more are less noisy and slower."""
+    filter: int = 0
+    """Coefficient of the chip's own low-pass; 0: none, as the estimator filters better."""
+    mode: Literal["continuous", "forced"] | None = None
+    """Conversions that the chip starts by itself, or on command; absent: as is usual for it."""
+
+    @property
+    def chip_settings(self) -> Registers:
+        """Its chip's settings, as its driver writes them."""
+        return PRESSURE_CHIPS[self.chip].encode_settings(self._settings)
+
+    @property
+    def _settings(self) -> ChipSettings:
+        return ChipSettings(self.oversampling, self.filter, self.mode)
+
     @property
     def chip_address(self) -> int:
         """I2C address of its chip."""
@@ -86,11 +104,15 @@ class TileSection(SceneSection):
         return chip
 
     @model_validator(mode="after")
-    def _address_is_the_chips(self) -> Self:
+    def _address_and_settings_are_the_chips(self) -> Self:
         addresses = PRESSURE_CHIPS[self.chip].addresses
         if self.chip_address not in addresses:
             known = ", ".join(f"0x{address:02x}" for address in addresses)
             raise ValueError(f"address 0x{self.chip_address:02x} is none of {self.chip}: {known}")
+        try:
+            PRESSURE_CHIPS[self.chip].encode_settings(self._settings)
+        except UsageError as error:
+            raise ValueError(str(error)) from error
         return self
 
     @field_validator("mux")

@@ -111,12 +111,21 @@ def list_builtin_scenes() -> tuple[str, ...]:
     return tuple(sorted(f.name.removesuffix(".toml") for f in folder.iterdir() if f.is_file()))
 
 
-def load_scene(name_or_path: str) -> Scene:
+def load_scene(name_or_path: str, chip: str | None = None) -> Scene:
     """Read a built-in scene by its name, or a scene file by its path.
+
+    Args:
+        name_or_path: name or path.
+        chip: kind of pressure chip of all tiles, instead of the scene's.
 
     Raises:
         SceneError: no such scene or file, not TOML, an unknown key, a wrong type, a contradiction.
     """
+    scene = _read_scene(name_or_path)
+    return scene if chip is None else replace_chips(scene, chip)
+
+
+def _read_scene(name_or_path: str) -> Scene:
     if name_or_path in list_builtin_scenes():
         folder = resources.files("devices.scene") / "builtin"
         text = (folder / f"{name_or_path}.toml").read_text("utf-8")
@@ -131,6 +140,22 @@ def load_scene(name_or_path: str) -> Scene:
     except (OSError, ValueError) as error:
         raise SceneError(f"scene {name_or_path!r} cannot be read: {error}") from error
     return parse_scene(text, where=name_or_path)
+
+
+def replace_chips(scene: Scene, chip: str) -> Scene:
+    """Return the scene with another kind of pressure chip in all tiles, at its usual address.
+
+    Beside a reference sensor the tiles convert on command, all at once.
+
+    Raises:
+        SceneError: there is no such kind, or two tiles would have one address.
+    """
+    content = scene.model_dump()
+    changed = {"chip": chip, "address": None, "oversampling": 1, "filter": 0, "mode": None}
+    if scene.reference is not None:
+        changed["mode"] = "forced"
+    content["tile"] = [tile | changed for tile in content["tile"]]
+    return validate_scene(content, where=f"scene {scene.name} with {chip}")
 
 
 def parse_scene(text: str, *, where: str) -> Scene:

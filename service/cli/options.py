@@ -42,6 +42,9 @@ UnquantizedOption = Annotated[
     bool,
     typer.Option("--no-quantize", help="Keep estimates as computed: do not round off their noise."),
 ]
+ChipOption = Annotated[
+    str | None, typer.Option(help="Kind of pressure chip in all tiles; default: the scene's.")
+]
 EstimatorOption = Annotated[
     str,
     typer.Option(
@@ -359,14 +362,16 @@ def check_emulated(scene: Scene) -> None:
         )
 
 
-def load_adapted_scene(name: str, *, bus: str | None, servo: str | None) -> Scene:
-    """Load a scene and replace its bus, or the port of its servo.
+def load_adapted_scene(
+    name: str, *, bus: str | None, servo: str | None, chip: str | None = None
+) -> Scene:
+    """Load a scene and replace its bus, the port of its servo, or its pressure chips.
 
     Raises:
         SceneError: no such scene.
         UsageError: the scene has no servo.
     """
-    scene = load_scene(name)
+    scene = load_scene(name, chip)
     if bus is not None:
         scene = scene.model_copy(update={"array": scene.array.model_copy(update={"bus": bus})})
     if servo == "none":

@@ -11,9 +11,10 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 
 from devices.errors import (
     CalibrationError,
@@ -24,7 +25,7 @@ from devices.errors import (
     require_extra,
 )
 from devices.scene.emulation_sections import PartFamily
-from devices.scene.scene_file import Scene, load_scene, validate_scene
+from devices.scene.scene_file import Scene, load_scene, replace_chips, validate_scene
 from service.estimation.calibration import PRESETS, UNPROVEN_SUFFIX, Calibration
 from service.estimation.effects import Parameter
 from service.rig.emulated_foot import EmulatedFoot, RigOptions
@@ -51,6 +52,7 @@ def find_calibration(
     name: str,
     serials: Sequence[str],
     *,
+    chips: Mapping[str, str] = MappingProxyType({}),
     parts_seed: int = 0,
     family: PartFamily = "default",
     repeatability: float | None = None,
@@ -62,6 +64,7 @@ def find_calibration(
     Args:
         name: "emulated-rig", a preset's name, or the path of a file.
         serials: tiles that it must cover.
+        chips: kinds of chip on the emulated rig, by serial; default: MPL115A2.
         parts_seed: seed of the parts on the emulated rig.
         family: family of these parts.
         repeatability: standard deviation between their loadings; None: that of the rig's scene.
@@ -73,7 +76,10 @@ def find_calibration(
     """
     if name == EMULATED_RIG:
         folder = cache_folder if cache_folder is not None else _cache_folder()
-        scenes = [make_rig_scene(serial, family, repeatability) for serial in serials]
+        scenes = [
+            make_rig_scene(serial, family, repeatability, chip=chips.get(serial))
+            for serial in serials
+        ]
         entries = [_calibrate_on_rig(scene, parts_seed, folder, on_progress) for scene in scenes]
         return Calibration(
             name=EMULATED_RIG,
@@ -118,7 +124,9 @@ def _calibrate_on_rig(
 ) -> Calibration:
     serial = scene.tile[0].serial
     # The name contains version and rig scene, because the result depends on both.
-    made_by = hashlib.sha256(f"{SOFTWARE_VERSION}/{parts_seed}/{scene.model_dump_json()}".encode())
+    made_by = hashlib.sha256(
+        f"{SOFTWARE_VERSION}/{parts_seed}/{scene.model_dump_json(exclude_defaults=True)}".encode()
+    )
     name = f"{serial}-{made_by.hexdigest()[:16]}.json"
     kept = folder / name if folder is not None else None
     if kept is not None and (found := _read_cached(kept, serial, progress)) is not None:
@@ -178,10 +186,16 @@ def _read_cached(kept: Path, serial: str, progress: ProgressCallback) -> Calibra
 
 
 def make_rig_scene(
-    serial: str, family: PartFamily = "default", repeatability: float | None = None
+    serial: str,
+    family: PartFamily = "default",
+    repeatability: float | None = None,
+    *,
+    chip: str | None = None,
 ) -> Scene:
-    """Build the indenter scene with one tile."""
+    """Build the indenter scene with one tile; `chip` None: the usual one."""
     scene = replace_tiles(load_scene("indentation"), [serial])
+    if chip is not None and chip != scene.tile[0].chip:
+        scene = replace_chips(scene, chip)
     requested: dict[str, object] = {"family": family}
     if repeatability is not None:
         requested["repeatability"] = repeatability
@@ -226,6 +240,7 @@ def find_scene_calibration(
         calibration = find_calibration(
             scene.calibration,
             [tile.serial for tile in scene.tile if not tile.reference],
+            chips={tile.serial: tile.chip for tile in scene.tile},
             parts_seed=options.foot.parts_seed,
             family=scene.emulation.family,
             on_progress=on_progress,

@@ -26,6 +26,7 @@ from devices.buses.device_files import find_programs_using
 from devices.buses.i2c import I2cBus, RetryingBus
 from devices.buses.serial_line import check_latency_timer, find_stable_path, read_latency_timer_ms
 from devices.chips.dynamixel.servo_setup import BAUDRATES, FoundServo, find_servos
+from devices.chips.pressure_chip import ChipSettings
 from devices.chips.pressure_chips import get_chip
 from devices.clock import Clock
 from devices.errors import I2cError, ServoSetupError
@@ -187,6 +188,8 @@ def _match_tiles(
 
 def _make_tile_info(finding: TileFinding) -> TileInfo:
     assert finding.registers is not None  # noqa: S101  # without a problem there are some
+    chip = get_chip(finding.chip)
+    settings = chip.encode_settings(ChipSettings())
     return TileInfo(
         serial=finding.serial or f"0x{finding.mux:02x}.{finding.channel}",
         mux=finding.mux,
@@ -198,7 +201,8 @@ def _make_tile_info(finding: TileFinding) -> TileInfo:
         y_m=0.0,
         z_m=0.0,
         reference=False,
-        conversion_ms=get_chip(finding.chip).conversion_typical_ns / 1e6,
+        settings=settings,
+        conversion_ms=chip.compute_conversion_ns(settings)[0] / 1e6,
     )
 
 

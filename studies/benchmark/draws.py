@@ -294,6 +294,7 @@ def record_draw(scene: Scene, seconds: float | None, draw: int) -> DrawRecording
     calibration = find_calibration(
         scene.calibration,
         [tile.serial for tile in scene.tile if not tile.reference],
+        chips={tile.serial: tile.chip for tile in scene.tile},
         parts_seed=draw,
         family=scene.emulation.family,
     )

@@ -95,7 +95,9 @@ class Witness:
         pressure_raw, temperature_raw = np.zeros(shape), np.zeros(shape)
         own = np.zeros(shape, dtype=np.bool_)
         for i, tile in enumerate(tiles):
-            delay_ns = round(tile.conversion_ms * 1e6) // MPL115A2.sample_delay_divisor
+            delay_ns = MPL115A2.compute_sample_delay_ns(
+                tile.settings, round(tile.conversion_ms * 1e6)
+            )
             asked_ns = frames.t_mono_ns + frames.sample_offset_us[:, i] * 1000 - delay_ns
             stops_ns, words, chips = self._stops_ns[i], self._words[i], self._chips[i]
             for row, stop_ns in enumerate(asked_ns.tolist()):

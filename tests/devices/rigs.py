@@ -11,7 +11,7 @@ import pytest
 from smbus2 import i2c_msg
 
 from devices.array.bus_recovery import BusRecovery
-from devices.array.schedules import BusTiming
+from devices.array.schedules import BusTiming, count_read_bits
 from devices.array.tile import Scan
 from devices.array.tile_array import TileArray
 from devices.buses.i2c import I2cBus
@@ -209,7 +209,7 @@ def array_on(
         wires.scl_hz,
         tuple(wait_ns * 1e-9 for wait_ns in waits_ns or wires.tc_ns),
         tuple(mux for mux, _ in wires.plugs),
-        bytes_per_read=2.0 + 2.0 / temperature_every,
+        read_bits=count_read_bits(2.0 + 2.0 / temperature_every),
     )
     return TileArray(
         wires.bus,

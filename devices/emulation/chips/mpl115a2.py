@@ -18,7 +18,7 @@ import numpy as np
 
 from devices.chips.mpl115a2 import (
     ADDRESS,
-    MPL115A2,
+    CONVERSION_MAX_NS,
     PRESSURE_MAX_KPA,
     PRESSURE_MIN_KPA,
     Coefficients,
@@ -290,7 +290,7 @@ def draw_chip(serial: str, parts_seed: int) -> ChipProperties:
             break
     return ChipProperties(
         coefficients=coefficients,
-        conversion_ns=min(MPL115A2.conversion_max_ns, round(rng.uniform(1.4e6, 2.0e6))),
+        conversion_ns=min(CONVERSION_MAX_NS, round(rng.uniform(1.4e6, 2.0e6))),
         tadc_at_25_degc=rng.uniform(472, 498),  # two published scales, 26 counts apart
     )
 

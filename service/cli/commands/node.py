@@ -16,6 +16,7 @@ from devices.errors import StorageError, UsageError
 from devices.types import check_user_name
 from service.cli.options import (
     CaOption,
+    ChipOption,
     FootOptions,
     add_options,
     create_stop_event,
@@ -56,6 +57,7 @@ def node_command(
         typer.Option(help="Record a local session of this name, without a server."),
     ] = None,
     ca: CaOption = None,
+    chip: ChipOption = None,
     end_with_parent: Annotated[
         bool, typer.Option("--end-with-parent", hidden=True, help="End with the parent process.")
     ] = False,
@@ -103,7 +105,7 @@ def node_command(
             check_user_name(record)
         except ValueError as error:
             raise UsageError(f"--record {record!r} {error}", expected="one line of text") from error
-    the_scene = load_adapted_scene(scene, bus=bus, servo=servo)
+    the_scene = load_adapted_scene(scene, bus=bus, servo=servo, chip=chip)
     rig = RigOptions(the_scene, _choose_name(name), options.make_foot(the_scene))
     calibration, problem = find_scene_calibration(rig, remark)
     with suppress(StorageError):  # an unwritable card is reported later

@@ -23,6 +23,7 @@ from service.cli.commands.sessions import SERVER, ServerOption
 from service.cli.options import (
     SECONDS_MAX,
     CaOption,
+    ChipOption,
     FootOptions,
     JsonOption,
     add_options,
@@ -215,6 +216,7 @@ _STOP_TIMEOUT_S = 8.0
 @add_options
 def demo_command(
     scene: Annotated[str, typer.Option(help="Built-in scene, or a scene file.")] = "rolling",
+    chip: ChipOption = None,
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port; 0: any.")] = 8000,
     advertise: AdvertiseOption = None,
@@ -240,11 +242,13 @@ def demo_command(
     from service.rig.emulated_foot import RigOptions
 
     raise_open_files_limit()
-    the_scene = load_adapted_scene(scene, bus=None, servo=None)
+    the_scene = load_adapted_scene(scene, bus=None, servo=None, chip=chip)
     check_emulated(the_scene)
     # Fills the cache for the node.
     find_scene_calibration(RigOptions(the_scene, NODE, options.make_foot(the_scene)), remark)
     arguments = [f"--scene={scene}", *options.to_arguments()]
+    if chip is not None:
+        arguments.append(f"--chip={chip}")
     folder = resolve_data_folder(data)
     if data is None:
         folder /= "demo"

@@ -11,6 +11,7 @@ from devices.errors import UsageError, require_extra
 from devices.scene.hardware_sections import AnySchedule, ScheduleName
 from devices.scene.scene_file import load_scene
 from service.cli.options import (
+    ChipOption,
     FootOptions,
     JsonOption,
     UnquantizedOption,
@@ -51,6 +52,7 @@ def simulate_command(
     truth: Annotated[
         bool, typer.Option("--truth", help="Add the true_* columns and print the error.")
     ] = False,
+    chip: ChipOption = None,
     no_estimates: Annotated[bool, typer.Option("--no-estimates", help="Raw frames only.")] = False,
     unquantized: UnquantizedOption = False,
     as_json: JsonOption = False,
@@ -70,7 +72,7 @@ def simulate_command(
     from service.rig.emulated_foot import make_injected_path
     from service.sessions.estimate_stream import EstimateOptions
 
-    the_scene = load_scene(scene)
+    the_scene = load_scene(scene, chip)
     if tiles is not None:
         if the_scene.ground.kind != "indentation":
             raise UsageError("--tiles needs an indenter", expected="a scene with an indentation")
@@ -91,6 +93,7 @@ def simulate_command(
         calibration = find_calibration(
             the_scene.calibration,
             [tile.serial for tile in the_scene.tile if not tile.reference],
+            chips={tile.serial: tile.chip for tile in the_scene.tile},
             parts_seed=foot.parts_seed,
             family=the_scene.emulation.family,
             on_progress=remark,

@@ -14,6 +14,7 @@ from devices.scene.emulation_sections import PartFamily
 from devices.scene.scene_file import load_scene
 from service.cli.options import (
     SEED_MAX,
+    ChipOption,
     EstimatorOption,
     JsonOption,
     check_emulated,
@@ -210,6 +211,7 @@ def benchmark_command(
             "set constants of the estimator."
         ),
     ] = "development",
+    chip: ChipOption = None,
     check_goals: Annotated[
         bool, typer.Option("--check-goals", help="Exit code 3 if a goal is not met.")
     ] = False,
@@ -229,6 +231,7 @@ def benchmark_command(
             "--seconds": seconds,
             "--frames": frames,
             "--correlated-ms": correlated_ms,
+            "--chip": chip,
             "--full-only": full_only or None,
             "--estimator": None if estimator == "models" else estimator,
         },
@@ -249,7 +252,7 @@ def benchmark_command(
     from studies.benchmark.run import BenchmarkOptions, run_benchmark
     from studies.estimators import get_estimator
 
-    scenes = tuple(load_scene(name) for name in scene or SCENES)
+    scenes = tuple(load_scene(name, chip) for name in scene or SCENES)
     names = [the_scene.name for the_scene in scenes]
     if len(set(names)) < len(names):
         raise UsageError(f"scenes {', '.join(names)}", expected="each scene once")

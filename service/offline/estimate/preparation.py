@@ -271,6 +271,7 @@ def _find_calibration(
     return find_calibration(
         name,
         serials,
+        chips={tile.serial: tile.chip for tile in session.info.tiles},
         parts_seed=int(notes.get("parts_seed", 0)),
         family=_read_family(notes),
         on_progress=remark,

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from smbus2 import i2c_msg
 
-from devices.array.schedules import BusTiming, compute_frame_s
+from devices.array.schedules import BusTiming, compute_frame_s, count_read_bits
 from devices.scene.hardware_sections import ScheduleName
 from tests.devices.rigs import (
     CONVERT,
@@ -46,7 +46,8 @@ def compute_predicted_ns(
 ) -> float:
     """Return the length by the bus budget, which the tables of hardware.md 4 test."""
     muxes = tuple(mux for mux, _ in plugs)
-    timing = BusTiming(scl_hz, (tc_ns * 1e-9,) * len(plugs), muxes, bytes_per_read=read_bytes)
+    read_bits = count_read_bits(read_bytes)
+    timing = BusTiming(scl_hz, (tc_ns * 1e-9,) * len(plugs), muxes, read_bits=read_bits)
     return compute_frame_s(schedule, timing) * 1e9
 
 

@@ -36,7 +36,7 @@ def timing(
         scl_hz,
         (tc_ms * 1e-3,) * tiles,
         tuple(mux for mux, _ in full(tiles)),
-        bytes_read,
+        count_read_bits(bytes_read),
         transaction_us * 1e-6,
         sleep_us * 1e-6,
     )
