@@ -11,13 +11,14 @@ import numpy.typing as npt
 from pydantic import AfterValidator
 
 from devices.arrays import Floats
+from devices.chips.bmp581 import BMP581
 from devices.chips.mpl115a2 import MPL115A2
 from devices.chips.pressure_chip import PressureChip, PressureLaw
 from devices.errors import UsageError
 from devices.flags import TileFlag
 from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileInfo
 
-PRESSURE_CHIPS: dict[str, PressureChip] = {chip.name: chip for chip in (MPL115A2,)}
+PRESSURE_CHIPS: dict[str, PressureChip] = {chip.name: chip for chip in (MPL115A2, BMP581)}
 """Every kind, by its name."""
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from devices.arrays import Floats, Times
 from devices.chips.dynamixel.protocol import COUNTS_PER_TURN
 from devices.clock import Clock
-from devices.emulation.chips import mpl115a2
+from devices.emulation.chips import bmp581, mpl115a2
 from devices.emulation.chips.dynamixel import EmulatedServo
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.dome_physics import Domes
@@ -56,7 +56,10 @@ class ChipMaker(Protocol):
         """Make the chip; `make_site` makes the site of its serial, or of a spare part's."""
 
 
-CHIP_MAKERS: dict[str, ChipMaker] = {"mpl115a2": mpl115a2.make_chip}
+CHIP_MAKERS: dict[str, ChipMaker] = {
+    "mpl115a2": mpl115a2.make_chip,
+    "bmp581": bmp581.make_chip,
+}
 """Emulation of every kind of pressure chip."""
 
 DomeEffect = Literal["gas", "rubber", "hysteresis", "surroundings"]
