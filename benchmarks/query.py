@@ -22,7 +22,7 @@ from side_by_side import in_turns, note, spread, table
 
 from service.estimation.calibration import make_paper_shape_preset
 from service.offline.archive.query import find_sessions, run_query
-from service.sessions.sealing import seal_session
+from service.sessions.sealing import write_sealed_files
 from storage.journal.journal import Journal
 from storage.sessions.folder import FRAMES_NAME, Session, SessionsFolder
 from storage.sessions.ledger import StreamState, compute_ledger
@@ -52,7 +52,7 @@ def sealed(recording: Recording, folder: SessionsFolder, session_id: str, work: 
     held = {journal.info.stream_id: StreamState(stored=journal.stored)}
     ledger = compute_ledger(sources.session.parts, held, has_all_parts=True)
     folder.save_session_json(sources.session)
-    done = seal_session(sources, folder.get_path(session_id), ledger)
+    done = write_sealed_files(sources, folder.get_path(session_id), ledger)
     assert done.problem is None, done.problem
     folder.save_session_json(done)
     return done

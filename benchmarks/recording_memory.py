@@ -91,7 +91,7 @@ def generate(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
 def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
     from service.offline.calibration_lookup import find_calibration
     from service.sessions.inputs import SessionInputs
-    from service.sessions.sealing import seal_session
+    from service.sessions.sealing import write_sealed_files
     from storage.journal.journal import Journal
     from storage.parquet_hash import fill_hash_placeholders_and_sync
     from storage.sessions import writer as session_file
@@ -141,7 +141,7 @@ def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
     sessions = SessionsFolder(folder / "sessions")
     sessions.save_session_json(session)
     begin = time.perf_counter()
-    sealed = seal_session(sources, sessions.get_path(SESSION_ID), ledger)
+    sealed = write_sealed_files(sources, sessions.get_path(SESSION_ID), ledger)
     seal_s = time.perf_counter() - begin
     sessions.save_session_json(sealed)
     return {

@@ -248,11 +248,11 @@ class Scan:
         self.tile_flags[tile] |= status
 
 
-STALE_EVIDENCE = 20
-"""Evidence from which a tile is stale. A reading equal to the previous one counts two, or one if
-only the pressure was read. One in nine readings of a healthy MPL115A2, and fewer of a finer chip,
-equals its neighbour, so ten in a row occur once in 10^9; with noise that is correlated over 10 ms
-once in 10^6."""
+STALE_SCORE = 20
+"""Score from which a tile is stale: 2 for each reading equal to the previous one, 1 if only the
+pressure was read; 0 after another one. One in nine readings of a healthy MPL115A2, and fewer of a
+finer chip, equals its neighbour, so ten in a row occur once in 10^9; with noise that is correlated
+over 10 ms once in 10^6."""
 
 _TRIAL_EVERY = 2048  # every two seconds at 500 frames a second
 _TEMPERATURE_MAX_NS = 500_000_000  # half the hold of `devices.frames`
@@ -284,7 +284,7 @@ class TileHealth:
         self._temperature_raw: int | None = None
         self._temperature_ns = 0
         self._last_counts = (NOT_READ, NOT_READ)
-        self._stale_evidence = 0
+        self._stale_score = 0
         self._probe_due_ns = 0
         self._probe_wait_ns = 0
 
@@ -305,7 +305,7 @@ class TileHealth:
         self._probe_wait_ns = _FIRST_PROBE_NS
         self._recent.clear()
         self._temperature_raw = None
-        self._stale_evidence = 0
+        self._stale_score = 0
 
     def is_probe_due(self, now_ns: int) -> bool:
         """Return whether the next probe of a lost tile is due."""
@@ -349,16 +349,16 @@ class TileHealth:
             self._temperature_ns = now_ns
 
     def update_staleness(self, pressure_raw: int, temperature_raw: int) -> bool:
-        """Update the evidence with a frame's reading; return whether the tile is stale."""
+        """Update the score with a frame's reading; return whether the tile is stale."""
         if pressure_raw == NOT_READ:
             return False
         same = pressure_raw == self._last_counts[0] and (
             temperature_raw == NOT_READ or self._last_counts[1] in (temperature_raw, NOT_READ)
         )
         if same:
-            self._stale_evidence += 1 if temperature_raw == NOT_READ else 2
+            self._stale_score += 1 if temperature_raw == NOT_READ else 2
         else:
-            self._stale_evidence = 0
+            self._stale_score = 0
         self._last_counts = (
             pressure_raw,
             self._last_counts[1] if same and temperature_raw == NOT_READ else temperature_raw,
@@ -368,12 +368,12 @@ class TileHealth:
     @property
     def has_stale_readings(self) -> bool:
         """True if the readings are stale."""
-        return self._stale_evidence >= STALE_EVIDENCE
+        return self._stale_score >= STALE_SCORE
 
     @property
     def is_trial_due(self) -> bool:
         """True if the conversion time of a stale tile should be tested: at first, then at times."""
-        return 0 <= (self._stale_evidence - STALE_EVIDENCE) % _TRIAL_EVERY < 2
+        return 0 <= (self._stale_score - STALE_SCORE) % _TRIAL_EVERY < 2
 
     def _median(self) -> int:
         return sorted(self._recent)[_RECENT // 2]

@@ -16,7 +16,7 @@ from devices.clock import server_utc_ns
 from devices.errors import FootTileError, StorageError
 from service.estimation.calibration import Calibration
 from service.sessions.lifecycle import (
-    NodeChange,
+    Reevaluate,
     Resume,
     Sealed,
     Stop,
@@ -105,7 +105,7 @@ class LocalRecording:
         else:
             ids = session.parts[-1].stream_id, stream.stream_id
             facts = replace(self._make_facts(), stream_ids=ids, scene=stream.info.scene)
-            step = apply_event(session, NodeChange(), facts)
+            step = apply_event(session, Reevaluate(), facts)
             session = step.session
             for continuation in step.continuations:
                 self._report(f"other tiles: session {session.id} ends, and another one begins")
@@ -167,15 +167,15 @@ class LocalRecording:
     def _seal(self, session: Session) -> Session:
         # Imported here, because scipy would delay a node's first frame.
         from service.sessions.inputs import make_inputs
-        from service.sessions.sealing import seal_session
+        from service.sessions.sealing import write_sealed_files
 
         facts = replace(self._make_facts(), frames_to_come="none")
-        session = apply_event(session, NodeChange(), facts).session
+        session = apply_event(session, Reevaluate(), facts).session
         self._folder.save_session_json(session)
         folder = self._folder.get_path(session.id)
         remove_dead_process_temporaries(folder)
         sources = make_inputs(session, facts, load_tares=None, emulated=self._emulated)
-        sealed = seal_session(sources, folder, compute_present_ledger(session, facts))
+        sealed = write_sealed_files(sources, folder, compute_present_ledger(session, facts))
         sealed = apply_event(session, Sealed(sealed)).session
         self._folder.save_session_json(sealed)
         return sealed

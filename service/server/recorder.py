@@ -26,7 +26,7 @@ from service.sessions.lifecycle import (
     Abandon,
     Delete,
     Event,
-    NodeChange,
+    Reevaluate,
     Sealed,
     Step,
     Stop,
@@ -37,7 +37,7 @@ from service.sessions.lifecycle import (
     iterate_needed_parts,
 )
 from service.sessions.parts import NodeFacts, find_first_seq
-from service.sessions.sealing import seal_session
+from service.sessions.sealing import write_sealed_files
 from storage.intervals import NO_END, Intervals, to_open_pairs
 from storage.sessions.folder import IdempotencyRecord, Ledger, Part, Session
 from storage.sessions.ledger import group_numbers_by_stream
@@ -216,7 +216,7 @@ class Recorder:
         for session in self._store.list_unsealed(node.name):
             # The ends of the others are known: with a full disk, saving them can wait.
             if session.state != "sealing" and session.parts[-1].seq_last is None:
-                self._apply_node_change(session)
+                self._reevaluate_session(session)
 
     def advance_unsealed_sessions(self) -> None:
         """Find the ends of stopped sessions, and start to seal those whose frames are all here."""
@@ -422,10 +422,10 @@ class Recorder:
                 self._store.save(each)
         return step
 
-    def _apply_node_change(self, session: Session) -> Step:
-        """Apply any change of the node; frames that are damaged are requested again."""
+    def _reevaluate_session(self, session: Session) -> Step:
+        """Follow the node's present facts; frames that are damaged are requested again."""
         try:
-            return self._apply(session, NodeChange())
+            return self._apply(session, Reevaluate())
         except DamagedFramesError as error:
             self._invalidate(session, error)
             return Step(session)
@@ -440,7 +440,7 @@ class Recorder:
             self._failures.pop(session.id, None)
         if session.state == "recording":  # changes only at its node's hello
             return
-        if session.state == "sealing" or self._apply_node_change(session).action == "seal":
+        if session.state == "sealing" or self._reevaluate_session(session).action == "seal":
             self._sealing[session.id] = asyncio.create_task(self._seal(session.id))
 
     def _has_unreadable_journal(self, session: Session) -> bool:
@@ -457,12 +457,12 @@ class Recorder:
             session = store.get_session(session_id)
             self._nodes.get(session.node)  # raises if it is unknown: nothing is known of its frames
             # The disk may have lost frames that it had accepted: the node has to send them again.
-            step = self._apply(session, NodeChange())
+            step = self._apply(session, Reevaluate())
             if step.action != "seal":
                 return
             inputs = self.collect_inputs_from_journals(session_id)
             folder, ledger = store.folder.get_path(session_id), self.get_ledger(session_id)
-            sealed = await asyncio.to_thread(seal_session, inputs, folder, ledger)
+            sealed = await asyncio.to_thread(write_sealed_files, inputs, folder, ledger)
             step = apply_event(store.get_session(session_id), Sealed(sealed))
             if step.action == "write_markers":
                 write_markers(step.session, folder)
@@ -471,7 +471,7 @@ class Recorder:
         except DamagedFramesError as error:
             session = store.get_session(session_id)
             self._invalidate(session, error)
-            self._apply(session, NodeChange())
+            self._apply(session, Reevaluate())
         except Exception as error:
             if not isinstance(error, FootTileError):
                 log.exception("session %s: this is a bug", session_id)

@@ -291,7 +291,7 @@ class Server:
         """Send a node's present state to all subscribers; an error is logged."""
         if self.broadcaster.subscriber_count:
             with self._isolate_errors(f"node {node.name}, its view"):
-                self.broadcaster.queue_droppable_notice(NodeChanged(node=self.make_node_view(node)))
+                self.broadcaster.queue_notice(NodeChanged(node=self.make_node_view(node)))
 
     def _update_retention(self, link: NodeLink) -> None:
         """Notify a node if its retention request has changed."""
@@ -339,13 +339,13 @@ class Server:
         if self.broadcaster.subscriber_count:
             with self._isolate_errors(f"session {session.id}, its view"):
                 view = make_session_view(session, self.recorder)
-                self.broadcaster.queue_droppable_notice(SessionChanged(session=view))
+                self.broadcaster.queue_notice(SessionChanged(session=view))
 
     def _send_heartbeat(self) -> None:
         if not self.broadcaster.subscriber_count:
             return
         last = [node.last_seq for node in self.nodes if node.last_seq is not None]
-        self.broadcaster.queue_droppable_notice(
+        self.broadcaster.queue_notice(
             Heartbeat(
                 t_ns=server_utc_ns(),
                 last_seq=max(last, default=None),

@@ -4,7 +4,7 @@ recording -- `Stop` --> pending -- all frames are here --> sealing -- `Sealed` -
 
 | event | recording | pending | sealing | sealed |
 |---|---|---|---|---|
-| `NodeChange` | follows streams, or ends | sealing, or pending | sealing, or pending | same |
+| `Reevaluate` | follows streams, or ends | sealing, or pending | sealing, or pending | same |
 | `Stop` | pending | same | same | same |
 | `Resume` | recording | refused | recording | refused |
 | `Abandon` | refused | sealing, or pending | refused | refused |
@@ -13,7 +13,7 @@ recording -- `Stop` --> pending -- all frames are here --> sealing -- `Sealed` -
 | `Delete` | refused | same | same | same |
 
 Arriving or lost frames, restarts and crashes are no events of their own: the needs of a session
-follow from the present facts of its node (`NodeFacts`), so the next `NodeChange` makes up for a
+follow from the present facts of its node (`NodeFacts`), so the next `Reevaluate` makes up for a
 missed one. The caller saves the sessions of a `Step`, then does its action. Server, node alone and
 recovery call the same function; it has no side effects.
 
@@ -36,10 +36,10 @@ from service.estimation.calibration import Calibration
 from service.sessions.parts import (
     NodeFacts,
     close_at_likely_end,
-    close_at_stop_if_passed,
     close_at_stream_end_or_newest_frame,
     close_part,
     close_unfinished,
+    close_where_stream_passed_stop,
     find_begin_t_ns,
     find_later_streams,
     has_begun_before_stop,
@@ -55,8 +55,8 @@ from storage.sessions.ledger import (
 
 
 @dataclass(frozen=True)
-class NodeChange:
-    """Any change of the node's facts, or none: every caller may send it at any time."""
+class Reevaluate:
+    """New look at the node's facts: every caller may send it at any time."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Sealed:
     """End of sealing: the files are on the disk.
 
     Attributes:
-        session: result of `seal_session`.
+        session: result of `write_sealed_files`.
     """
 
     session: Session
@@ -101,7 +101,7 @@ class Delete:
     """Move to the trash."""
 
 
-Event = NodeChange | Stop | Resume | Abandon | Sealed | Edit | Delete
+Event = Reevaluate | Stop | Resume | Abandon | Sealed | Edit | Delete
 
 _EDITABLE = ("name", "subject", "notes", "tags", "markers")
 
@@ -170,7 +170,7 @@ def apply_event(session: Session, event: Event, node: NodeFacts = _NO_FACTS) -> 
     Args:
         session: the session.
         event: the event.
-        node: present facts of its node; only `NodeChange`, `Stop` and `Abandon` need them.
+        node: present facts of its node; only `Reevaluate`, `Stop` and `Abandon` need them.
 
     Raises:
         StateError: the session's state refuses the event.
@@ -200,9 +200,9 @@ def apply_event(session: Session, event: Event, node: NodeFacts = _NO_FACTS) -> 
                 is_changed=True,
                 action="write_markers" if has_other_markers else None,
             )
-        case "recording" | "pending" | "sealing", NodeChange():
+        case "recording" | "pending" | "sealing", Reevaluate():
             return _update_parts_and_state(session, node)
-        case ("sealed", NodeChange()) | (_, Stop()) | ("pending" | "sealing" | "sealed", Delete()):
+        case ("sealed", Reevaluate()) | (_, Stop()) | ("pending" | "sealing" | "sealed", Delete()):
             return Step(session)
     raise _make_refusal(session, event)
 
@@ -301,7 +301,7 @@ def _follow_once(session: Session, node: NodeFacts) -> list[Session]:
     stream_id = session.parts[-1].stream_id
     if stream_id in node.unreadable and not session.is_abandoned:
         return []
-    closed = close_at_stop_if_passed(session, node, leave_open_while_missing=True)
+    closed = close_where_stream_passed_stop(session, node, leave_open_while_missing=True)
     if closed.parts[-1].seq_last is not None:
         return [closed]
     if stream_id == node.present_id or not node.has_reported:

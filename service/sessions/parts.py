@@ -205,7 +205,7 @@ RATE_MAX_HZ = 1000.0
 """Assumed rate of a stream without a description: no bus is faster."""
 
 
-def close_at_stop_if_passed(
+def close_where_stream_passed_stop(
     session: Session, node: NodeFacts, *, leave_open_while_missing: bool = False
 ) -> Session:
     """Return the session with those open parts closed whose stream has passed the stop.
@@ -234,7 +234,7 @@ def close_at_stop_if_passed(
 def close_at_likely_end(session: Session, node: NodeFacts) -> Session:
     """Return the session closed at its likely end; frames close to the stop may still come."""
     with suppress(FootTileError):  # the frames at the stop are damaged
-        return close_at_stop_if_passed(session, node)
+        return close_where_stream_passed_stop(session, node)
     return session
 
 
@@ -263,7 +263,9 @@ def close_unfinished(session: Session, node: NodeFacts) -> Session:
     Raises:
         DamagedFramesError: the frames at the stop are damaged.
     """
-    session = close_at_stream_end_or_newest_frame(close_at_stop_if_passed(session, node), node)
+    session = close_at_stream_end_or_newest_frame(
+        close_where_stream_passed_stop(session, node), node
+    )
     if session.stopped_t_ns is None:
         last_part = session.parts[-1]
         stream = node.get_stream(session, last_part.stream_id)

@@ -27,7 +27,7 @@ from devices.errors import (
 )
 from service.sessions.inputs import make_inputs
 from service.sessions.lifecycle import (
-    NodeChange,
+    Reevaluate,
     Sealed,
     apply_event,
     compute_present_ledger,
@@ -39,7 +39,7 @@ from service.sessions.parts import (
     SessionStream,
     bound_lost_tail_frames,
 )
-from service.sessions.sealing import rebuild_damaged_session_json, seal_session
+from service.sessions.sealing import rebuild_damaged_session_json, write_sealed_files
 from service.sessions.tares import TareHistory
 from storage.clock.log import ClockLog
 from storage.documents import read_checksummed_json
@@ -354,7 +354,7 @@ def _seal_if_possible(
             load_tares=lambda: TareHistory(data / "nodes" / session.node / "tares.json"),
             emulated=_read_hello_or_empty(data, session.node).get("emulated"),
         )
-        sealed = apply_event(session, Sealed(seal_session(sources, folder, ledger))).session
+        sealed = apply_event(session, Sealed(write_sealed_files(sources, folder, ledger))).session
         problems = verify_session(folder, expected_session=sealed).problems
         if problems:
             return RecoveredSession(session, "failed", "; ".join(problems), ledger)
@@ -370,7 +370,7 @@ def _close_parts_without_damaged_frames(
     """Return the session with its parts closed, as well as they are known."""
     while True:
         try:
-            return apply_event(session, NodeChange(), facts).session
+            return apply_event(session, Reevaluate(), facts).session
         except DamagedFramesError as error:  # at the stop: retry without these frames
             _invalidate(streams, error)
 

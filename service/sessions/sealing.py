@@ -33,8 +33,8 @@ from storage.sessions.writer import SealedFileWriter
 from storage.verify.sealed_file import verify_sealed_file
 
 
-def seal_session(inputs: SessionInputs, folder: Path, ledger: Ledger) -> Session:
-    """Write the session's files; return the sealed session.
+def write_sealed_files(inputs: SessionInputs, folder: Path, ledger: Ledger) -> Session:
+    """Write the session's files; return the sealed session, whose `session.json` the caller saves.
 
     Args:
         inputs: inputs to seal; every part is closed.

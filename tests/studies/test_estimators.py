@@ -156,5 +156,5 @@ def test_a_saturated_tile_is_a_lower_bound_without_a_sum() -> None:
 
 
 def test_an_unknown_estimator_is_refused() -> None:
-    with pytest.raises(UsageError, match="kalman"):
-        get_estimator("kalman")
+    with pytest.raises(UsageError, match="unknown"):
+        get_estimator("unknown")

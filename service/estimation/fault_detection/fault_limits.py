@@ -13,7 +13,11 @@ from devices.chips.pressure_chips import Compensation
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration
 from service.estimation.fault_detection import baseline_loss
-from service.estimation.fault_detection.stuck import RunLimits, StuckParams, make_stuck_params
+from service.estimation.fault_detection.stuck import (
+    EqualCountLimits,
+    StuckParams,
+    make_stuck_params,
+)
 from service.estimation.records import KernelRecord, RecordArray
 from service.estimation.tare.tare import Tare, compute_sealed_gas_shift_kpa
 
@@ -39,7 +43,7 @@ def make_fault_params(
     chip_max_kpa: Floats,
     *,
     is_gas_corrected: Bools,
-) -> tuple[RecordArray[FaultParams], RecordArray[RunLimits]]:
+) -> tuple[RecordArray[FaultParams], RecordArray[EqualCountLimits]]:
     """Make the limits of the tiles, (tiles,), and of the array, (1,).
 
     Args:

@@ -36,8 +36,8 @@ SHARE_MARGIN_SIGMAS = 2.0
 """Margin on the learnt shares, in standard deviations."""
 SHARE_STEPS = 256
 """Number of steps of the share in the tables of limits."""
-RUN_LENGTH_MIN = 8
-"""Longest run that is never judged."""
+EQUAL_COUNT_MIN = 8
+"""Largest number of equal counts in a row that is never judged."""
 PAIRS_MAX = 1 << 14
 """Number of pairs after which the older ones count half."""
 LOADINGS_OF_OTHERS = 5
@@ -50,8 +50,8 @@ class StuckState(KernelRecord):
     """State of a tile."""
 
     pressure_raw: int = -1  # last count; -1 before the first
-    run_length: int  # number of equal counts in a row
-    toggles_at_start: int  # of all tiles, when the run began
+    equal_count: int  # number of equal counts in a row
+    changes_at_start: int  # `load_changes` at the first of these
     was_unloaded: int  # 1: the last reading was
     unloaded_pairs: int  # consecutive unloaded readings
     equal_pairs: int  # of these
@@ -64,17 +64,17 @@ class StuckParams(KernelRecord):
 
     equal_share: float  # of equal neighbours
     double_step_share: float  # of neighbours two counts apart
-    run_max: int  # limit for white noise as at the tare
+    equal_count_max: int  # limit for white noise as at the tare
 
 
-class RunLimits(KernelRecord):
+class EqualCountLimits(KernelRecord):
     """Limits of equal counts in a row for an array, by the shares of a tile's neighbours."""
 
-    run_max_by_equal: Annotated[Ints, (SHARE_STEPS + 1,)]
-    run_max_by_double_step: Annotated[Ints, (SHARE_STEPS + 1,)]
+    max_by_equal_share: Annotated[Ints, (SHARE_STEPS + 1,)]
+    max_by_double_step_share: Annotated[Ints, (SHARE_STEPS + 1,)]
 
 
-def _compute_run_limit_tables(rate_hz: float, tiles: int) -> tuple[Ints, Ints]:
+def _compute_limit_tables(rate_hz: float, tiles: int) -> tuple[Ints, Ints]:
     """Compute tables of the limits of equal counts in a row, by the shares of steps 0 and 2.
 
     Neighbours whose difference has the standard deviation d, in counts, are equal or two counts
@@ -87,8 +87,8 @@ def _compute_run_limit_tables(rate_hz: float, tiles: int) -> tuple[Ints, Ints]:
     chance = 1.0 / (FALSE_ALARM_HOURS * 3600.0 * rate_hz * tiles)
     most = []
     for at_most in _compute_repeat_chances():
-        run = 1.0 + np.ceil(math.log(chance) / np.log(np.minimum(at_most, 1.0 - 1e-15)))
-        most.append(np.minimum(run, UNLIMITED).astype(np.int64))
+        count = 1.0 + np.ceil(math.log(chance) / np.log(np.minimum(at_most, 1.0 - 1e-15)))
+        most.append(np.minimum(count, UNLIMITED).astype(np.int64))
     return most[0], most[1]
 
 
@@ -131,14 +131,14 @@ def _compute_unrounded_step_sigma_counts(noise_counts: Floats, correlation: floa
 
 def make_stuck_params(
     noise_counts: Floats, rate_hz: float
-) -> tuple[RecordArray[StuckParams], RecordArray[RunLimits]]:
+) -> tuple[RecordArray[StuckParams], RecordArray[EqualCountLimits]]:
     """Make the parameters (tiles,) and the limits (1,).
 
     Args:
         noise_counts: (tiles,), noise at the tare, in counts with outliers and rounding.
         rate_hz: of the frames.
     """
-    by_equal, by_double_step = _compute_run_limit_tables(rate_hz, len(noise_counts))
+    by_equal, by_double_step = _compute_limit_tables(rate_hz, len(noise_counts))
     supposed = _compute_unrounded_step_sigma_counts(
         noise_counts, math.exp(-1.0 / (rate_hz * PRIOR_CORRELATION_S))
     )
@@ -149,24 +149,26 @@ def make_stuck_params(
         len(noise_counts),
         equal_share=compute_step_share(supposed, 0),
         double_step_share=compute_step_share(supposed, 2),
-        run_max=by_equal[np.minimum(white, SHARE_STEPS)],
+        equal_count_max=by_equal[np.minimum(white, SHARE_STEPS)],
     )
-    limits = RunLimits.array(1, run_max_by_equal=by_equal, run_max_by_double_step=by_double_step)
+    limits = EqualCountLimits.array(
+        1, max_by_equal_share=by_equal, max_by_double_step_share=by_double_step
+    )
     return params, limits
 
 
 @jit_cached
-def update_stuck_and_toggles(
-    limits: RunLimits,
+def update_stuck_and_load_changes(
+    limits: EqualCountLimits,
     params: StuckParams,
     state: StuckState,
     pressure_raw: int,
     above_kpa: float,
     unloaded_band_kpa: float,
-    load_toggles: int,
+    load_changes: int,
     tiles: int,
 ) -> tuple[bool, int]:
-    """Update the state; return whether noise does not explain a repeat, and the new toggle count.
+    """Update the state; return whether noise does not explain a repeat, and `load_changes`.
 
     Args:
         limits: of the array.
@@ -176,40 +178,40 @@ def update_stuck_and_toggles(
         above_kpa: pressure above the baseline; NaN where none was readable, or where it is so great
             that a healthy chip may stand still.
         unloaded_band_kpa: distance from the baseline within which a tile counts as unloaded.
-        load_toggles: number of loadings and unloadings of all tiles before.
+        load_changes: number of loadings and unloadings of all tiles before.
         tiles: number of tiles.
     """
     if math.isnan(above_kpa):
         state.was_unloaded = 0
-        return False, load_toggles
+        return False, load_changes
     step = abs(pressure_raw - state.pressure_raw)
     unloaded = abs(above_kpa) < unloaded_band_kpa
     is_loaded = 1 if above_kpa > 2.0 * unloaded_band_kpa else (0 if unloaded else state.is_loaded)
     if is_loaded != state.is_loaded:
-        load_toggles += 1
+        load_changes += 1
         state.is_loaded = is_loaded
     if step == 0:
-        state.run_length += 1
+        state.equal_count += 1
     else:
-        state.pressure_raw, state.run_length = pressure_raw, 1
-        state.toggles_at_start = load_toggles
+        state.pressure_raw, state.equal_count = pressure_raw, 1
+        state.changes_at_start = load_changes
     stuck = False
-    if state.run_length > RUN_LENGTH_MIN:
+    if state.equal_count > EQUAL_COUNT_MIN:
         weight = PRIOR_PAIRS + state.unloaded_pairs
         share = (PRIOR_PAIRS * params.equal_share + state.equal_pairs) / weight
         share += SHARE_MARGIN_SIGMAS * math.sqrt(share * (1.0 - share) / weight)
         two = (PRIOR_PAIRS * params.double_step_share + state.double_step_pairs) / weight
         two -= SHARE_MARGIN_SIGMAS * math.sqrt(two * (1.0 - two) / weight)
         limit = max(
-            params.run_max,
-            limits.run_max_by_equal[min(math.ceil(share * SHARE_STEPS), SHARE_STEPS)],
-            limits.run_max_by_double_step[max(int(two * SHARE_STEPS), 0)],
+            params.equal_count_max,
+            limits.max_by_equal_share[min(math.ceil(share * SHARE_STEPS), SHARE_STEPS)],
+            limits.max_by_double_step_share[max(int(two * SHARE_STEPS), 0)],
         )
-        others = load_toggles - state.toggles_at_start
+        others = load_changes - state.changes_at_start
         stays_loaded = (
             is_loaded == 1 and tiles > 1 and others >= 2 * LOADINGS_OF_OTHERS * (tiles - 1)
         )
-        stuck = state.run_length >= limit or stays_loaded
+        stuck = state.equal_count >= limit or stays_loaded
     if unloaded and state.was_unloaded == 1 and not stuck:
         state.unloaded_pairs += 1
         state.equal_pairs += 1 if step == 0 else 0
@@ -219,4 +221,4 @@ def update_stuck_and_toggles(
             state.equal_pairs //= 2
             state.double_step_pairs //= 2
     state.was_unloaded = 1 if unloaded else 0
-    return stuck, load_toggles
+    return stuck, load_changes

@@ -13,7 +13,7 @@ from typing import Annotated, Any, NamedTuple
 from devices.arrays import Floats
 from devices.errors import CalibrationError, UsageError
 from service.estimation.fault_detection.fault_limits import FaultParams
-from service.estimation.fault_detection.stuck import RunLimits
+from service.estimation.fault_detection.stuck import EqualCountLimits
 from service.estimation.models import LoadBearingTiles, ModelParams
 from service.estimation.models.ambient import AmbientParams
 from service.estimation.models.denoise import WINDOW_READINGS_MAX
@@ -128,7 +128,7 @@ class FootParams(KernelRecord):
     is_shear_known: int
     shear: float
     shear_sigma: float
-    run_limits: RunLimits
+    equal_count_limits: EqualCountLimits
     variance_inflation: Annotated[Floats, (WINDOW_READINGS_MAX + 1,)]  # of the sum of tiles
 
 

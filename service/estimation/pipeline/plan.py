@@ -149,7 +149,7 @@ def make_plan(
             )
     tiles = TileParams.array(len(info.tiles))
     tiles[bearing] = _make_bearing_params(info, calibration, tare, bearing, model_inputs, by_model)
-    faults, run_limits = make_fault_params(
+    faults, equal_count_limits = make_fault_params(
         info,
         compensation,
         calibration,
@@ -176,7 +176,7 @@ def make_plan(
         tiles[name]["is_used"] = 1
     normals, offsets_m = compute_hull_half_planes(tiles["position_m"][bearing, :2])
     foot = _make_foot_params(info, calibration, tare, models, round(lag_ms * 1e6))
-    foot["run_limits"] = run_limits
+    foot["equal_count_limits"] = equal_count_limits
     foot["variance_inflation"] = tiles["variance_inflation"][bearing].mean(axis=0)
     still_n = (
         tiles["static"]["slope_at_zero_n_per_kpa"][bearing]

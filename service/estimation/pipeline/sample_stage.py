@@ -27,7 +27,7 @@ from service.estimation.fault_detection.baseline_loss import (
     update_thermal_drift_kpa,
 )
 from service.estimation.fault_detection.clipping import update_clipping_limit_kpa
-from service.estimation.fault_detection.stuck import update_stuck_and_toggles
+from service.estimation.fault_detection.stuck import update_stuck_and_load_changes
 from service.estimation.foot import store_servo_reading_and_link_to_previous, update_candidate
 from service.estimation.models import gas
 from service.estimation.models.ambient import low_pass_ambient_kpa
@@ -192,9 +192,9 @@ def _detect_faults(
             )  # fmt: skip
         may_stand_still = as_read_kpa >= tile_params.faults.stuck_check_max_kpa
         above_kpa = math.nan if may_stand_still else as_read_kpa - baseline_kpa
-        stuck, foot_state.load_toggles = update_stuck_and_toggles(
-            foot_params.run_limits, tile_params.faults.stuck, tile_state.stuck, sample.pressure_raw,
-            above_kpa, unloaded_band_kpa, foot_state.load_toggles, tiles,
+        stuck, foot_state.load_changes = update_stuck_and_load_changes(
+            foot_params.equal_count_limits, tile_params.faults.stuck, tile_state.stuck,
+            sample.pressure_raw, above_kpa, unloaded_band_kpa, foot_state.load_changes, tiles,
         )  # fmt: skip
         if stuck:
             row.flags |= _STUCK

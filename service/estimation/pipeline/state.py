@@ -68,7 +68,7 @@ class FootState(KernelRecord):
     end_row: int
     newest_ns: int  # instant of the newest frame
     run_count: int  # gapless runs so far
-    load_toggles: int  # loadings and unloadings of all tiles so far
+    load_changes: int  # loadings and unloadings of all tiles so far
     ambient: AmbientState
     contact: ContactState
     is_contact: int  # contact in the last estimate

@@ -84,8 +84,8 @@ class Subscriber:
 class Tick:
     """Update for all subscribers of a rate group, encoded once."""
 
-    def __init__(self, summary: PendingUpdate, ages_ms: Mapping[str, float]) -> None:
-        self.update, self.ages_ms = summary.pop_update(), ages_ms
+    def __init__(self, pending: PendingUpdate, ages_ms: Mapping[str, float]) -> None:
+        self.update, self.ages_ms = pending.pop_update(), ages_ms
         self.framed = encode_websocket_messages(self.update.encode_messages(ages_ms))
 
 
@@ -174,17 +174,20 @@ class Broadcaster:
                 task.cancel()
                 del self._groups[key]
 
-    def queue_droppable_notice(self, message: PageMessage) -> None:
-        """Queue a message to all subscribers for the next update."""
+    def queue_notice(self, message: PageMessage) -> None:
+        """Queue a message for the next update of all subscribers, whatever their node.
+
+        Of more than 256 unsent ones, a subscriber gets the newest.
+        """
         if self._groups:
             text = encode_message(message)
-            for summary in self._pending_updates():
-                summary.add_notice(text)
+            for pending in self._pending_updates():
+                pending.add_notice(text)
 
     def queue_progress(self, node: str, progress_by_session: Mapping[str, SessionProgress]) -> None:
         """Queue the progress of sessions, by id, for the subscribers of their node."""
-        for summary in self._pending_updates():
-            summary.add_progress(node, progress_by_session)
+        for pending in self._pending_updates():
+            pending.add_progress(node, progress_by_session)
 
     def add_to_history_and_updates(self, node: ServerNode, batches: list[EstimatedBatch]) -> None:
         """Add estimated frames of a node to its history and to the next updates."""
@@ -198,8 +201,8 @@ class Broadcaster:
             self._get_history(node, frames.tile_count).add_span(span, tiles)
             if self._groups:
                 piece = summarize_frames(node.stream_id, span, tiles, frames, columns)
-                for summary in self._pending_updates():
-                    summary.join_summary_or_drop_older(node.name, piece)
+                for pending in self._pending_updates():
+                    pending.join_summary_or_drop_older(node.name, piece)
 
     def get_present_stream_history(self, node: ServerNode) -> StreamHistory:
         """Return the history of a node's present stream, in place of another stream's."""

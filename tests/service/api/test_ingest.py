@@ -320,7 +320,7 @@ def test_a_notice_that_cannot_be_encoded_ends_no_socket(
     with running.socket(LIVE) as live, caplog.at_level(logging.ERROR):
         receive_live(live, lambda message: message["type"] == "hello")
         with monkeypatch.context() as patch:
-            patch.setattr(running.server.broadcaster, "queue_droppable_notice", fail)
+            patch.setattr(running.server.broadcaster, "queue_notice", fail)
             bench = running.server.nodes.get("bench")
             running.call(lambda: running.server.notify_node_changed(bench))
             session.stop()

@@ -166,7 +166,7 @@ def test_a_subscriber_that_does_not_read_is_disconnected_and_delays_no_other(
         received_s = []
         while running.server.broadcaster.subscriber_count == 2:
             assert time.monotonic() < end_s, "it is never disconnected"
-            running.call(lambda: running.server.broadcaster.queue_droppable_notice(notice))
+            running.call(lambda: running.server.broadcaster.queue_notice(notice))
             receive(live, "frame")
             received_s.append(time.monotonic())
         # A server that waits for the slow one sends nothing meanwhile. A single long gap may be

@@ -13,7 +13,7 @@ import pytest
 
 import service.server.recorder
 from devices.errors import StorageError
-from service.sessions.sealing import seal_session
+from service.sessions.sealing import write_sealed_files
 from tests.builders.arrays import COUNT_KPA
 from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import FakeNode, NodeOf
@@ -173,8 +173,8 @@ def test_a_session_without_frames_is_complete(tared: FakeNode) -> None:
 def test_a_session_is_sealed_when_the_disk_has_space(
     tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fail_once = failing_once(seal_session, StorageError, "No space left on device")
-    monkeypatch.setattr(service.server.recorder, "seal_session", fail_once)
+    fail_once = failing_once(write_sealed_files, StorageError, "No space left on device")
+    monkeypatch.setattr(service.server.recorder, "write_sealed_files", fail_once)
     monkeypatch.setattr(service.server.recorder, "_RETRY_S", 0.2)
     session = tared.record()
     tared.deliver(20)

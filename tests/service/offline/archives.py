@@ -13,7 +13,7 @@ from service.offline.archive.locations import find_session_locations
 from service.offline.archive.tasks import EstimateTask, SessionTask
 from service.offline.worker_pool import map_in_processes
 from service.sessions.inputs import SessionInputs
-from service.sessions.sealing import seal_session
+from service.sessions.sealing import write_sealed_files
 from storage.journal.journal import Journal
 from storage.sessions.folder import Marker, Part, Session, SessionsFolder
 from storage.sessions.ledger import StreamState, compute_ledger
@@ -79,7 +79,7 @@ def sealed(
         notes={"lost": {}},
     )
     held = {info.stream_id: StreamState(stored=journal.stored)}
-    done = seal_session(
+    done = write_sealed_files(
         sources, folder.get_path(begun.id), compute_ledger(begun.parts, held, has_all_parts=True)
     )
     folder.save_session_json(done)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.sessions.lifecycle import Abandon, NodeChange, Stop, apply_event, create_session
+from service.sessions.lifecycle import Abandon, Reevaluate, Stop, apply_event, create_session
 from storage.intervals import Intervals
 from storage.sessions.folder import Part, Session
 from storage.sessions.ledger import group_numbers_by_stream
@@ -54,7 +54,7 @@ class Recorded:
 
     def follow(self) -> None:
         facts = self.told.node.make_session_facts()
-        self.session = apply_event(self.session, NodeChange(), facts).session
+        self.session = apply_event(self.session, Reevaluate(), facts).session
 
 
 @settings(max_examples=60, deadline=None)

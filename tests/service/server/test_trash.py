@@ -14,7 +14,7 @@ import service.api.routes.recordings.sessions
 import service.server
 import service.server.recorder
 from devices.errors import StorageError
-from service.sessions.sealing import seal_session
+from service.sessions.sealing import write_sealed_files
 from storage.sessions.folder import DELETED_PREFIX, SessionsFolder
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
@@ -85,9 +85,9 @@ def test_a_session_is_not_deleted_during_its_seal(
 
     def wait_and_seal(*arguments: Any) -> Any:
         assert may_seal.wait(20.0)
-        return seal_session(*arguments)
+        return write_sealed_files(*arguments)
 
-    monkeypatch.setattr(service.server.recorder, "seal_session", wait_and_seal)
+    monkeypatch.setattr(service.server.recorder, "write_sealed_files", wait_and_seal)
     try:
         session = tared.record()
         tared.deliver(20)
@@ -223,7 +223,7 @@ def test_a_restarted_server_seals_unsealed_sessions(
     running: Running, tared: FakeNode, state: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        service.server.recorder, "seal_session", refusing(StorageError, "No space left")
+        service.server.recorder, "write_sealed_files", refusing(StorageError, "No space left")
     )
     session = tared.record()
     tared.deliver(20)
@@ -232,7 +232,7 @@ def test_a_restarted_server_seals_unsealed_sessions(
         tared.send(10, now=True)
         until(lambda: "No space" in (session.now()["problem"] or ""))
     assert session.now()["state"] == state
-    monkeypatch.setattr(service.server.recorder, "seal_session", seal_session)
+    monkeypatch.setattr(service.server.recorder, "write_sealed_files", write_sealed_files)
     running.restart()
     if state == "pending":
         tared.connect()

@@ -19,7 +19,7 @@ from service.sessions.lifecycle import (
     Delete,
     Edit,
     Event,
-    NodeChange,
+    Reevaluate,
     Resume,
     Sealed,
     Step,
@@ -37,7 +37,7 @@ from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 STREAM = "a" * 32
 STATES: tuple[SessionState, ...] = get_args(SessionState)
 EVENTS: dict[str, Event] = {
-    "NodeChange": NodeChange(),
+    "Reevaluate": Reevaluate(),
     "Stop": Stop(),
     "Resume": Resume(),
     "Abandon": Abandon(),
@@ -108,7 +108,7 @@ def test_each_state_takes_each_event_as_the_table_says(
         step = apply_event(before, event, node)
         allowed = {state} if cell == "same" else NEXT[cell]
         assert step.session.state in allowed, (name, state, cell)
-        assert (step.action == "seal") == (step.session.state == "sealing") or name != "NodeChange"
+        assert (step.action == "seal") == (step.session.state == "sealing") or name != "Reevaluate"
         if not step.is_changed:
             assert step.session == before
             assert not step.sessions_to_save
@@ -117,7 +117,7 @@ def test_each_state_takes_each_event_as_the_table_says(
 
 def test_a_sealed_session_is_changed_by_people_only() -> None:
     done = session("sealed")
-    for event in (NodeChange(), Stop(), Delete()):
+    for event in (Reevaluate(), Stop(), Delete()):
         assert apply_event(done, event) == Step(done)
     edited = apply_event(done, Edit({"markers": ()}))
     assert (edited.session.state, edited.action) == ("sealed", "write_markers")
@@ -320,10 +320,10 @@ class World:
         self.sessions = done
 
     def seal(self) -> None:
-        self.apply(NodeChange())
+        self.apply(Reevaluate())
         facts = self.facts()
         for at, each in enumerate(self.sessions):
-            if each.state == "sealing" and apply_event(each, NodeChange(), facts).action == "seal":
+            if each.state == "sealing" and apply_event(each, Reevaluate(), facts).action == "seal":
                 ledger = compute_present_ledger(each, facts)
                 sealed = each.model_copy(update={"state": "sealed", "ledger": ledger})
                 self.sessions[at] = apply_event(each, Sealed(sealed)).session
@@ -387,7 +387,7 @@ def test_every_number_counts_once_whatever_happens(happened: list[str]) -> None:
                 world.is_connected = False
             case "connect":
                 world.connect()
-                world.apply(NodeChange())
+                world.apply(Reevaluate())
             case "node restarts":
                 world.start(world.present.tiles)
             case "other tiles":
@@ -395,7 +395,7 @@ def test_every_number_counts_once_whatever_happens(happened: list[str]) -> None:
             case "server restarts":
                 world.restart_server()
             case "change":
-                world.apply(NodeChange())
+                world.apply(Reevaluate())
             case "stop":
                 stops_t_ns += [world.now_t_ns] if not stops_t_ns else []
                 world.apply(Stop())
@@ -411,11 +411,11 @@ def test_every_number_counts_once_whatever_happens(happened: list[str]) -> None:
     stops_t_ns += [world.now_t_ns] if not stops_t_ns else []
     world.apply(Stop())
     world.connect()
-    world.apply(NodeChange())
+    world.apply(Reevaluate())
     world.sample(4)
     world.deliver()
     for _ in range(3):
-        world.apply(NodeChange())
+        world.apply(Reevaluate())
         world.check_laws()
     world.seal()
     world.check_laws()

@@ -15,7 +15,7 @@ import pytest
 from devices.errors import StorageError
 from service.sessions import recovery as recover_module
 from service.sessions.recovery import recover_locked_folder
-from service.sessions.sealing import seal_session
+from service.sessions.sealing import write_sealed_files
 from storage.clock.log import ClockOffset
 from storage.durable_files import lock_folder
 from storage.journal.node.in_flight import InFlightWriter
@@ -294,14 +294,14 @@ def test_a_file_that_does_not_prove_itself_is_not_called_recovered(
 ) -> None:
 
     def careless(*arguments: Any) -> Session:
-        done = seal_session(*arguments)
+        done = write_sealed_files(*arguments)
         path = data / "sessions" / ID / "frames.parquet"
         content = bytearray(path.read_bytes())
         content[100] ^= 1
         path.write_bytes(content)
         return done
 
-    monkeypatch.setattr(recover_module, "seal_session", careless)
+    monkeypatch.setattr(recover_module, "write_sealed_files", careless)
     (one,) = recover_locked_folder(data).sessions
     assert one.outcome == "failed"
     assert "changed since it was sealed" in one.problem
@@ -313,7 +313,9 @@ def test_a_file_that_does_not_prove_itself_is_not_called_recovered(
 def test_a_full_disk_leaves_the_session_for_the_next_run(
     data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recover_module, "seal_session", refusing(StorageError, "no space left"))
+    monkeypatch.setattr(
+        recover_module, "write_sealed_files", refusing(StorageError, "no space left")
+    )
     (one,) = recover_locked_folder(data).sessions
     assert (one.outcome, loaded(data).state) == ("failed", "sealing")
     monkeypatch.undo()

@@ -14,7 +14,7 @@ import pytest
 from devices.errors import FileFormatError
 from devices.frames import ArrayInfo, FrameBatch
 from service.sessions.inputs import SessionInputs
-from service.sessions.sealing import seal_session
+from service.sessions.sealing import write_sealed_files
 from storage.clock.log import ClockOffset
 from storage.documents import (
     append_json_checksum,
@@ -102,7 +102,7 @@ def sealed(data: Path, session_id: str = ID, **changes: Any) -> Path:
     ledger = compute_ledger(begun.parts, states, has_all_parts=True)
     notes = {"lost": {stream_id: losses.to_pairs() for stream_id, losses in lost.items()}}
     folder = keep(data, begun)
-    done = seal_session(
+    done = write_sealed_files(
         SessionInputs(begun, array(), journals, None, "none", (), notes), folder, ledger
     )
     return keep(data, done)
@@ -170,7 +170,7 @@ def test_a_session_without_a_frame_is_whole(tmp_path: Path) -> None:
     ledger = compute_ledger(begun.parts, {}, has_all_parts=True)
     folder = keep(tmp_path, begun)
     inputs = SessionInputs(begun, array(), {}, None, "none", (), {})
-    keep(tmp_path, seal_session(inputs, folder, ledger))
+    keep(tmp_path, write_sealed_files(inputs, folder, ledger))
     assert problems(folder) == ""
     (folder / "frames.parquet").write_bytes(b"")
     assert "no frame recorded" in problems(folder)

@@ -283,7 +283,7 @@ async def delete_session(session_id: str, server: ServerState, if_match: IfMatch
     Only emptying the trash frees its space.
     """
     server.recorder.move_to_trash(session_id, if_revision=parse_if_match(if_match))
-    server.broadcaster.queue_droppable_notice(SessionDeleted(session_id=session_id))
+    server.broadcaster.queue_notice(SessionDeleted(session_id=session_id))
 
 
 @router.post(

@@ -205,11 +205,11 @@ async def _serve_page(socket: WebSocket, server: Server, outlet: Connection) -> 
         _select_node(server, query.node)
     hello = encode_message(_make_hello(server, query.node))
     outlet.write_framed_unless_closed(encode_websocket_messages([hello]))
-    viewer = server.broadcaster.subscribe(outlet, query.rate_hz, query.node)
+    subscriber = server.broadcaster.subscribe(outlet, query.rate_hz, query.node)
     try:
-        await run_until_first_ends(viewer.disconnected, _answer_pings(socket))
+        await run_until_first_ends(subscriber.disconnected, _answer_pings(socket))
     finally:
-        server.broadcaster.unsubscribe(viewer)
+        server.broadcaster.unsubscribe(subscriber)
 
 
 def _parse_query(kind: type[_Query], socket: WebSocket) -> _Query:

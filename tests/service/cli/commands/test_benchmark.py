@@ -77,7 +77,7 @@ def test_another_estimator_is_measured_with_the_static_curve_alone(
     (rolling,) = content["scenes"]
     assert (content["estimator"], rolling["failures"]) == ("low-pass", [])
     assert [each["models"] for each in rolling["model_sets"]] == [["static"]]
-    run("benchmark", "--estimator", "kalman", "--out", "o").fails(2, "--estimator kalman")
+    run("benchmark", "--estimator", "unknown", "--out", "o").fails(2, "--estimator unknown")
 
 
 def test_a_draw_that_fails_is_reported_and_the_others_count(

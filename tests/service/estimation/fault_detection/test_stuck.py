@@ -9,12 +9,12 @@ import pytest
 from devices.arrays import Bools, Floats, Ints
 from devices.jit import jit_cached
 from service.estimation.fault_detection.stuck import (
-    RunLimits,
+    EqualCountLimits,
     StuckParams,
     StuckState,
     compute_step_share,
     make_stuck_params,
-    update_stuck_and_toggles,
+    update_stuck_and_load_changes,
 )
 from service.estimation.records import RecordArray
 from tests.builders.noise import draw_lasting_noise
@@ -33,14 +33,14 @@ def draw_noise(
 
 def make_limits(
     counts: float, tiles: int
-) -> tuple[RecordArray[StuckParams], RecordArray[RunLimits]]:
+) -> tuple[RecordArray[StuckParams], RecordArray[EqualCountLimits]]:
     # The noise of a tare has rounding and outliers.
     tared = 1.25 * np.hypot(counts, np.sqrt(1.0 / 12.0))
     return make_stuck_params(np.full(tiles, tared), RATE_HZ)
 
 
 def find_repeats(
-    limits: tuple[RecordArray[StuckParams], RecordArray[RunLimits]],
+    limits: tuple[RecordArray[StuckParams], RecordArray[EqualCountLimits]],
     states: RecordArray[StuckState],
     pressure_raw: npt.NDArray[np.uint16],
     kpa: Floats,
@@ -56,7 +56,7 @@ def find_repeats(
 
 @jit_cached
 def _update_all(
-    limits: RecordArray[RunLimits],
+    limits: RecordArray[EqualCountLimits],
     params: RecordArray[StuckParams],
     states: RecordArray[StuckState],
     pressure_raw: Ints,
@@ -65,12 +65,12 @@ def _update_all(
     out: Bools,
 ) -> None:
     n, tiles = kpa.shape
-    toggles = 0
+    load_changes = 0
     for i in range(n):
         for j in range(tiles):
-            out[i, j], toggles = update_stuck_and_toggles(
+            out[i, j], load_changes = update_stuck_and_load_changes(
                 limits[0], params[j], states[j], pressure_raw[i, j], kpa[i, j], unloaded_kpa,
-                toggles, tiles,
+                load_changes, tiles,
             )  # fmt: skip
 
 

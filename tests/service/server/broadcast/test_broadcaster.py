@@ -109,7 +109,7 @@ async def test_who_does_not_read_is_told_later_of_all_peaks_and_the_others_at_on
     slow.is_writable = False
     for first in range(0, 50, 10):
         publish(hub, node, first, 10)
-        hub.queue_droppable_notice(SessionDeleted(session_id=str(first)))
+        hub.queue_notice(SessionDeleted(session_id=str(first)))
         await ticked(hub, now_s=first / 100)
     assert slow.written == []
     assert [m["n"] for m in quick.messages if m["type"] == "frame"] == [10] * 5
@@ -130,10 +130,10 @@ async def test_who_does_not_read_for_ten_seconds_has_to_go_and_nobody_else() -> 
     going, staying = hub.subscribe(slow, RATE_HZ), hub.subscribe(quick, RATE_HZ)
     slow.is_writable = False
     for now_s in range(11):
-        hub.queue_droppable_notice(NOTICE)
+        hub.queue_notice(NOTICE)
         await ticked(hub, now_s=float(now_s))
         assert not going.disconnected.done()
-    hub.queue_droppable_notice(NOTICE)
+    hub.queue_notice(NOTICE)
     await ticked(hub, now_s=10.1)
     with pytest.raises(CloseConnection) as end:
         going.disconnected.result()
@@ -146,10 +146,10 @@ async def test_who_does_not_read_for_ten_seconds_has_to_go_and_nobody_else() -> 
 async def test_time_without_news_is_not_time_without_reading() -> None:
     hub, screen = Broadcaster(), Screen()
     viewer = hub.subscribe(screen, RATE_HZ)
-    hub.queue_droppable_notice(NOTICE)
+    hub.queue_notice(NOTICE)
     await ticked(hub, now_s=0.0)
     screen.is_writable = False
-    hub.queue_droppable_notice(NOTICE)
+    hub.queue_notice(NOTICE)
     await ticked(hub, now_s=100.0)
     assert not viewer.disconnected.done()
 
@@ -157,13 +157,13 @@ async def test_time_without_news_is_not_time_without_reading() -> None:
 @in_a_loop
 async def test_only_who_has_joined_is_told_and_nobody_after_leaving() -> None:
     hub, node, one, two = Broadcaster(), fake_node(), Screen(), Screen()
-    hub.queue_droppable_notice(SessionDeleted(session_id="early"))
+    hub.queue_notice(SessionDeleted(session_id="early"))
     publish(hub, node, 0, 5)
     assert node.published_t_ns == 10**18 + 4 * PERIOD_NS
     first, _ = hub.subscribe(one, RATE_HZ), hub.subscribe(two, RATE_HZ, "other")
     assert hub.subscriber_count == 2
     publish(hub, node, 5, 5)
-    hub.queue_droppable_notice(SessionDeleted(session_id="late"))
+    hub.queue_notice(SessionDeleted(session_id="late"))
     await ticked(hub)
     hub.unsubscribe(first)
     hub.unsubscribe(first)
@@ -194,7 +194,7 @@ async def test_a_feed_tells_at_its_rate_and_its_task_ends_with_its_last_screen()
     loop = asyncio.get_running_loop()
     began_s = loop.time()
     while len(screen.written) < 6:
-        hub.queue_droppable_notice(NOTICE)
+        hub.queue_notice(NOTICE)
         await asyncio.sleep(0.001)
     assert loop.time() - began_s > 4 / RATE_HZ
     hub.unsubscribe(viewer)
@@ -238,7 +238,7 @@ async def test_screens_that_are_many_do_not_hold_up_the_loop() -> None:
             await asyncio.sleep(0)
 
     task = asyncio.create_task(others())
-    hub.queue_droppable_notice(NOTICE)
+    hub.queue_notice(NOTICE)
     await ticked(hub)
     task.cancel()
     assert turns >= 9
