@@ -84,7 +84,7 @@ TILE_FLAGS: Mapping[TileFlag, FlagText] = {
         "no answer", "it did not acknowledge, or is looked for: no counts", Severity.UNKNOWN
     ),
     TileFlag.STALE: FlagText(
-        "stale", "the node read the same counts for ten frames: kept, not used", Severity.UNKNOWN
+        "stale", "the node read ten repeats of its counts: kept, not used", Severity.UNKNOWN
     ),
     TileFlag.RETRIED: FlagText("", "it took a second attempt, or a third reading: good"),
     TileFlag.IMPLAUSIBLE: FlagText(

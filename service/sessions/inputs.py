@@ -1,8 +1,7 @@
 """Inputs of a session: array, calibration, tares, metadata, and its frames with their estimates.
 
-The same whether a session is sealed, exported before that, recovered, or recorded on a node. Frames
-are raw where the estimator is not installed. Only here does a node use the estimator: it seals, and
-so does `foottile recover`, where neither numba nor scipy is installed.
+The same whether a session is sealed, exported before that, recovered, or recorded on a node. A node
+and `foottile recover` estimate only when they seal. Without numba and scipy frames stay raw.
 """
 
 from __future__ import annotations

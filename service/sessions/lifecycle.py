@@ -1,4 +1,4 @@
-"""Lifecycle of a session: one pure function from a state and an event to the next state.
+"""Lifecycle of a session: one function from a state and an event to the next state.
 
 recording -- `Stop` --> pending -- all frames are here --> sealing -- `Sealed` --> sealed
 
@@ -15,7 +15,7 @@ recording -- `Stop` --> pending -- all frames are here --> sealing -- `Sealed` -
 Arriving or lost frames, restarts and crashes are no events of their own: the needs of a session
 follow from the present facts of its node (`NodeFacts`), so the next `Reevaluate` makes up for a
 missed one. The caller saves the sessions of a `Step`, then does its action. Server, node alone and
-recovery call the same function; it has no side effects.
+recovery call the same function; it reads clock and journals, and writes nothing.
 
 The trash is a folder, no state. A session whose `session.json` is damaged has no state: it is
 rebuilt from its sealed file, or left out (`service.sessions.sealing`).

@@ -1,6 +1,7 @@
-"""Models of disturbances, one module each: the effect on readings, and its correction.
+"""Models of disturbances, one module each (`hysteresis`: two): effect on readings, and correction.
 
 Each declares its parameters of a tile in one record, and makes them from calibration and tare.
+`unwrap` is with the conversion of counts, in `service.estimation.pipeline.sample_stage`.
 """
 
 from __future__ import annotations

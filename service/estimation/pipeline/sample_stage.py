@@ -1,7 +1,7 @@
 """Sample stage: raw pressures to the apparent force on every dome, reading by reading.
 
 Apparent force: by the static curve, before hysteresis and creep of the rubber are removed. Order of
-the models: outliers, temperature, ambient, gas, static, skew.
+the models: unwrap, outliers, temperature, ambient, gas, static, and skew without denoise.
 
 Counts of an MPL115A2 wrap beyond some 25 N (hardware.md 1.3), and at face value full load reads as
 about 23 kPa. Recognised without memory: no sealed bubble can be below 50 kPa, the begin of the
