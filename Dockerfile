@@ -10,7 +10,7 @@ WORKDIR /src
 ARG LOCK=requirements.lock
 COPY $LOCK ./
 # Every download is compared with its hash here; what follows takes nothing from anywhere else.
-RUN pip download --no-cache-dir --require-hashes -r $LOCK -d /wheels
+RUN pip download --no-cache-dir --no-deps --require-hashes -r $LOCK -d /wheels
 # .dockerignore names what there is to copy.
 COPY . .
 ARG EXTRAS=server,emulation
