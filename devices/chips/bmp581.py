@@ -24,6 +24,7 @@ from devices.chips.pressure_chip import (
 )
 from devices.errors import NoAcknowledgeError, TileSetupError, UsageError
 from devices.flags import TileFlag
+from devices.frames import NOT_READ
 
 ADDRESSES = (0x46, 0x47)
 """I2C addresses with pin SDO low and high (DS 5.6)."""
@@ -302,7 +303,8 @@ class Bmp581:
         if NO_DATA in (pressure_raw, temperature_raw - TEMPERATURE_OFFSET):
             return TileFlag.NOT_CONVERTED
         degc = (temperature_raw - TEMPERATURE_OFFSET) / COUNTS_PER_KELVIN
-        if pressure_raw == 0 or pressure_raw >> 23 or not _COLD_DEGC < degc < _HOT_DEGC:
+        is_far = temperature_raw != NOT_READ and not _COLD_DEGC < degc < _HOT_DEGC
+        if pressure_raw == 0 or pressure_raw >> 23 or is_far:
             return TileFlag.IMPLAUSIBLE
         return 0
 

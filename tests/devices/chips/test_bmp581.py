@@ -22,6 +22,7 @@ from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.i2c_bus import EmulatedI2cAdapter
 from devices.errors import NoAcknowledgeError, TileSetupError, UsageError
 from devices.flags import TileFlag
+from devices.frames import NOT_READ
 
 PART_ID = (0x1234, 0x5678, 0x9ABC, 0xDEF0)
 CONTINUOUS = BMP581.encode_settings(ChipSettings())
@@ -94,6 +95,10 @@ def test_a_stuck_line_is_implausible(data: bytes) -> None:
     bench = Bench()
     bench.chip._registers[0x1D:0x23] = data
     assert bench.driver.classify_counts(*bench.driver.read_counts()) == TileFlag.IMPLAUSIBLE
+
+
+def test_a_pressure_without_its_temperature_is_possible() -> None:
+    assert Bench().driver.classify_counts(6_400_000, NOT_READ) == 0
 
 
 def test_power_up_is_as_the_data_sheet_says() -> None:
