@@ -11,13 +11,12 @@ every transaction may have a fixed overhead, every sleep an overshoot.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Protocol, get_args
 
-from devices.array.tile import Scan
+from devices.array.tile import STORED_MAX, Scan
 from devices.errors import SceneError
 from devices.scene.hardware_sections import ScheduleName
 
@@ -180,22 +179,21 @@ def compute_frame_s(schedule: ScheduleName, timing: BusTiming) -> float:
     """Compute the frame period of a schedule, in seconds."""
     frame_s = _compute_frame_s(schedule, timing)
     if timing.bits_per_conversion:
-        # A longer frame finds more conversions, which take longer to read.
+        # A longer frame finds more conversions, which take longer to read. At the start all are
+        # stored.
+        frame_s = STORED_MAX * max(timing.conversions_s)
         for _ in range(_ROUNDS):
-            further = fmean(count_conversions(frame_s, each) - 1 for each in timing.conversions_s)
+            further = fmean(
+                min(max(1.0, frame_s / each + _IN_VAIN), STORED_MAX) - 1.0
+                for each in timing.conversions_s
+            )
             bits = timing.read_bits + further * timing.bits_per_conversion
             frame_s = _compute_frame_s(schedule, replace(timing, read_bits=bits))
     return frame_s
 
 
-_ROUNDS = 8
-_STORED_MAX = 32  # of a part's FIFO
-_RARE = 0.05  # part of the frames that may have one more
-
-
-def count_conversions(frame_s: float, conversion_s: float) -> int:
-    """Return the number of conversions that a free-running part ends in nearly every frame."""
-    return min(max(1, math.ceil(frame_s / conversion_s - _RARE)), _STORED_MAX)
+_ROUNDS = 100
+_IN_VAIN = 0.1  # conversions that a read expects too soon, and further reads where one was late
 
 
 def _compute_frame_s(schedule: ScheduleName, timing: BusTiming) -> float:

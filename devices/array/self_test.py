@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import accumulate, pairwise, product
+from statistics import linear_regression, median
 
 from devices.array.schedules import ADDRESS_BITS, CONVERT_BITS, count_read_bits
 from devices.buses.i2c import I2cBus, i2c_msg
@@ -38,12 +39,14 @@ equal by chance in one of nine cases, eight in one of 10^7."""
 _TEMPERATURE_SAME_MAX = 20
 """Limit like `_SAME_MAX`, for the temperature alone, which is equal by chance in every second
 reading. It is loaded last."""
-_MARGIN = 1.004
+MARGIN = 1.004
 """Allowance for the drift of a part's clock; a larger drift is detected while running."""
 
 _STATUS_CONVERSIONS = 48
 """Conversions that are timed where a status tells their end. The first of free-running ones may
 have ended earlier."""
+_FREE_CONVERSIONS_MIN, _FREE_CONVERSIONS_NS = 8, 100_000_000
+"""Fewest free-running ones, and time for more: a long one is timed as exactly by fewer."""
 
 _SCL_READS = 100
 _UNDISTURBED = 0.1
@@ -281,17 +284,22 @@ def measure_conversion_ns(
     delay_ns = _bisect_conversion_ns(typical_ns, longest_ns, finished_within)
     if delay_ns is None:
         return None
-    waits_ns = round((delay_ns + ADDRESS_BITS * 1e9 / wires.scl_hz) * _MARGIN)
+    waits_ns = round((delay_ns + ADDRESS_BITS * 1e9 / wires.scl_hz) * MARGIN)
     return min(longest_ns, waits_ns)
 
 
 def _measure_by_status(
     driver: ChipDriver, clock: Clock, longest_ns: int, is_free_running: bool
 ) -> int | None:
-    """Measure a conversion of a part with a status: the mean of free ones, else the longest."""
+    """Measure a conversion of a part with a status: the period of free ones, else the longest."""
     ended_ns: list[int] = []
     took_ns: list[int] = []
-    for _ in range(_STATUS_CONVERSIONS):
+    conversions = _STATUS_CONVERSIONS
+    if is_free_running:
+        conversions = min(
+            conversions, max(_FREE_CONVERSIONS_MIN, _FREE_CONVERSIONS_NS // longest_ns)
+        )
+    for _ in range(conversions):
         begin_ns = clock.now_ns()
         if not is_free_running:
             driver.start_conversion()
@@ -301,9 +309,11 @@ def _measure_by_status(
         ended_ns.append(clock.now_ns())
         took_ns.append(ended_ns[-1] - begin_ns)
     if is_free_running:
-        mean_ns = (ended_ns[-1] - ended_ns[1]) / (len(ended_ns) - 2)
-        return min(longest_ns, round(mean_ns * _MARGIN))
-    return min(longest_ns, round(max(took_ns) * _MARGIN))
+        # A busy machine may miss the end of one: their number follows from the time between two.
+        apart_ns = [later - earlier for earlier, later in pairwise(ended_ns[1:])]
+        numbers = [0, *accumulate(round(each / median(apart_ns)) for each in apart_ns)]
+        return min(longest_ns, round(linear_regression(numbers, ended_ns[1:]).slope))
+    return min(longest_ns, round(max(took_ns) * MARGIN))
 
 
 def _bisect_conversion_ns(

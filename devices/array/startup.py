@@ -16,6 +16,7 @@ from devices.array.schedules import (
     count_read_bits,
 )
 from devices.array.self_test import (
+    MARGIN,
     WireTiming,
     identify_tiles,
     measure_conversion_ns,
@@ -287,28 +288,31 @@ def compute_bus_timing(
         chip.compute_conversion_ns(tile.settings)[1] if known is None else known
         for tile, chip, known in zip(tiles, chips, conversions_ns, strict=True)
     ]
+    free_running = tuple(
+        chip.is_free_running(tile.settings) for tile, chip in zip(tiles, chips, strict=True)
+    )
     reads = [
         chip.compute_read_bytes(tile.settings) for tile, chip in zip(tiles, chips, strict=True)
     ]
     part = 1 / array.temperature_every
     return BusTiming(
         scl_hz=wires.scl_hz,
-        conversions_s=tuple(wait_ns * 1e-9 for wait_ns in waits_ns),
+        # Reads come a little slower than free conversions, so that each finds a new one.
+        conversions_s=tuple(
+            wait_ns * 1e-9 * (MARGIN if is_free else 1.0)
+            for wait_ns, is_free in zip(waits_ns, free_running, strict=True)
+        ),
         muxes=tuple(tile.mux for tile in tiles),
         channels=tuple(tile.channel for tile in tiles),
         addresses=tuple(tile.address for tile in tiles),
-        free_running=tuple(
-            chip.is_free_running(tile.settings) for tile, chip in zip(tiles, chips, strict=True)
-        ),
+        free_running=free_running,
         read_bits=fmean(
             (1 - part) * count_read_bits(*alone) + part * count_read_bits(*whole)
             for alone, whole in reads
         ),
         bits_per_conversion=fmean(
-            count_read_bits(chip.bytes_per_conversion) - count_read_bits(0)
-            if chip.is_free_running(tile.settings)
-            else 0.0
-            for tile, chip in zip(tiles, chips, strict=True)
+            count_read_bits(chip.bytes_per_conversion) - count_read_bits(0) if is_free else 0.0
+            for chip, is_free in zip(chips, free_running, strict=True)
         ),
         reads_per_sample=fmean(
             (1 - part) * len(alone) + part * len(whole) for alone, whole in reads

@@ -146,6 +146,16 @@ class ConversionClock:
         self._fixed_ns: float | None = None
         self._counted = 0
 
+    def set_end(self, end_ns: int) -> None:
+        """Begin with the known end of a conversion, the last one in the next read."""
+        self._end_ns = self._fixed_ns = end_ns
+        self._last_read_ns, self._counted = None, 0
+
+    def estimate_new(self, now_ns: int) -> int:
+        """Estimate how many conversions a read finds now: at least one."""
+        ended = int((now_ns - self._end_ns) / self._period_ns + _EARLY)
+        return min(max(1, ended), STORED_MAX)
+
     def count_conversions(self, count: int, begin_ns: int, end_ns: int) -> int:
         """Count the conversions in a read; return the estimated end of the last one.
 
@@ -155,8 +165,14 @@ class ConversionClock:
             end_ns: its end.
         """
         last, self._last_read_ns = self._last_read_ns, (begin_ns, end_ns)
-        if last is None or count > _CONVERSIONS_MAX:
-            self._end_ns, self._fixed_ns = begin_ns - self._period_ns / 2, None
+        if last is None:
+            if self._fixed_ns is None:
+                self._end_ns = begin_ns - self._period_ns / 2
+            return round(self._end_ns)
+        if count >= STORED_MAX:  # some may be lost, and the period tells how many
+            ended = max(count, (begin_ns - self._end_ns) // self._period_ns)
+            self._end_ns += ended * self._period_ns
+            self._fixed_ns = None
             return round(self._end_ns)
         low_ns = max(last[0] + (count - 1) * self._period_ns, begin_ns - self._period_ns)
         high_ns = min(end_ns, last[1] + count * self._period_ns)
@@ -173,8 +189,10 @@ class ConversionClock:
         return round(self._end_ns)
 
 
-_CONVERSIONS_MAX = 16
-"""Conversions in a read from which some may have been lost in the part's FIFO of 32."""
+STORED_MAX = 32
+"""Conversions that a free-running part stores until they are read; then the oldest is lost."""
+_EARLY = 0.05
+"""Part of the period by which an end may come before its estimate."""
 _NARROW = 0.25
 """Part of the period to which bounds must leave the end of a conversion to fix it."""
 _COUNTED_MIN, _COUNTED_MAX = 200, 4000

@@ -10,6 +10,7 @@ part, and a part that answers with others is another part.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 
 from devices.array.bus_recovery import BusMonitor, BusRecovery
@@ -21,10 +22,9 @@ from devices.array.schedules import (
     check_broadcast_channels,
     compute_frame_s,
     compute_turns_s,
-    count_conversions,
     count_read_bits,
 )
-from devices.array.tile import ConversionClock, Scan, TileHealth, TileIo
+from devices.array.tile import STORED_MAX, ConversionClock, Scan, TileHealth, TileIo
 from devices.buses.i2c import I2cBus
 from devices.chips.pressure_chip import Counts
 from devices.clock import Clock
@@ -100,6 +100,8 @@ _LEARN_NS, _FORGET_NS = 10_000, 2_000
 """Largest increase, and fixed decrease, of a tile's learnt turn in each frame."""
 _REPEATS_MAX = 10
 """Repeated readings of a chip with a status from which its part is set up anew."""
+_PATIENCE = 1.1
+"""Conversions of a free-running part in which one surely ends."""
 _DISTURBED_BUDGETS = 4
 """Factor of the retry budget on a line with flipped bits: correct readings before rate."""
 
@@ -183,9 +185,11 @@ class TileArray:
         # The part is read when its address has passed.
         self._bit_ns = 1e9 / timing.scl_hz
         self._address_ns = round(ADDRESS_BITS * self._bit_ns)
-        self._conversions_per_frame = [
-            count_conversions(self._frame_ns * 1e-9, each_s) for each_s in timing.conversions_s
-        ]
+        self._has_unknown_phase = [True] * len(tiles)
+        # Before conversions are lost, but longer than a frame in which all phases are sought, else
+        # these would follow one another.
+        seeking_ns = 3 * (self._frame_ns + sum(self._conversions_ns))
+        self._pause_ns = max((STORED_MAX - 4) * max(self._conversions_ns), seeking_ns)
         self._conversion_clocks = [ConversionClock(each_ns) for each_ns in self._conversions_ns]
         self._busy_since_ns = 0
         self._frame_index = 0
@@ -317,6 +321,7 @@ class TileArray:
             scan.add_flag(tile, TileFlag.NO_ANSWER)
             return
         if not health.is_present:
+            self._has_unknown_phase[tile] = True
             if self._may_retry(scan, tile):
                 self._reconnector.probe_if_due(scan, tile)
             else:
@@ -363,21 +368,29 @@ class TileArray:
             self._plausibility.check_reading(
                 scan, tile, counts, with_temperature=with_temperature, may_retry=may_ask
             )
+            if self._tile_io.are_free_running[tile] and scan.pressure_raw[tile] != counts[0]:
+                # A later conversion was read in its place: it has an instant of its own.
+                with scan.charge_retry(self._clock), suppress(NoAcknowledgeError):
+                    self._read_free_conversions(scan, tile, with_temperature=False)
         else:
             scan.add_flag(tile, TileFlag.NO_ANSWER)
             health.mark_lost(self._clock.now_ns())
 
     def _read_free_conversions(self, scan: Scan, tile: int, with_temperature: bool) -> Counts:
         """Read the last conversion of a free-running tile, and follow its clock."""
+        conversion_clock = self._conversion_clocks[tile]
+        is_late = self._clock.now_ns() - self._read_ns[tile] > self._pause_ns
+        if is_late or self._has_unknown_phase[tile]:
+            self._find_phase(tile)
         begin_ns = self._read_ns[tile] = self._clock.now_ns()
-        # As many as a frame has, and one that tells that there is no more.
-        at_once = self._conversions_per_frame[tile] + 1
+        # One more than have ended since the last read, which tells that there is no more.
+        at_once = conversion_clock.estimate_new(begin_ns) + 1
         pressures = self._tile_io.read_new_pressures(tile, at_once)
         # A read that was full is followed by another one, here an empty one.
         reads = 2 if pressures and len(pressures) % at_once == 0 else 1
         n_bytes = at_once * self._tile_io.chips[tile].bytes_per_conversion
         data_ns = round(reads * count_read_bits(n_bytes) * self._bit_ns) - self._address_ns
-        ended_ns = self._conversion_clocks[tile].count_conversions(
+        ended_ns = conversion_clock.count_conversions(
             len(pressures), begin_ns + self._address_ns, self._clock.now_ns() - data_ns
         )
         scan.convert_stop_ns[tile] = ended_ns - self._conversions_ns[tile]
@@ -385,6 +398,23 @@ class TileArray:
             return NOT_READ, NOT_READ
         temperature_raw = self._tile_io.read_temperature(tile) if with_temperature else NOT_READ
         return pressures[-1], temperature_raw
+
+    def _find_phase(self, tile: int) -> None:
+        """Wait for the end of a free-running tile's conversion, which its status tells.
+
+        It is sought once, for at most a conversion, so that a part that does not convert holds up
+        the others no further.
+        """
+        # What has ended before is read, so that the next read finds the one that ends now.
+        self._tile_io.read_new_pressures(tile, STORED_MAX)
+        self._tile_io.has_new_counts(tile)
+        since_ns = last_ns = read_ns = self._clock.now_ns()
+        while not self._tile_io.has_new_counts(tile):
+            if read_ns - since_ns > _PATIENCE * self._conversions_ns[tile]:
+                break
+            last_ns, read_ns = read_ns, self._clock.now_ns()
+        self._conversion_clocks[tile].set_end((last_ns + read_ns) // 2 + self._address_ns)
+        self._has_unknown_phase[tile] = False
 
     # Retries
 

@@ -76,10 +76,12 @@ def test_the_clock_of_a_part_is_followed_by_the_number_of_its_conversions(
     assert np.abs(errors_ns[2000:]).max() < 0.06 * period_ns
 
 
-def test_samples_of_free_running_tiles_have_their_instants() -> None:
-    rig = Rig(make_scene("rolling"))
-    half_ns = bmp581.CONVERSION_P_NS[0] // 2
-    ends_ns: list[list[tuple[int, int]]] = [[] for _ in rig.world.chips]
+Ends = list[dict[int, int | None]]
+
+
+def note_ends(rig: Rig) -> Ends:
+    """Note the end of each tile's conversions by pressure word; None where one comes again soon."""
+    ends_ns: Ends = [{} for _ in rig.world.chips]
     for tile, ends in enumerate(ends_ns):
         chip = rig.chip(tile)
 
@@ -87,27 +89,69 @@ def test_samples_of_free_running_tiles_have_their_instants() -> None:
             begin_ns: int,
             counts: tuple[int, int],
             _: object,
-            ends: list[tuple[int, int]] = ends,
+            ends: dict[int, int | None] = ends,
             chip: EmulatedBmp581 = chip,
         ) -> None:
-            ends.append((begin_ns + chip._conversion_ns(), counts[0]))
+            end_ns = begin_ns + chip._conversion_ns()
+            is_repeated = end_ns - (ends.get(counts[0]) or 0) < 10 * chip._conversion_ns()
+            ends[counts[0]] = None if is_repeated else end_ns
 
         chip.on_conversion = note
-    scans = [rig.array.scan_frame() for _ in range(1500)]
-    for tile, ends in enumerate(ends_ns):
-        words = [pressure_raw for _, pressure_raw in ends]
-        true_ns = {pressure_raw: end_ns for end_ns, pressure_raw in ends}
-        errors_ns = [
-            scan.convert_stop_ns[tile]
-            + rig.array.sample_delay_ns[tile]
-            + half_ns
-            - true_ns[scan.pressure_raw[tile]]
-            for scan in scans[1000:]
-            if words.count(scan.pressure_raw[tile]) == 1
-        ]
-        assert len(errors_ns) > 100
-        assert np.abs(errors_ns).max() < 200_000, "unfollowed it would be a millisecond"
-        assert np.std(errors_ns) < 60_000
+    return ends_ns
+
+
+def scan_instant_errors_ns(rig: Rig, ends_ns: Ends, frames: int) -> np.ndarray:
+    """Scan frames; return the errors of their samples' ends, where these are known."""
+    errors_ns = []
+    for _ in range(frames):
+        scan = rig.array.scan_frame()
+        for tile, ends in enumerate(ends_ns):
+            estimated_ns = scan.convert_stop_ns[tile] + rig.array._conversions_ns[tile]
+            true_ns = ends.get(scan.pressure_raw[tile])
+            if true_ns is not None:
+                errors_ns.append(estimated_ns - true_ns)
+    assert len(errors_ns) > frames / 2
+    return np.array(errors_ns)
+
+
+@pytest.mark.parametrize(
+    ("oversampling", "frames"), [(1, 1000), (4, 300), pytest.param(32, 60, marks=pytest.mark.slow)]
+)
+def test_samples_of_free_running_tiles_have_their_instants_from_the_first_frame_on(
+    oversampling: int, frames: int
+) -> None:
+    rig = Rig(make_scene("rolling", oversampling=oversampling))
+    errors_ns = scan_instant_errors_ns(rig, note_ends(rig), frames)
+    conversion_ns = max(rig.array._conversions_ns)
+    assert np.abs(errors_ns).max() < 0.1 * conversion_ns, "unfollowed it would be a half"
+    assert np.std(errors_ns) < 0.03 * conversion_ns
+
+
+def test_a_reading_that_is_read_again_has_its_own_instant() -> None:
+    """The second reading may be of a later conversion."""
+    rig = Rig(make_scene("rolling"))
+    ends_ns = note_ends(rig)
+    for _ in range(300):
+        for health in rig.array.health:
+            health._recent.clear()
+        assert np.abs(scan_instant_errors_ns(rig, ends_ns, 1)).max() < 300_000
+
+
+@pytest.mark.parametrize("pause_ms", [10, 60, 100, 1000])
+def test_a_pause_in_which_conversions_are_lost_costs_one_frame_and_no_instant(
+    pause_ms: int,
+) -> None:
+    """A part stores 32 conversions, here 64 ms, and drops the oldest without a sign."""
+    rig = Rig(make_scene("rolling"))
+    ends_ns = note_ends(rig)
+    rig.scan(200)
+    for _ in range(5):
+        rig.clock.sleep_until_ns(rig.clock.now_ns() + pause_ms * 1_000_000)
+        before_ns = rig.clock.now_ns()
+        errors_ns = scan_instant_errors_ns(rig, ends_ns, 1)
+        assert np.abs(errors_ns).max() < 300_000
+        assert rig.clock.now_ns() - before_ns < 30_000_000
+        assert not any(any(flags) for flags in rig.scan(20))
 
 
 def test_no_reading_of_a_healthy_array_is_flagged_or_repeated() -> None:
@@ -118,23 +162,56 @@ def test_no_reading_of_a_healthy_array_is_flagged_or_repeated() -> None:
     assert sum(a == b for a, b in pairwise(words)) < 10
 
 
-@pytest.mark.parametrize("tiles", [4, 8])
-@pytest.mark.parametrize("scl_hz", [400_000, 1_000_000])
-@pytest.mark.parametrize("tile", [{}, {"mode": "forced"}, {"oversampling": 4}])
+def make_array_scene(
+    tiles: int,
+    scl_hz: int = 400_000,
+    *,
+    temperature_every: int = 1,
+    mixed: bool = False,
+    **tile: Any,
+) -> Scene:
+    """Make a scene of some of the grid's tiles, if `mixed` every second one an MPL115A2."""
+    content = make_scene("grid", **tile).model_dump(exclude_none=True)
+    content["tile"] = content["tile"][:tiles]
+    for each in content["tile"][1::2] if mixed else ():
+        each |= {"chip": "mpl115a2", "oversampling": 1}
+        each.pop("mode", None)
+    content["array"] |= {"scl_hz": scl_hz, "temperature_every": temperature_every}
+    content |= {"ground": {"kind": "none"}, "rate_hz": 0.0}
+    return validate_scene(content, where="test")
+
+
+@pytest.mark.parametrize(
+    ("tiles", "scl_hz", "tile", "published_hz"),
+    [
+        (4, 400_000, {}, 490),
+        (8, 400_000, {"oversampling": 4}, 251),
+        (16, 400_000, {"oversampling": 8}, 150),
+        pytest.param(64, 400_000, {"oversampling": 32}, 36, marks=pytest.mark.slow),
+        (8, 1_000_000, {}, 490),
+        (16, 1_000_000, {}, 352),
+        pytest.param(64, 1_000_000, {"oversampling": 16}, 85, marks=pytest.mark.slow),
+        (4, 400_000, {"mode": "forced"}, 258),
+        (16, 400_000, {"mode": "forced"}, 184),
+        (4, 400_000, {"mixed": True}, 490),
+        (16, 400_000, {"mixed": True, "oversampling": 8}, 153),
+        # Slower than conversions: the stored ones are read, too.
+        (16, 400_000, {}, 82),
+        (8, 400_000, {"temperature_every": 10}, 435),
+    ],
+)
 def test_an_array_reaches_the_rate_that_its_bits_allow(
-    tiles: int, scl_hz: int, tile: dict[str, Any]
+    tiles: int, scl_hz: int, tile: dict[str, Any], published_hz: float
 ) -> None:
-    content = make_scene("insole" if tiles == 8 else "standing", **tile).model_dump()
-    content["array"] |= {"scl_hz": scl_hz}
-    content["ground"] = {"kind": "none"}
-    content["rate_hz"] = 0.0
-    rig = Rig(validate_scene(content, where="test"))
-    rig.scan(50)
+    rig = Rig(make_array_scene(tiles, scl_hz, **tile))
+    predicted_hz = 1 / compute_frame_s(rig.ready.choice.schedule, rig.ready.timing)
+    assert predicted_hz == pytest.approx(published_hz, rel=0.02)
+    rig.scan(2 * tiles)
+    frames = 50 if tiles == 64 else 300
     begin_ns = rig.clock.now_ns()
-    rig.scan(400)
-    frame_s = (rig.clock.now_ns() - begin_ns) * 1e-9 / 400
-    expected_s = compute_frame_s(rig.ready.choice.schedule, rig.ready.timing)
-    assert frame_s == pytest.approx(expected_s, rel=0.02)
+    assert not any(any(flags) for flags in rig.scan(frames))
+    rate_hz = 1e9 * frames / (rig.clock.now_ns() - begin_ns)
+    assert rate_hz == pytest.approx(predicted_hz, rel=0.02)
 
 
 def test_two_tiles_share_a_channel_without_a_select_between_them() -> None:
