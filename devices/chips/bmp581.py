@@ -89,6 +89,8 @@ FILTER_COEFFICIENTS = (0, 1, 3, 7, 15, 31, 63, 127)
 """Coefficients c of the filter y = (c y + x) / (c + 1), by their code (DS 4.4.4); 0: no filter."""
 START_UP_MAX_NS = 3_000_000
 """Longest time from FORCED to the start of its conversion (DS table 4)."""
+START_SPREAD_NS = 1_200_000
+"""Time by which these starts differ, of real parts: hardware.md 12. An instant is as uncertain."""
 _TOLERANCE_PERCENT = 5  # of a conversion's time (DS table 4)
 
 FIFO_FRAMES, _FIFO_FRAME_BYTES = 32, 3
@@ -151,9 +153,11 @@ def compute_conversion_ns(settings: Registers) -> tuple[int, int]:
 def compute_sample_delay_ns(settings: Registers, conversion_ns: int) -> int:
     """Return the time from a conversion's begin to the middle of its pressure sample.
 
-    The pressure is taken to be the second part of a conversion.
+    The pressure is taken to be the second part of a conversion. The measured time of one that is
+    commanded is the longest, so that its start is late by half of what starts differ by.
     """
-    return conversion_ns - CONVERSION_P_NS[settings[0] >> 3 & 7] // 2
+    late_ns = 0 if is_free_running(settings) else START_SPREAD_NS // 2
+    return conversion_ns - late_ns - CONVERSION_P_NS[settings[0] >> 3 & 7] // 2
 
 
 def make_law(registers: Registers) -> PressureLaw:

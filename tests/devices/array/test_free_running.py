@@ -106,7 +106,8 @@ def scan_instant_errors_ns(rig: Rig, ends_ns: Ends, frames: int) -> np.ndarray:
     for _ in range(frames):
         scan = rig.array.scan_frame()
         for tile, ends in enumerate(ends_ns):
-            estimated_ns = scan.convert_stop_ns[tile] + rig.array._conversions_ns[tile]
+            half_ns = bmp581.CONVERSION_P_NS[rig.array.tiles[tile].settings[0] >> 3 & 7] // 2
+            estimated_ns = scan.convert_stop_ns[tile] + rig.array.sample_delay_ns[tile] + half_ns
             true_ns = ends.get(scan.pressure_raw[tile])
             if true_ns is not None:
                 errors_ns.append(estimated_ns - true_ns)
@@ -125,6 +126,14 @@ def test_samples_of_free_running_tiles_have_their_instants_from_the_first_frame_
     conversion_ns = max(rig.array._conversions_ns)
     assert np.abs(errors_ns).max() < 0.1 * conversion_ns, "unfollowed it would be a half"
     assert np.std(errors_ns) < 0.03 * conversion_ns
+
+
+def test_the_instants_of_commanded_conversions_are_right_in_the_mean() -> None:
+    """A conversion starts 0.3 to 1.5 ms after its command, and nothing tells when."""
+    rig = Rig(make_scene("rolling", mode="forced"))
+    errors_ns = scan_instant_errors_ns(rig, note_ends(rig), 200)
+    assert np.abs(errors_ns.mean()) < 200_000
+    assert np.std(errors_ns) == pytest.approx(bmp581.START_SPREAD_NS / 12**0.5, rel=0.1)
 
 
 def test_a_reading_that_is_read_again_has_its_own_instant() -> None:
