@@ -8,7 +8,7 @@ CONVERT, never polls, and cycles no power; changed counts show that a conversion
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise, product
 from statistics import linear_regression, median
@@ -129,8 +129,18 @@ class FoundTile:
     problem: str = ""
 
 
-def find_tiles_on_all_channels(bus: I2cBus) -> tuple[FoundTile, ...]:
-    """Search all muxes, channels and chip addresses for tiles, one at a time, without a scene.
+Place = tuple[int, int, str, int]
+"""Mux, channel, kind of chip and address of a tile."""
+
+
+def find_tiles_on_all_channels(
+    bus: I2cBus, settings: Mapping[Place, Registers]
+) -> tuple[FoundTile, ...]:
+    """Search all muxes, channels and chip addresses for tiles, one at a time.
+
+    Args:
+        bus: the bus.
+        settings: settings of the tiles that are expected; others have their chip's usual ones.
 
     Raises:
         BusFaultError: the bus itself fails, or acknowledges everything and returns only zeros.
@@ -153,7 +163,7 @@ def find_tiles_on_all_channels(bus: I2cBus) -> tuple[FoundTile, ...]:
                 bus,
                 chip,
                 address,
-                chip.encode_settings(ChipSettings()),
+                settings.get(place) or chip.encode_settings(ChipSettings()),
                 f"mux 0x{mux:02x} channel {channel}",
             )
             plugs.append(FoundTile(*place, registers))

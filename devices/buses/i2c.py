@@ -135,6 +135,10 @@ class I2cBus:
                 self.release_adapter()
             raise found from error
 
+    def transfer_once(self, *messages: i2c_msg) -> None:
+        """Run a transfer that no kind of bus retries: a part that is busy may be silent."""
+        self.transfer(*messages)
+
     def release_adapter(self) -> None:
         """Close an adapter that no longer works, so that its device number becomes free.
 
@@ -189,6 +193,10 @@ class RetryingBus(I2cBus):
             else:
                 self.retried_transfers += attempt > 0
                 return
+
+    def transfer_once(self, *messages: i2c_msg) -> None:
+        """Run a transfer without a retry."""
+        self._bus.transfer_once(*messages)
 
 
 def _classify_error(error: OSError, bus: str, messages: tuple[i2c_msg, ...]) -> I2cError:

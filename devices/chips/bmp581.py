@@ -327,9 +327,11 @@ class Bmp581:
         return (osr, iir, odr) == settings
 
     def _wait_until(self, register: int, mask: int, value: int, what: str) -> None:
+        message = i2c_msg.read(self._address, 1)
         for _ in range(_POLLS):
             with suppress(NoAcknowledgeError):  # a part in its reset is silent
-                if self._read(register, 1)[0] & mask == value:
+                self._bus.transfer_once(i2c_msg.write(self._address, [register]), message)
+                if bytes(message)[0] & mask == value:
                     return
         raise TileSetupError(
             f"the part is not {what}",
@@ -364,6 +366,7 @@ BMP581 = PressureChip(
     jump_kpa=0.5,
     far_jump_kpa=1.5,
     jump_temperature_counts=COUNTS_PER_KELVIN,
+    oversamplings=OVERSAMPLINGS,
     encode_settings=encode_settings,
     is_free_running=is_free_running,
     compute_read_bytes=compute_read_bytes,

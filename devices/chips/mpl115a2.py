@@ -250,6 +250,7 @@ MPL115A2 = PressureChip(
     jump_kpa=0.5,
     far_jump_kpa=1.5,
     jump_temperature_counts=5,  # a kelvin (hardware.md 8)
+    oversamplings=(1,),
     encode_settings=_refuse_settings,
     is_free_running=lambda _: False,
     compute_read_bytes=lambda _: ((2,), (4,)),

@@ -148,6 +148,7 @@ class PressureChip:
             reading is rare, so that it is read again.
         far_jump_kpa: distance beyond any outlier of a healthy part: its identity is verified.
         jump_temperature_counts: change from frame to frame that no healthy part shows.
+        oversamplings: numbers of samples that a reading may have.
         encode_settings: encodes a scene's settings of a tile for the driver; raises `UsageError`.
         is_free_running: returns whether a part with these settings starts conversions by itself.
         compute_read_bytes: computes the bytes of each read of a sample from settings: of the
@@ -177,6 +178,7 @@ class PressureChip:
     jump_kpa: float
     far_jump_kpa: float
     jump_temperature_counts: int
+    oversamplings: tuple[int, ...]
     encode_settings: Callable[[ChipSettings], Registers]
     is_free_running: Callable[[Registers], bool]
     compute_read_bytes: Callable[[Registers], tuple[tuple[int, ...], tuple[int, ...]]]

@@ -13,6 +13,8 @@ from devices.errors import NoAcknowledgeError
 
 ADDRESSES = range(0x70, 0x78)
 CHANNELS = range(8)
+SCL_MAX_HZ = 400_000
+"""Highest bus clock (data sheet 6.6)."""
 
 _REFUSALS_MAX = 2  # one refusal may be a disturbed bit
 

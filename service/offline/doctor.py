@@ -5,7 +5,7 @@ All values are measured over the bus; a scene only gives the expected parts.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from devices.array.schedules import (
@@ -17,6 +17,7 @@ from devices.array.schedules import (
 )
 from devices.array.self_test import (
     FoundTile,
+    Place,
     find_tiles_on_all_channels,
     measure_conversion_ns,
     measure_wire_timing,
@@ -26,8 +27,8 @@ from devices.buses.device_files import find_programs_using
 from devices.buses.i2c import I2cBus, RetryingBus
 from devices.buses.serial_line import check_latency_timer, find_stable_path, read_latency_timer_ms
 from devices.chips.dynamixel.servo_setup import BAUDRATES, FoundServo, find_servos
-from devices.chips.pressure_chip import ChipSettings
 from devices.chips.pressure_chips import get_chip
+from devices.chips.tca9548a import SCL_MAX_HZ
 from devices.clock import Clock
 from devices.errors import I2cError, ServoSetupError
 from devices.frames import TileInfo
@@ -96,10 +97,15 @@ def diagnose_bus(
     """
     array = scene.array if scene is not None else ArraySection()
     bus = RetryingBus(bus)
-    findings = _match_tiles(
-        find_tiles_on_all_channels(bus), scene.tile if scene is not None else ()
-    )
-    well = [(finding, _make_tile_info(finding)) for finding in findings if not finding.problem]
+    expected: dict[Place, TileSection] = {
+        (tile.mux, tile.channel, tile.chip, tile.chip_address): tile
+        for tile in (scene.tile if scene is not None else ())
+    }
+    settings = {place: tile.chip_settings for place, tile in expected.items()}
+    findings = _match_tiles(find_tiles_on_all_channels(bus, settings), expected)
+    sound = [finding for finding in findings if not finding.problem]
+    sections = [expected.get(_place(finding)) or _make_section(finding) for finding in sound]
+    well = [(each, _make_tile_info(each, of)) for each, of in zip(sound, sections, strict=True)]
     if not well:
         return BusDiagnosis(
             findings,
@@ -112,7 +118,7 @@ def diagnose_bus(
             verdict=_describe_no_tiles(findings),
         )
     wires = measure_wire_timing(bus, clock, well[0][1])
-    measured: dict[_Place, TileFinding] = {}
+    measured: dict[Place, TileFinding] = {}
     conversions_ns: list[int | None] = []
     for finding, info in well:
         try:
@@ -147,6 +153,15 @@ def diagnose_bus(
     hints = (
         *advice.hints,
         _describe_slowest_tile(requested, timing, schedule, rates[schedule]),
+        _advise_oversampling(
+            [info for _, info in well],
+            sections,
+            conversions_ns,
+            lambda tiles, times_ns: (
+                1.0 / compute_frame_s(schedule, compute_bus_timing(array, wires, tiles, times_ns))
+            ),
+            requested_hz,
+        ),
         _describe_disturbance(bus.retried_transfers),
     )
     return BusDiagnosis(
@@ -161,19 +176,14 @@ def diagnose_bus(
     )
 
 
-_Place = tuple[int, int, str, int]
-
-
-def _place(tile: FoundTile) -> _Place:
+def _place(tile: FoundTile) -> Place:
     return tile.mux, tile.channel, tile.chip, tile.address
 
 
 def _match_tiles(
-    plugs: tuple[FoundTile, ...], wanted: tuple[TileSection, ...]
+    plugs: tuple[FoundTile, ...], expected: Mapping[Place, TileSection]
 ) -> tuple[TileFinding, ...]:
-    places: dict[_Place, str] = {
-        (tile.mux, tile.channel, tile.chip, tile.chip_address): tile.serial for tile in wanted
-    }
+    places = {place: tile.serial for place, tile in expected.items()}
     there = {_place(plug): plug for plug in plugs}
     found = [
         TileFinding(**vars(plug), serial=places.get(place, "")) for place, plug in there.items()
@@ -186,12 +196,25 @@ def _match_tiles(
     return tuple(sorted((*found, *absent), key=_place))
 
 
-def _make_tile_info(finding: TileFinding) -> TileInfo:
+def _make_section(finding: TileFinding) -> TileSection:
+    """Make the section of a tile that no scene has."""
+    return TileSection(
+        serial=f"0x{finding.mux:02x}.{finding.channel}",
+        mux=finding.mux,
+        channel=finding.channel,
+        chip=finding.chip,
+        address=finding.address,
+        x_m=0.0,
+        y_m=0.0,
+        z_m=0.0,
+    )
+
+
+def _make_tile_info(finding: TileFinding, section: TileSection) -> TileInfo:
     assert finding.registers is not None  # noqa: S101  # without a problem there are some
-    chip = get_chip(finding.chip)
-    settings = chip.encode_settings(ChipSettings())
+    settings = section.chip_settings
     return TileInfo(
-        serial=finding.serial or f"0x{finding.mux:02x}.{finding.channel}",
+        serial=section.serial,
         mux=finding.mux,
         channel=finding.channel,
         chip=finding.chip,
@@ -202,7 +225,7 @@ def _make_tile_info(finding: TileFinding) -> TileInfo:
         z_m=0.0,
         reference=False,
         settings=settings,
-        conversion_ms=chip.compute_conversion_ns(settings)[0] / 1e6,
+        conversion_ms=get_chip(finding.chip).compute_conversion_ns(settings)[0] / 1e6,
     )
 
 
@@ -237,6 +260,8 @@ def _make_advice(
     if ill:
         names = ", ".join(f.serial or f"0x{f.mux:02x} channel {f.channel}" for f in ill)
         wrong.append(f"{names} {'needs' if len(ill) == 1 else 'need'} attention first.")
+    if array.scl_hz > SCL_MAX_HZ:
+        hints.append(f"The multiplexers are rated for {SCL_MAX_HZ / 1e3:.0f} kHz only.")
     part = timing.scl_hz / array.scl_hz
     if part < _MIN_CLOCK_SHARE:
         slow = f"The bus runs at {timing.scl_hz / 1e3:.0f} kHz where {array.scl_hz / 1e3:.0f} are"
@@ -295,6 +320,46 @@ def _describe_slowest_tile(
     return (
         f"{name} converts slowest ({slowest_s * 1e3:.2f} ms) and sets the pace: with a part like "
         f"the others it would be {without_hz:.0f}."
+    )
+
+
+_NEARLY = 0.85
+"""Part of the best rate for which less noise is worth the rest."""
+
+
+def _advise_oversampling(
+    tiles: Sequence[TileInfo],
+    sections: Sequence[TileSection],
+    conversions_ns: Sequence[int | None],
+    predict_hz: Callable[[Sequence[TileInfo], Sequence[int | None]], float],
+    requested_hz: float,
+) -> str:
+    """Advise the oversampling with which free-running tiles convert in about a frame.
+
+    Longer conversions would set the pace, and of shorter ones several have to be read.
+    """
+    free = [i for i, tile in enumerate(tiles) if get_chip(tile.chip).is_free_running(tile.settings)]
+    rates_hz: dict[int, float] = {}
+    for number in get_chip(tiles[free[0]].chip).oversamplings if free else ():
+        changed, times_ns = list(tiles), list(conversions_ns)
+        for i in free:
+            compute_ns = get_chip(tiles[i].chip).compute_conversion_ns
+            settings = sections[i].model_copy(update={"oversampling": number}).chip_settings
+            changed[i] = tiles[i].model_copy(update={"settings": settings})
+            if (known_ns := conversions_ns[i]) is not None:
+                ratio = compute_ns(settings)[0] / compute_ns(tiles[i].settings)[0]
+                times_ns[i] = round(known_ns * ratio)
+        rates_hz[number] = predict_hz(changed, times_ns)
+    if not rates_hz:
+        return ""
+    best_hz = max(rates_hz.values())
+    least_hz = requested_hz if 0 < requested_hz <= best_hz else _NEARLY * best_hz
+    advised = max(number for number, rate_hz in rates_hz.items() if rate_hz >= least_hz)
+    if all(sections[i].oversampling == advised for i in free):
+        return ""
+    return (
+        f"Set oversampling = {advised}: {rates_hz[advised]:.0f} frames/s, with the least noise at "
+        "this rate."
     )
 
 

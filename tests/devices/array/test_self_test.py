@@ -94,7 +94,7 @@ def test_a_bus_that_fails_at_the_start_is_no_fault_of_a_tile() -> None:
 def test_tiles_are_found_on_every_channel_of_every_mux() -> None:
     plugs: Plugs = ((0x70, 1), (0x72, 0), (0x72, 7), (0x77, 3))
     wires = Wires(plugs, words={1: FORUM_CHIP, 2: THIRD, 3: (0, 0, 0, 0)})
-    found = find_tiles_on_all_channels(wires.bus)
+    found = find_tiles_on_all_channels(wires.bus, {})
     assert [(plug.mux, plug.channel) for plug in found] == list(plugs)
     words = [plug.registers for plug in found]
     assert words == [DATA_SHEET_CHIP, FORUM_CHIP, THIRD, None]
@@ -105,10 +105,10 @@ def test_tiles_are_found_on_every_channel_of_every_mux() -> None:
 def test_no_tile_is_found_on_an_empty_bus_and_a_stuck_one_is_an_error() -> None:
     wires = Wires(FOUR)
     with wires.fault("sda_high"):
-        assert find_tiles_on_all_channels(wires.bus) == ()
+        assert find_tiles_on_all_channels(wires.bus, {}) == ()
     # hardware.md 3.2: an SDA that is stuck low looks like an answer at every address
     with wires.fault("sda_low"), pytest.raises(BusFaultError, match="8 multiplexers") as caught:
-        find_tiles_on_all_channels(wires.bus)
+        find_tiles_on_all_channels(wires.bus, {})
     assert "SDA is stuck low" in caught.value.remedy
 
 

@@ -169,3 +169,45 @@ def test_a_bus_that_hangs_since_the_last_run_is_freed_or_named_and_no_tile_is_bl
     outcome = run(*simulate)
     outcome.fails(1, "SDA is stuck low")
     assert "T01" not in outcome.err
+
+
+def bmp581_text(tiles: int, **keys: object) -> str:
+    """Return the text of a scene of the grid's first tiles, of the chip BMP581."""
+    head, *sections = scene_text("grid").split("[[tile]]")
+    sections[-1], behind = sections[-1].split("\n[", 1)
+    lines = [f"{key} = {json.dumps(value)}" for key, value in {"chip": "bmp581", **keys}.items()]
+    own = ["\n".join(["[[tile]]", *lines, each]) for each in sections[:tiles]]
+    return "".join([head, *own, "\n[", behind])
+
+
+@pytest.mark.parametrize(
+    ("tiles", "keys", "rate_hz", "advice"),
+    [
+        (4, {}, 490, ""),
+        (4, {"oversampling": 8}, 153, "oversampling = 1: 490 frames/s"),
+        (8, {}, 267, "oversampling = 4: 251 frames/s"),
+        (8, {"oversampling": 4}, 251, ""),
+        (8, {"mode": "forced"}, 258, ""),
+        (16, {"oversampling": 8}, 149, ""),
+        pytest.param(64, {}, 6.2, "oversampling = 32: 36 frames/s", marks=pytest.mark.slow),
+    ],
+)
+def test_tiles_with_settings_are_examined_with_them_and_better_ones_are_advised(
+    doctor: Doctor, tiles: int, keys: dict[str, object], rate_hz: float, advice: str
+) -> None:
+    found = doctor(bmp581_text(tiles, **keys)).printed()
+    assert len(found["tiles"]) == tiles
+    assert found["rates_hz"]["pipelined"] == pytest.approx(rate_hz, rel=0.02)
+    assert advice in found["verdict"]
+    assert ("Set oversampling" in found["verdict"]) == bool(advice)
+    assert "repeated" not in found["verdict"], "a part in its reset is no disturbance"
+
+
+def test_a_requested_rate_leaves_time_for_more_samples(doctor: Doctor) -> None:
+    verdict = doctor(bmp581_text(4), "--rate-hz", 100).printed()["verdict"]
+    assert "Set oversampling = 8: 153 frames/s" in verdict
+
+
+def test_a_clock_beyond_the_multiplexers_is_named(doctor: Doctor) -> None:
+    text = bmp581_text(4) + "\n[array]\nscl_hz = 1000000\n"
+    assert "rated for 400 kHz only" in doctor(text).printed()["verdict"]
