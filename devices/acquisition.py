@@ -239,8 +239,8 @@ class Acquisition:
 class RangeDetector:
     """Detector of readings outside the chips' pressure range, for batches in order.
 
-    Raw counts stay as read. Beyond its range an MPL115A2's count falls through zero and wraps to
-    near full count (hardware.md 1.3), so both ends are out of range.
+    Raw counts stay as read. Beyond its range the count of a chip that wraps, as an MPL115A2, falls
+    through zero to near full count (hardware.md 1.3), so both ends are out of range.
     """
 
     def __init__(self, tiles: tuple[TileInfo, ...]) -> None:
@@ -252,5 +252,6 @@ class RangeDetector:
         held, self._temperature = hold_temperature(batch, self._temperature)
         chips = self._compensation
         kpa = chips.compute_usable_kpa(held)
-        outside = (kpa > chips.max_kpa) | (kpa < chips.min_kpa) | (batch.pressure_raw <= 1)
+        at_wrap = (batch.pressure_raw <= 1) & (chips.wrap_counts > 0)
+        outside = (kpa > chips.max_kpa) | (kpa < chips.min_kpa) | at_wrap
         batch.tile_flags[outside & ~np.isnan(kpa)] |= np.uint8(TileFlag.OVER_RANGE)

@@ -357,6 +357,7 @@ BMP581 = PressureChip(
     counts_max=((1 << 24) - 1, (1 << 24) - 1),
     wrap_counts=0,
     counts_per_kelvin=COUNTS_PER_KELVIN,
+    temperature_noise_counts=0.0055 * COUNTS_PER_KELVIN,  # of a real part (hardware.md 12)
     temperature_raw_at_25_degc=TEMPERATURE_OFFSET + 25.0 * COUNTS_PER_KELVIN,
     temperature_raw_usual=TEMPERATURE_OFFSET + 25.0 * COUNTS_PER_KELVIN,
     bytes_per_conversion=_FIFO_FRAME_BYTES,

@@ -239,6 +239,7 @@ MPL115A2 = PressureChip(
     counts_max=(COUNTS_MAX, COUNTS_MAX),
     wrap_counts=COUNTS_MAX + 1,
     counts_per_kelvin=TADC_PER_KELVIN,
+    temperature_noise_counts=0.5,  # hardware.md 1.6
     # Within some 5 K: the data sheet states no scale (hardware.md 1.3).
     temperature_raw_at_25_degc=472.0,
     temperature_raw_usual=500.0,

@@ -139,6 +139,7 @@ class PressureChip:
         counts_max: largest count of pressure and of temperature.
         wrap_counts: modulus of pressure counts, which wrap beyond the rated range; 0: they do not.
         counts_per_kelvin: temperature counts per kelvin.
+        temperature_noise_counts: standard deviation of a temperature reading.
         temperature_raw_at_25_degc: temperature counts at 25 degC; an estimate where the chip is not
             calibrated for it.
         temperature_raw_usual: temperature counts of a foot in use.
@@ -170,6 +171,7 @@ class PressureChip:
     counts_max: Counts
     wrap_counts: int
     counts_per_kelvin: float
+    temperature_noise_counts: float
     temperature_raw_at_25_degc: float
     temperature_raw_usual: float
     bytes_per_conversion: int

@@ -89,6 +89,7 @@ class Compensation:
         self.wrap_counts = np.array([chip.wrap_counts for chip in chips])
         """Pressure counts after which readings beyond the range wrap; 0: never."""
         self.counts_per_kelvin = np.array([chip.counts_per_kelvin for chip in chips])
+        self.temperature_noise_counts = np.array([chip.temperature_noise_counts for chip in chips])
         self.temperature_raw_usual = np.array([chip.temperature_raw_usual for chip in chips])
 
     def compute_usable_kpa(self, frames: FrameBatch) -> Floats:

@@ -331,8 +331,9 @@ def _split_by_tile(session: SealedFileReader) -> tuple[list[Indentation], tuple[
     compensation = Compensation(session.info.tiles)
     readable_kpa = compensation.compute_usable_kpa(held)
     # A count that wrapped around reads as almost no pressure (model `unwrap`): the tile was
-    # loaded beyond its chip's range.
-    kpa = np.where(readable_kpa < compensation.min_kpa, np.inf, readable_kpa)
+    # loaded beyond its chip's range. Of a chip whose counts do not wrap it is no pressure.
+    below_kpa = np.where(compensation.wrap_counts > 0, np.inf, np.nan)
+    kpa = np.where(readable_kpa < compensation.min_kpa, below_kpa, readable_kpa)
     tiles = [
         Indentation(
             serial=tile.serial,

@@ -29,6 +29,7 @@ class LoadBearingTiles:
         baseline_kpa: absolute pressure at the tare.
         tare_counts: mean raw temperature at the tare.
         counts_per_kelvin: temperature counts of the chips per kelvin.
+        temperature_noise_counts: standard deviation of their temperature readings.
         rated_max_kpa: end of the chips' rated range.
         step_s: nominal time between two readings.
         has_bare_tile: whether the array has a bare reference tile, too.
@@ -40,6 +41,7 @@ class LoadBearingTiles:
     baseline_kpa: Floats
     tare_counts: Floats
     counts_per_kelvin: Floats
+    temperature_noise_counts: Floats
     rated_max_kpa: Floats
     step_s: float
     has_bare_tile: bool

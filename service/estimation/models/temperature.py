@@ -2,10 +2,10 @@
 
 The raw temperature is the chip's. Gas and chip follow the surroundings one behind the other, by a
 lag of some seconds that is measured per tile in the rig's thermal soak. Where the gas lags, it
-follows its chip as through a low-pass, which suppresses the half count of noise of a reading. Where
-the chip lags, the gas is ahead: its rise goes on for the lag. Only the past is known, so the rise
-is that of a chip smoothed twice, over an eighth of the lag, which keeps the remaining noise below
-that of a reading. The uncertainty of the lag times the rise is part of sigma.
+follows its chip as through a low-pass, which suppresses the noise of a reading. Where the chip
+lags, the gas is ahead: its rise goes on for the lag. Only the past is known, so the rise is that of
+a chip smoothed twice, over an eighth of the lag, which keeps the remaining noise below that of a
+reading. The uncertainty of the lag times the rise is part of sigma.
 
 Pressure is referred to the tare's temperature in proportion to itself, because a warmer gas also
 responds to a squeeze more strongly.
@@ -26,18 +26,16 @@ from service.estimation.records import KernelRecord, RecordArray
 
 STARTUP_S = 0.5
 """Time at first for which the chip's mean temperature stands for the gas."""
-START_TOLERANCE_COUNTS = 2.0
+START_TOLERANCE_K = 2.0 / 5.35  # two counts of an MPL115A2
 """Largest distance from the tare's temperature at which a starting gas is as warm as its chip."""
 SMOOTHING_MIN_S = 0.1
 """Shortest time over which a chip's temperature is smoothed for its rise."""
 SMOOTHING_PER_LAG = 0.125
 """Smoothing time of a chip that lags its gas, as a part of the lag."""
-READING_NOISE_COUNTS = 0.5
-"""Standard deviation of a raw temperature reading (hardware.md 1.3)."""
 
 
 class TemperatureParams(ModelParams):
-    """Parameters of a tile; the last two follow from the others."""
+    """Parameters of a tile; the last two follow from the others and the chip."""
 
     effect = "temperature"
     is_needed_of_every_tile = True
@@ -48,6 +46,7 @@ class TemperatureParams(ModelParams):
     lag_sigma_s: float
     tare_counts: float  # mean raw temperature during the tare
     baseline_kpa: float  # absolute pressure at the tare
+    start_tolerance_counts: float
     smoothing_s: float
     noise_counts: float
 
@@ -64,8 +63,11 @@ class TemperatureParams(ModelParams):
             lag_sigma_s=[e.lag_s.sigma for e in found],
             tare_counts=tiles.tare_counts,
             baseline_kpa=tiles.baseline_kpa,
+            start_tolerance_counts=START_TOLERANCE_K * np.abs(tiles.counts_per_kelvin),
             smoothing_s=compute_smoothing_s(lag_s),
-            noise_counts=compute_gas_temperature_noise_counts(lag_s, tiles.step_s),
+            noise_counts=compute_gas_temperature_noise_counts(
+                lag_s, tiles.step_s, tiles.temperature_noise_counts
+            ),
         )
 
     @classmethod
@@ -93,14 +95,16 @@ def compute_smoothing_s(lag_s: Floats) -> Floats:
     return np.asarray(np.maximum(time_s, SMOOTHING_MIN_S))
 
 
-def compute_gas_temperature_noise_counts(gas_lag_s: Floats, step_s: float) -> Floats:
-    """Return the noise of the gas' counts by that of the raw temperature; 0 where the gas lags."""
+def compute_gas_temperature_noise_counts(
+    gas_lag_s: Floats, step_s: float, reading_counts: Floats | float
+) -> Floats:
+    """Return the noise of the gas' counts by that of a chip's reading; 0 where the gas lags."""
     time_s = compute_smoothing_s(gas_lag_s)
     lead = np.where(gas_lag_s < 0.0, 1.0 - gas_lag_s / time_s, 0.0)
     # (1 + (1 + lead) S s)/(1 + S s)^2 of white noise; the low-pass of a lag removes nearly all.
     power = step_s * (1.0 + (1.0 + lead) ** 2) / (4.0 * time_s)
     return np.asarray(
-        np.where(gas_lag_s < 0.0, READING_NOISE_COUNTS * np.sqrt(np.minimum(power, 4.0)), 0.0)
+        np.where(gas_lag_s < 0.0, reading_counts * np.sqrt(np.minimum(power, 4.0)), 0.0)
     )
 
 
@@ -153,7 +157,7 @@ def refer_to_tare_temperature_with_sigma(
     # distance is uncertain, and less so with every lag that passes.
     start_counts = state.first_counts - params.tare_counts
     unknown_counts = 0.0
-    if abs(start_counts) > START_TOLERANCE_COUNTS:
+    if abs(start_counts) > params.start_tolerance_counts:
         since_s = max(t_ns - state.first_ns, 0) * 1e-9
         unknown_counts = start_counts * math.exp(-since_s / max(abs(params.lag_s), SMOOTHING_MIN_S))
     warmed_kpa = params.kpa_per_count * (state.gas_counts - params.tare_counts)

@@ -132,6 +132,7 @@ def make_plan(
         baseline_kpa=tare.baseline_kpa[bearing],
         tare_counts=tare.temperature_raw_counts[bearing],
         counts_per_kelvin=compensation.counts_per_kelvin[bearing],
+        temperature_noise_counts=compensation.temperature_noise_counts[bearing],
         rated_max_kpa=compensation.max_kpa[bearing],
         step_s=1.0 / info.nominal_rate_hz,
         has_bare_tile=len(bearing) < len(info.tiles),

@@ -34,7 +34,7 @@ _CREEP_S = np.array([0.3, 1.0, 3.0, 10.0])
 _BLOCK_S = 0.5
 _ALONE_S = 5.0
 """Least unloaded time for a recovery to show: half of the longest time constant."""
-_STEADY_COUNTS = 1.0  # of the chip's temperature: 0.2 K, 0.06 kPa
+_STEADY_K = 1.0 / 5.35  # of the chip: a count of an MPL115A2, 0.06 kPa
 _AHEAD_S = 3.0
 """Largest lead of a gas' temperature before its chip's."""
 
@@ -83,7 +83,8 @@ def _extract_steady_soak(t_s: Floats, recording: Indentation) -> tuple[Floats, F
         np.bincount(block, values[rows]) / size
         for values in (t_s, recording.kpa, recording.temperature_raw)
     )
-    moved = np.abs(temperature_raw - temperature_raw[0]) > _STEADY_COUNTS
+    steady_counts = _STEADY_K * abs(recording.chip.counts_per_kelvin)
+    moved = np.abs(temperature_raw - temperature_raw[0]) > steady_counts
     steady = at_s < at_s[np.argmax(moved)] - _AHEAD_S if moved.any() else np.full(len(at_s), True)
     return at_s[steady], kpa[steady]
 

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from devices.chips.mpl115a2 import MPL115A2
 from service.estimation.models.temperature import (
-    READING_NOISE_COUNTS,
+    START_TOLERANCE_K,
     TemperatureParams,
     TemperatureState,
     compute_gas_temperature_noise_counts,
@@ -40,7 +41,10 @@ def refer(
         tare_counts=TARE,
         baseline_kpa=BASE_KPA,
         smoothing_s=compute_smoothing_s(lag),
-        noise_counts=compute_gas_temperature_noise_counts(lag, 0.002),
+        start_tolerance_counts=abs(START_TOLERANCE_K * MPL115A2.counts_per_kelvin),
+        noise_counts=compute_gas_temperature_noise_counts(
+            lag, 0.002, MPL115A2.temperature_noise_counts
+        ),
     )
     t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
     readings = kpa, np.asarray(temperature_raw, dtype=float), t_ns
@@ -70,11 +74,12 @@ def test_a_gas_leads_an_evenly_warming_chip_with_a_negative_lag(lag_s: float) ->
 def test_the_noise_of_a_leading_gas_is_less_than_that_of_a_reading(lag_s: float) -> None:
     rng = np.random.default_rng(1)
     t_s = np.arange(0.0, 100.0, 0.002)
-    chip = TARE + rng.normal(0, READING_NOISE_COUNTS, len(t_s))
+    chip = TARE + rng.normal(0, MPL115A2.temperature_noise_counts, len(t_s))
     counts, sigma_kpa = follow(chip, t_s, lag_s=lag_s)
     left = counts[10_000:].std()
-    stated = compute_gas_temperature_noise_counts(np.array([lag_s]), 0.002)[0]
-    assert left < READING_NOISE_COUNTS
+    noise_counts = MPL115A2.temperature_noise_counts
+    stated = compute_gas_temperature_noise_counts(np.array([lag_s]), 0.002, noise_counts)[0]
+    assert left < MPL115A2.temperature_noise_counts
     assert left == pytest.approx(stated, rel=0.2)
     assert np.median(sigma_kpa) >= 0.95 * abs(KPA_PER_COUNT) * left
 

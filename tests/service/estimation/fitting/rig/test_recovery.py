@@ -9,6 +9,8 @@ import pytest
 from scipy.signal import lfilter
 
 from devices.chips.mpl115a2 import MPL115A2
+from devices.chips.pressure_chip import PressureChip
+from devices.chips.pressure_chips import PRESSURE_CHIPS
 from devices.errors import CalibrationError
 from service.estimation.fitting.rig.checks import (
     check_baseline_drift_between_repeats_kpa,
@@ -27,14 +29,17 @@ ALL_N = np.append(STROKES_N, np.zeros(round(ALONE_S / STEP_S)))
 T_S = STEP_S * np.arange(len(ALL_N))
 
 
-def record(extra_kpa: np.ndarray | None = None, *, alone_s: float = ALONE_S) -> Indentation:
+def record(
+    extra_kpa: np.ndarray | None = None, *, alone_s: float = ALONE_S, chip: PressureChip = MPL115A2
+) -> Indentation:
     """Record four slow strokes, then no load; the pressure is the force's, and `extra_kpa`."""
     force_n = np.append(STROKES_N, np.zeros(round(alone_s / STEP_S)))
     phase = np.append(PHASES, np.full(round(alone_s / STEP_S), "soak"))
     extra = np.zeros(len(force_n)) if extra_kpa is None else extra_kpa[: len(force_n)]
-    noise = np.random.default_rng(1).normal(0.0, 0.165, len(force_n))
+    rng = np.random.default_rng(1)
+    noise = rng.normal(0.0, 0.165, len(force_n))
     return Indentation(
-        chip=MPL115A2,
+        chip=chip,
         serial="T01",
         where="bench.parquet",
         t_ns=np.rint(1e9 * STEP_S * np.arange(len(force_n))).astype(np.int64),
@@ -42,7 +47,9 @@ def record(extra_kpa: np.ndarray | None = None, *, alone_s: float = ALONE_S) -> 
         reference_n=np.where(phase == "soak", np.nan, force_n + 0.3),
         phase=phase,
         is_under_indenter=phase != "soak",
-        temperature_raw=np.full(len(force_n), 498.0),
+        temperature_raw=rng.normal(
+            chip.temperature_raw_usual, chip.temperature_noise_counts, len(force_n)
+        ),
     )
 
 
@@ -58,10 +65,13 @@ def compute_creep_kpa(parts: tuple[float, ...], times_s: tuple[float, ...]) -> n
     return np.asarray(KPA_PER_N * np.sum(lags_n, axis=0))
 
 
+@pytest.mark.parametrize("chip", PRESSURE_CHIPS.values(), ids=PRESSURE_CHIPS)
 @pytest.mark.parametrize("times_s", [(9.0,), (1.3, 7.0), (0.2, 2.0, 10.0)])
-def test_creep_of_15_percent_over_seconds_is_no_drift(times_s: tuple[float, ...]) -> None:
+def test_creep_of_15_percent_over_seconds_is_no_drift(
+    times_s: tuple[float, ...], chip: PressureChip
+) -> None:
     part = 0.15 / len(times_s)
-    recording = record(compute_creep_kpa((part,) * len(times_s), times_s))
+    recording = record(compute_creep_kpa((part,) * len(times_s), times_s), chip=chip)
     assert check_baseline_drift_between_repeats_kpa([recording]) < 0.8
     settled = fit_unloaded_recovery(recording)
     assert settled is not None
