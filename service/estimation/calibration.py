@@ -294,6 +294,10 @@ def is_increasing_cubic(
     return all(c1 + u * (2 * c2 + u * 3 * c3) > 0.0 for u in places)
 
 
+PAPER_EQUATION_2 = (0.1309, 0.5702, 0.02354, 0.13)
+"""Coefficients of the paper's curve, from the constant on; without units."""
+
+
 def make_paper_shape_preset() -> Calibration:
     """Make a preset with the shape of the paper's eq. 2, for any tile, with an assumed scale.
 
@@ -301,8 +305,7 @@ def make_paper_shape_preset() -> Calibration:
     gives the paper's 25 to 35 N at saturation (hardware.md 7). So: p = gauge / 15 kPa, zero at zero
     load, 30 N at full scale. The 25 to 35 N that are possible stand as 10 % uncertainty of scale.
     """
-    coefficients = (0.1309, 0.5702, 0.02354, 0.13)
-    full_scale = sum(coefficients[1:])
+    full_scale = sum(PAPER_EQUATION_2[1:])
     none = tuple(tuple(0.0 for _ in range(CUBIC_TERMS)) for _ in range(CUBIC_TERMS))
     tile = TileCalibration(
         serial=ANY_SERIAL,
@@ -312,7 +315,7 @@ def make_paper_shape_preset() -> Calibration:
         f_offset_n=0.0,
         f_scale_n=30.0 / full_scale,
         zero_mode="subtract_f0",
-        coefficients=coefficients,
+        coefficients=PAPER_EQUATION_2,
         range_kpa=(0.0, 15.0),
         monotonic=True,
         absolute_scale="assumed",

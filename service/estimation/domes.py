@@ -1,7 +1,7 @@
 """Choice of a dome for a load, by the paper's Table I and Boyle's law.
 
-The paper gives the range of one dome only, 25 to 35 N for 11 mm of Vytaflex 60 (III-A). For the
-others there is only a scaling, marked as an estimate: their curves are not published. PAPER is
+The paper gives the range of one dome over its chip only, 25 to 35 N for 11 mm of Vytaflex 60
+(III-A). For others there is only a scaling, marked as an estimate: no curve is published. PAPER is
 Ruppert and Badri-Sproewitz 2020, [D] a derivation in hardware.md 9.
 """
 
@@ -12,6 +12,7 @@ from math import pi
 from typing import Literal
 
 from devices.chips.mpl115a2 import MPL115A2
+from service.estimation.calibration import PAPER_EQUATION_2
 
 SEAL_KPA = 100.0
 """Approximate pressure at which a bubble is sealed (PAPER II-A)."""
@@ -19,8 +20,9 @@ ISOTHERMAL = 1.0
 ADIABATIC = 1.4
 """Exponents of air; a real load has a polytropic exponent between the two, by its speed against a
 relaxation of 5 to 42 ms ([D])."""
-FULL_SCALE_KPA = MPL115A2.max_kpa
-"""End of the range of the paper's chip."""
+PAPER_CHIP = MPL115A2
+PAPER_KPA = PAPER_CHIP.max_kpa
+"""End of that chip's range: full scale of the paper's domes."""
 BUBBLE_RADIUS_MM = 3.0
 """PAPER Table I, for the 11 mm dome; assumed for the others."""
 
@@ -74,21 +76,22 @@ PAPER_RANGE_N = (25.0, 35.0)
 """Load at which that dome saturates its chip (PAPER III-A)."""
 
 
-def compute_volume_ratio(exponent: float = ISOTHERMAL) -> float:
+def compute_volume_ratio(exponent: float = ISOTHERMAL, full_scale_kpa: float = PAPER_KPA) -> float:
     """Return V2/V1 of a bubble that goes from its seal to full scale: p1 V1^k = p2 V2^k.
 
     Slowly, k = 1, this is Boyle's law (PAPER eq. 1): 0.8696 is left at 115 kPa, 13 % are gone. Fast
     loads reach full scale earlier: k = 1.4 leaves 0.9050.
     """
-    return float((SEAL_KPA / FULL_SCALE_KPA) ** (1.0 / exponent))
+    return float((SEAL_KPA / full_scale_kpa) ** (1.0 / exponent))
 
 
-def compute_fast_to_slow_saturation_load_ratio() -> float:
+def compute_fast_to_slow_saturation_load_ratio(full_scale_kpa: float = PAPER_KPA) -> float:
     """Return the change of volume at full scale of a fast load, relative to a slow one: 0.73.
 
     With volume proportional to force this is also the ratio of the loads ([D], estimate).
     """
-    return (1.0 - compute_volume_ratio(ADIABATIC)) / (1.0 - compute_volume_ratio())
+    slow = 1.0 - compute_volume_ratio(ISOTHERMAL, full_scale_kpa)
+    return (1.0 - compute_volume_ratio(ADIABATIC, full_scale_kpa)) / slow
 
 
 def compute_wall_compliance_per_kpa(dome: Dome) -> float:
@@ -127,26 +130,48 @@ class SlowSaturationLoad:
         return "perhaps" if load_n <= self.high_n else "saturates"
 
 
-def compute_saturation_load(dome: Dome) -> SlowSaturationLoad:
-    """Return the saturation load: the paper's for its dome, else scaled by modulus and area.
+def compute_load_growth(full_scale_kpa: float) -> tuple[float, float]:
+    """Return the least and the greatest load at another full scale, over that at the paper's.
 
-    The scaling assumes the same shape and strain at full scale. It agrees with the paper in
-    direction only: stiffer and larger domes shift the curve to higher force (PAPER Fig. 5).
+    Nothing is published beyond the paper's full scale. At least the load follows the volume that is
+    lost, 1.53 times to 125 kPa, since a dome stiffens; at most the paper's curve, 2.24 times
+    (hardware.md 12, estimates).
     """
-    if dome == PAPER_DOME:
+    lost = 1.0 - compute_volume_ratio(full_scale_kpa=full_scale_kpa)
+    at = (full_scale_kpa - SEAL_KPA) / (PAPER_KPA - SEAL_KPA)  # in the paper's full scales
+    terms = PAPER_EQUATION_2[1:]
+    curve = sum(term * at**power for power, term in enumerate(terms, start=1)) / sum(terms)
+    return lost / (1.0 - compute_volume_ratio()), curve
+
+
+def compute_saturation_load(dome: Dome, full_scale_kpa: float = PAPER_KPA) -> SlowSaturationLoad:
+    """Return the saturation load: the paper's for its dome and chip, else scaled.
+
+    The scaling by modulus and area assumes the same shape and strain at full scale. It agrees with
+    the paper in direction only: stiffer and larger domes shift the curve to higher force (PAPER
+    Fig. 5).
+    """
+    if dome == PAPER_DOME and full_scale_kpa == PAPER_KPA:
         return SlowSaturationLoad(dome, *PAPER_RANGE_N, "paper")
     scale = (dome.material.modulus_mpa * dome.base_area_mm2) / (
         PAPER_DOME.material.modulus_mpa * PAPER_DOME.base_area_mm2
     )
-    return SlowSaturationLoad(dome, scale * PAPER_RANGE_N[0], scale * PAPER_RANGE_N[1], "estimate")
+    low_n, high_n = (
+        scale * growth * load_n
+        for growth, load_n in zip(compute_load_growth(full_scale_kpa), PAPER_RANGE_N, strict=True)
+    )
+    return SlowSaturationLoad(dome, low_n, high_n, "estimate")
 
 
-def list_saturation_loads() -> list[SlowSaturationLoad]:
+def list_saturation_loads(full_scale_kpa: float = PAPER_KPA) -> list[SlowSaturationLoad]:
     """Return the saturation loads of all domes of Table I, weakest first."""
-    return sorted((compute_saturation_load(dome) for dome in DOMES), key=lambda found: found.low_n)
+    found = (compute_saturation_load(dome, full_scale_kpa) for dome in DOMES)
+    return sorted(found, key=lambda load: load.low_n)
 
 
-def select_weakest_covering_dome(load_n: float) -> SlowSaturationLoad | None:
+def select_weakest_covering_dome(
+    load_n: float, full_scale_kpa: float = PAPER_KPA
+) -> SlowSaturationLoad | None:
     """Return the weakest dome that covers a slow load; it resolves the load best.
 
     If none does for certain, the weakest that perhaps does; None if all saturate.
@@ -157,7 +182,7 @@ def select_weakest_covering_dome(load_n: float) -> SlowSaturationLoad | None:
     if not load_n > 0.0:
         raise ValueError(f"a load of {load_n} N is no load")
     for verdict in ("covers", "perhaps"):
-        for found in list_saturation_loads():
+        for found in list_saturation_loads(full_scale_kpa):
             if found.judge_slow_load(load_n) == verdict:
                 return found
     return None

@@ -23,7 +23,7 @@ from scipy.special import chdtri
 
 from devices.arrays import Floats
 from devices.scene.scene_file import Scene
-from service.estimation.calibration import Calibration, TileCalibration
+from service.estimation.calibration import PAPER_EQUATION_2, Calibration, TileCalibration
 from service.estimation.domes import Dome, SlowSaturationLoad, compute_saturation_load
 from service.estimation.fitting.least_squares import (
     compute_curve_through_zero_n,
@@ -52,15 +52,13 @@ FRAME_RATE_HZ = 330.0
 """Frame rate of four tiles (II-C)."""
 LEG_WEIGHT_N = 8.92
 
-_EQUATION_2 = (0.1309, 0.5702, 0.02354, 0.13)
-
 
 def compute_normalised_force(output: Floats) -> Floats:
     """Compute the paper's curve in normalised variables: 0 without output, 1 at the greatest.
 
     Its units are not published (hardware.md 7): only the shape is compared.
     """
-    curve = np.polynomial.Polynomial(_EQUATION_2)
+    curve = np.polynomial.Polynomial(PAPER_EQUATION_2)
     return np.asarray((curve(output) - curve(0.0)) / (curve(1.0) - curve(0.0)))
 
 

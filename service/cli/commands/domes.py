@@ -8,9 +8,11 @@ import typer
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
+from devices.chips.pressure_chips import PRESSURE_CHIPS, get_chip
 from devices.errors import UsageError
 from service.cli.options import JsonOption, echo, print_json, stdout
 from service.estimation.domes import (
+    PAPER_CHIP,
     SlowSaturationLoad,
     compute_ambient_transmission,
     compute_fast_to_slow_saturation_load_ratio,
@@ -23,27 +25,35 @@ def domes_command(
     load_n: Annotated[
         float | None, typer.Option(help="Greatest load on one tile, N: select a dome.")
     ] = None,
+    chip: Annotated[
+        str, typer.Option(help="Kind of pressure chip, whose range ends a dome's.")
+    ] = PAPER_CHIP.name,
     as_json: JsonOption = False,
 ) -> None:
     """List the domes of the paper's Table I and their load ranges.
 
-    The paper states a range for one dome only, 11 mm of Vytaflex 60; the others are scaled by
-    modulus and area, which is an estimate. Exit codes: 0 success, 2 wrong usage, 3 every dome
+    The paper states a range for one dome over its chip only, 11 mm of Vytaflex 60; the others are
+    scaled, which is an estimate. Exit codes: 0 success, 2 wrong usage, 3 every dome
     saturates.
     """
     if load_n is not None and not 0.0 < load_n < float("inf"):
         raise UsageError(f"--load-n {load_n} is not a load", expected="newtons above 0")
-    selected = None if load_n is None else select_weakest_covering_dome(load_n)
+    full_kpa = get_chip(chip).max_kpa
+    selected = None if load_n is None else select_weakest_covering_dome(load_n, full_kpa)
+    fast_share = compute_fast_to_slow_saturation_load_ratio(full_kpa)
+    all_found = list_saturation_loads(full_kpa)
     if as_json:
         print_json(
             {
                 "load_n": load_n,
+                "chip": chip,
+                "full_scale_kpa": full_kpa,
                 "dome": None if selected is None else selected.dome.name,
                 "verdict": None
                 if selected is None or load_n is None
                 else selected.judge_slow_load(load_n),
                 "basis": None if selected is None else selected.source,
-                "fast_share": compute_fast_to_slow_saturation_load_ratio(),
+                "fast_share": fast_share,
                 "domes": [
                     {
                         "name": found.dome.name,
@@ -55,7 +65,7 @@ def domes_command(
                         "external_share": compute_ambient_transmission(found.dome),
                         "verdict": None if load_n is None else found.judge_slow_load(load_n),
                     }
-                    for found in list_saturation_loads()
+                    for found in all_found
                 ],
             }
         )
@@ -70,7 +80,7 @@ def domes_command(
         headings = ["dome", "material", "mm", "MPa", "full scale N", "from", "outside"]
         for heading in [*headings, *([] if load_n is None else [f"{load_n:g} N"])]:
             table.add_column(heading, no_wrap=True)
-        for found in list_saturation_loads():
+        for found in all_found:
             table.add_row(
                 found.dome.name,
                 found.dome.material.name,
@@ -82,23 +92,28 @@ def domes_command(
                 *([] if load_n is None else [found.judge_slow_load(load_n)]),
             )
         stdout.print(table)
-        echo(_NOTES.format(fast=100 * compute_fast_to_slow_saturation_load_ratio()))
+        echo(_NOTES.format(chip=chip, kpa=full_kpa, fast=100 * fast_share))
         if load_n is not None:
-            echo(f"For {load_n:g} N: {_format_choice(selected, load_n)}")
+            echo(f"For {load_n:g} N: {_format_choice(selected, load_n, full_kpa)}")
     if load_n is not None and selected is None:
         raise typer.Exit(3)
 
 
 _NOTES = """\
-Full scale: slow load at which the chip reaches its 115 kPa. The paper states it for
-v60-11; the others are scaled by modulus and area: test a dome before you rely on it.
+Full scale: slow load at which the chip, {chip}, reaches its {kpa:g} kPa. The paper states it
+for v60-11 to 115 kPa; the others are scaled: test a dome before you rely on it.
 A load within milliseconds reaches full scale at about {fast:.0f} % of it.
 Outside: estimated part of a change of air or water pressure that a tile reads."""
 
 
-def _format_choice(selected: SlowSaturationLoad | None, load_n: float) -> str:
+def _format_choice(selected: SlowSaturationLoad | None, load_n: float, full_kpa: float) -> str:
     if selected is None:
-        return "none of them; share the load between tiles."
+        wider = (
+            f", or --chip {kind.name}"
+            for kind in PRESSURE_CHIPS.values()
+            if kind.max_kpa > full_kpa
+        )
+        return f"none of them; share the load between tiles{''.join(wider)}."
     if selected.judge_slow_load(load_n) == "covers":
         return f"{selected.dome.name} ({selected.source})."
     return (

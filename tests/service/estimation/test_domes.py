@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
+from devices.emulation.parts import draw_dome
 from service.estimation.domes import (
     ADIABATIC,
     DOMES,
@@ -50,6 +52,20 @@ def test_table_i_has_three_diameters_of_two_materials() -> None:
         *((0.69, 10.0), (0.69, 11.0), (0.69, 12.0)),
         *((2.17, 10.0), (2.17, 11.0), (2.17, 12.0)),
     ]
+
+
+def test_a_dome_bears_more_to_the_end_of_a_wider_chip() -> None:
+    found = compute_saturation_load(PAPER_DOME, 125.0)
+    assert found.source == "estimate"
+    # A fifth of the volume is gone instead of 13 %; the paper's cubic at 25 / 15 of its full scale.
+    assert found.low_n == pytest.approx(25.0 * 0.2 / 0.1304, rel=1e-3)
+    assert found.high_n == pytest.approx(35.0 * 2.235, rel=1e-3)
+    assert select_weakest_covering_dome(45.0, 125.0) == compute_saturation_load(
+        Dome(VYTAFLEX_60, 12.0), 125.0
+    )
+    for serial in ("T01", "T02", "T03", "T04"):  # emulated ones are stiffer than the lower bound
+        emulated_n = draw_dome(serial, 0).compute_static_force_n(np.array([125.0]))
+        assert emulated_n > found.low_n
 
 
 def test_only_the_papers_dome_has_the_papers_range() -> None:

@@ -24,3 +24,13 @@ def test_domes_names_one_for_a_load_and_marks_estimates(run: Run) -> None:
     assert run("domes", "--load-n", 50).code == 3
     printed = json.loads(run("domes", "--load-n", 30, "--json").out)
     assert (printed["dome"], printed["verdict"]) == ("v60-11", "perhaps")
+
+
+def test_domes_bear_more_over_a_chip_of_a_wider_range(run: Run) -> None:
+    assert "tiles, or --chip bmp581." in run("domes", "--load-n", 50).out
+    printed = run("domes", "--load-n", 35, "--chip", "bmp581", "--json").printed()
+    assert (printed["full_scale_kpa"], printed["dome"], printed["basis"]) == (
+        *(125.0, "v60-11", "estimate"),
+    )
+    assert "bmp581, reaches its 125 kPa" in run("domes", "--chip", "bmp581").out
+    run("domes", "--chip", "bmp999").fails(2, "one of mpl115a2, bmp581")
