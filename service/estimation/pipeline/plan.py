@@ -41,6 +41,9 @@ from service.estimation.tare.unloaded_windows import compute_variance_inflation
 
 CONTACT_ON_SIGMA = 5.0  # of the GRF unloaded: noise alone does not get there
 CONTACT_OFF_SIGMA = 3.0  # lower than on, so that noise about a threshold does not chatter
+UNLOADED_SIGMA_MIN_KPA = 0.06
+"""Least standard deviation of an unloaded reading about the baseline, however quiet the chip is:
+the rubber keeps one or two parts in a hundred of a load for a second, and 0.2 K are as much."""
 CONTACT_MIN_NS = 10_000_000  # a shorter change is an outlier or a bounce
 SIGNIFICANCE_SIGMAS = 5.0
 """Least GRF for a COP, in its sigmas: below, the first-order variance of a ratio is invalid. Also
@@ -300,7 +303,7 @@ def _make_bearing_params(
 
 def _compute_unloaded_sigma_kpa(tare: Tare) -> Floats:
     """Compute the standard deviation of a single unloaded reading about the true baseline."""
-    return np.hypot(tare.noise_kpa, tare.baseline_sigma_kpa)
+    return np.maximum(np.hypot(tare.noise_kpa, tare.baseline_sigma_kpa), UNLOADED_SIGMA_MIN_KPA)
 
 
 def _compute_variance_inflation(

@@ -31,6 +31,10 @@ def test_contact_thresholds_are_five_and_three_sigma_of_the_unloaded_sum() -> No
     uncertain = make_plan(plan.info, plan.calibration, tare, models=plan.models)
     on_n = uncertain.params.foot["contact_on_n"]
     assert on_n == pytest.approx(rule["contact_on_n"]), "0.3 N and 0.4 N of the baseline"
+    quiet = newton_plan(INFO, sigma_n=0.001).params
+    floor_n = 0.06 / COUNT_KPA  # what the rubber keeps of a load is no contact
+    assert quiet.foot["contact_off_n"] == pytest.approx(3 * floor_n * np.sqrt(3))
+    assert quiet.tiles["range_low_kpa"] == pytest.approx(-5 * 0.06)
 
 
 def test_a_reference_tile_is_in_no_sum_no_hull_and_no_grid() -> None:
