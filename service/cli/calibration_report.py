@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -53,7 +54,7 @@ def _tabulate_weights(calibration: Calibration, tile: TileCalibration) -> Table:
             escape(step.weight),
             _format_number(step.force_n, 2),
             _format_number(step.gauge_kpa, 2),
-            _format_number(step.noise_kpa, 2),
+            f"{step.noise_kpa:.{2 if step.noise_kpa >= 0.01 else 4}f}",
             f"{step.settle_kpa:+.2f}",
             f"{step.residual_n:+.2f}",
             f"±{facts.interpolate_half_width_95_n(step.gauge_kpa):.2f}",
@@ -251,6 +252,8 @@ def _make_parameter_json(
 
 def _format_interval(parameter: Parameter, digits: int, factor: float = 1.0) -> str:
     half = SIGMAS_95 * factor * parameter.sigma
+    if 0.0 < half < 0.5 * 10.0**-digits:  # of a quiet chip
+        digits = -math.floor(math.log10(half))
     return f"{factor * parameter.value:.{digits}f}±{half:.{digits}f}"
 
 

@@ -64,7 +64,7 @@ function card(tile) {
     const isOutlier = Math.abs(row.residual_n) > row.half_width_n;
     return el("tr", { "data-outlier": String(isOutlier) },
       el("td", { text: plainWeight(row.weight) }), el("td", { text: number(row.force_n, 2) }), el("td", { text: number(row.gauge_kpa, 2) }),
-      el("td", { text: number(row.noise_kpa, 2) }), el("td", { text: signed(row.settle_kpa, 2) }),
+      el("td", { text: number(row.noise_kpa, row.noise_kpa < 0.01 ? 4 : 2) }), el("td", { text: signed(row.settle_kpa, 2) }),
       el("td", { cls: "residual", text: signed(row.residual_n, 2) }), el("td", { text: `±${number(row.half_width_n, 2)}` }));
   });
   const head = ["Weight", "Force|N", "Pressure|kPa", "Noise|kPa", "Settled|kPa", "Residual|N", "95 %|N"].map((text) => {
