@@ -26,6 +26,7 @@ from devices.arrays import Floats
 from devices.errors import CalibrationError
 from devices.frames import ChipRegisters
 from devices.types import Count, Identifier, Text
+from service.estimation.domes import PAPER_EQUATION_2
 from service.estimation.effects import CalibrationPart, Effects, NonNegative, Number, Parameter
 
 GAIN_RANGE = (0.05, 20.0)
@@ -292,10 +293,6 @@ def is_increasing_cubic(
     if c3 != 0.0 and low < (vertex := -c2 / (3 * c3)) < high:
         places.append(vertex)
     return all(c1 + u * (2 * c2 + u * 3 * c3) > 0.0 for u in places)
-
-
-PAPER_EQUATION_2 = (0.1309, 0.5702, 0.02354, 0.13)
-"""Coefficients of the paper's curve, from the constant on; without units."""
 
 
 def make_paper_shape_preset() -> Calibration:

@@ -12,7 +12,6 @@ from math import pi
 from typing import Literal
 
 from devices.chips.mpl115a2 import MPL115A2
-from service.estimation.calibration import PAPER_EQUATION_2
 
 SEAL_KPA = 100.0
 """Approximate pressure at which a bubble is sealed (PAPER II-A)."""
@@ -72,6 +71,8 @@ DOMES = tuple(
 """Domes of PAPER Table I."""
 PAPER_DOME = Dome(VYTAFLEX_60, 11.0)
 """Dome that was built (PAPER III-A)."""
+PAPER_EQUATION_2 = (0.1309, 0.5702, 0.02354, 0.13)
+"""Coefficients of its curve, from the constant on, without units (PAPER eq. 2, hardware.md 7)."""
 PAPER_RANGE_N = (25.0, 35.0)
 """Load at which that dome saturates its chip (PAPER III-A)."""
 

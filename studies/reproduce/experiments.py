@@ -23,8 +23,13 @@ from scipy.special import chdtri
 
 from devices.arrays import Floats
 from devices.scene.scene_file import Scene
-from service.estimation.calibration import PAPER_EQUATION_2, Calibration, TileCalibration
-from service.estimation.domes import Dome, SlowSaturationLoad, compute_saturation_load
+from service.estimation.calibration import Calibration, TileCalibration
+from service.estimation.domes import (
+    PAPER_EQUATION_2,
+    Dome,
+    SlowSaturationLoad,
+    compute_saturation_load,
+)
 from service.estimation.fitting.least_squares import (
     compute_curve_through_zero_n,
     compute_mean_curve_half_width_95_n,
