@@ -317,6 +317,7 @@ type OverviewView = {
   columns: Record<string, Array<number | null>>;
   time_axis: Array<PartShift>;
   serials: Array<string>;
+  counts_fall: Array<boolean>;
   provisional: boolean;
   catching_up: boolean;
 };

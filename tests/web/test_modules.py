@@ -110,6 +110,32 @@ def test_of_tiles_in_one_row_the_page_says_that_y_is_not_measured(ask: Ask) -> N
     assert plan == [True, "1000.0 mm ± 500.0", None]
 
 
+def test_counts_of_two_kinds_of_chip_have_each_their_own_scale(ask: Ask) -> None:
+    ranges, panels, most = ask(
+        "session/panels session/readout session/bins",
+        """({ panelsOf, readingsOf, Bins }) => {
+          const columns = { t_first_s: [0, 1], t_last_s: [0, 1], frames: [1, 1] };
+          const serials = [...Array(20).keys()].map(String);
+          serials.forEach((_, i) => {
+            const counts = i % 2 ? [6400000, i === 5 ? 7360000 : 6500000] : [420, 300];
+            columns[`pressure_raw_${i}_min`] = columns[`pressure_raw_${i}_max`] = counts;
+            columns[`tile_flags_${i}`] = [0, 0];
+          });
+          columns.pressure_raw_4_min = columns.pressure_raw_4_max = [400, 400]; // it stands still
+          const overview = { columns, serials, counts_fall: serials.map((_, i) => i % 2 === 0) };
+          const bins = new Bins(overview, { from: 0, to: 1 });
+          return [[0, 4, 5].map((i) => bins.countRange(i)),
+            panelsOf(bins, false).slice(0, 2).map(({ unit, factor, group }) => [unit, factor ?? 1, group ?? null]),
+            readingsOf(bins, 1, panelsOf(bins, true)).at(-1)[2]];
+        }""",
+    )
+    assert ranges == [
+        *({"low": 420, "high": 300}, {"low": 401, "high": 400}, {"low": 6400000, "high": 7360000}),
+    ]
+    assert panels == [["counts", 1, None], ["million counts", 1e-6, None]]
+    assert most.startswith("0 300")
+
+
 def test_of_a_cut_stance_a_bound_of_zero_is_left_out(ask: Ask) -> None:
     found = ask(
         "session/stances",

@@ -135,8 +135,10 @@ function writeCell(cell, reading) {
   setData(cell.root, "fault", String(FAULT_STATES.has(reading.state)));
   setText(cell.word, reading.text);
   setText(cell.bound, reading.bound ? `, ≥ ${reading.bound} ${cell.unit}` : "");
-  setText(cell.value, reading.bound ? `≥ ${reading.bound}` : number(reading.value, Math.abs(reading.value) < 99.95 ? 1 : 0));
-  setText(cell.sigma, reading.sigma === null ? "" : `± ${number(1.96 * reading.sigma)}`);
+  const half = 1.96 * (reading.sigma ?? NaN);
+  const decimals = half < 0.05 ? 2 : 1; // of a quiet chip
+  setText(cell.value, reading.bound ? `≥ ${reading.bound}` : number(reading.value, Math.abs(reading.value) < 99.95 ? decimals : 0));
+  setText(cell.sigma, reading.sigma === null ? "" : `± ${number(half, decimals)}`);
 }
 
 /** Return the bar of a reading; null: none. @returns {import("./tracks.js").Bar | null} */

@@ -29,6 +29,7 @@ export class Bins {
     this.beginNs = overview.begin_t_ns;
     this.axis = overview.time_axis;
     this.serials = overview.serials;
+    this.countsFall = overview.counts_fall;
     this.provisional = Boolean(overview.provisional); // not sealed
     this.catching_up = Boolean(overview.catching_up); // estimation is not complete
     this.covers = covers;
@@ -46,6 +47,13 @@ export class Bins {
       begin = i + 1;
     }
     return sampled > 0 && lastedS > 0 ? sampled / lastedS : null;
+  }
+
+  /** Return a tile's counts at its least (`low`) and most load: each kind of chip has its own scale and sign. */
+  countRange(tile) {
+    const { low, high } = this.extremes(`pressure_raw_${tile}_min`, `pressure_raw_${tile}_max`, 0, this.count) ?? { low: 0, high: 1 };
+    const end = high > low ? high : low + 1;
+    return this.countsFall[tile] ? { low: end, high: low } : { low, high: end };
   }
 
   has(name) { return Boolean(this.columns[name]?.some((value) => value !== null)); }

@@ -11,14 +11,15 @@ export function drawTiles(plots, context, panel, box, view, x) {
   const { colours, whole } = plots;
   const counts = !whole.estimated;
   const serials = panel.besideOnly ? plots.beside.answer.serials : whole.serials;
-  const names = serials.map((_, i) => (counts ? `pressure_raw_${i}_min` : `force_n_${i}_max`));
-  plots.heat ??= heatRange(whole, counts);
+  const names = serials.map((_, i) => (counts ? `pressure_raw_${i}_${whole.countsFall[i] ? "min" : "max"}` : `force_n_${i}_max`));
+  plots.heat ??= counts ? whole.serials.map((_, i) => whole.countRange(i)) : [forceRange(whole)];
+  const [{ low, high }] = plots.heat;
   const stops = STOPS.map((name) => colours[name]);
   const rows = names.length;
   const rowPx = (box.bottom - box.top) / rows;
   for (const [bins, from, to] of panel.besideOnly ? [[plots.beside.best(view), view.from, view.to]] : plots.layers(view)) {
     const [begin, end] = bins.within({ from, to });
-    drawHeat(context, bins, begin, end, x, { ...box, left: x(from), right: x(to) }, { names, ...plots.heat, stops });
+    drawHeat(context, bins, begin, end, x, { ...box, left: x(from), right: x(to) }, { names, ranges: plots.heat, stops });
   }
   context.strokeStyle = colours.edge;
   context.lineWidth = 1;
@@ -36,23 +37,14 @@ export function drawTiles(plots, context, panel, box, view, x) {
   context.fillRect(bar.left, bar.top, bar.right - bar.left, bar.bottom - bar.top);
   context.strokeRect(crisp(bar.left), crisp(bar.top), bar.right - bar.left, bar.bottom - bar.top);
   context.fillStyle = colours.text;
-  const decimals = counts || plots.heat.high >= 20 ? 0 : 1;
-  context.fillText(number(plots.heat.low, decimals), bar.left - 5, bar.top + 5);
+  const decimals = high >= 20 ? 0 : 1;
+  context.fillText(counts ? "least" : number(low, decimals), bar.left - 5, bar.top + 5);
   context.textAlign = "left";
-  context.fillText(`${number(plots.heat.high, decimals)} ${counts ? "" : panel.unit}`, bar.right + 5, bar.top + 6);
+  context.fillText(counts ? "most" : `${number(high, decimals)} ${panel.unit}`, bar.right + 5, bar.top + 6);
 }
 
 /** Return the range over the whole session: colours do not depend on the zoom. */
-function heatRange(bins, counts) {
-  let [low, high] = [Infinity, -Infinity];
-  bins.serials.forEach((_, i) => {
-    const stem = `${counts ? "pressure_raw" : "force_n"}_${i}`;
-    const found = bins.extremes(`${stem}_min`, `${stem}_max`, 0, bins.count);
-    if (!found) return;
-    low = Math.min(low, found.low);
-    high = Math.max(high, found.high);
-  });
-  if (!Number.isFinite(low)) return { low: 0, high: 1 };
-  if (counts) return low < high ? { low: high, high: low } : { low: high + 1, high };
-  return { low: 0, high: Math.max(high, 0.1) };
+function forceRange(bins) {
+  const tops = bins.serials.map((_, i) => bins.extremes(`force_n_${i}_min`, `force_n_${i}_max`, 0, bins.count)?.high ?? 0);
+  return { low: 0, high: Math.max(0.1, ...tops) };
 }

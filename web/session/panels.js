@@ -48,13 +48,14 @@ export function panelsOf(bins, asHeat, beside = null) {
     });
   }
   const [stem, unit] = bins.estimated ? ["force_n", "N"] : ["pressure_raw", "counts"];
+  const isWide = (i) => !bins.estimated && bins.countRange(i).low >= 1e5;
   const names = (i) => /** @type {[string, string]} */ ([`${stem}_${i}_min`, `${stem}_${i}_max`]);
   // Reference tiles have no force; failed tiles are shown.
   const known = tiles.map((_, i) => i).filter((i) => bins.has(names(i)[1]) || bins.columns[`tile_flags_${i}`].some(Boolean));
   if (asHeat ?? tiles.length >= HEAT_FROM) {
     panels.push({
-      key: "tiles", title: bins.estimated ? "Force per tile" : "Raw counts per tile (fall under load)",
-      unit, kind: "heat", force: true, height: Math.min(420, Math.max(90, tiles.length * (tiles.length > 24 ? 7 : 14))), head: TITLE_PX,
+      key: "tiles", title: bins.estimated ? "Force per tile" : "Load of each tile",
+      unit: bins.estimated ? unit : "by its raw counts", kind: "heat", force: true, height: Math.min(420, Math.max(90, tiles.length * (tiles.length > 24 ? 7 : 14))), head: TITLE_PX,
     });
     if (bins.estimated && beside?.hasTiles) {
       const rows = beside.answer.serials.length;
@@ -66,8 +67,8 @@ export function panelsOf(bins, asHeat, beside = null) {
   } else {
     const height = Math.max(46, Math.min(FORCE_PX, 220 / known.length)); // high if alone
     known.forEach((i, at) => panels.push({
-      key: `tile-${i}`, title: tiles[i], unit, kind: "series", columns: names(i), group: "tiles", force: true,
-      zero: bins.estimated, height, head: at ? 7 : 18, tile: i,
+      key: `tile-${i}`, title: tiles[i], ...(isWide(i) ? { unit: "million counts", factor: 1e-6 } : { unit }),
+      kind: "series", columns: names(i), ...(bins.estimated && { group: "tiles" }), force: true, zero: bins.estimated, height, head: at ? 7 : 18, tile: i,
     }));
   }
   for (const [axis, title] of [["x", "COP forward"], ["y", "COP left"]]) {

@@ -68,14 +68,18 @@ function tilesAt(bins, i) {
   /** @returns {[string, string]} */
   const names = (tile) => [`${stem}_${tile}_min`, `${stem}_${tile}_max`];
   const order = bins.serials.map((_, tile) => tile);
-  const greatest = (tile) => bins.columns[names(tile)[bins.estimated ? 1 : 0]][i] ?? (bins.estimated ? -Infinity : Infinity);
   if (order.length <= TILES_MAX) {
     return order.map((tile) => {
       const value = span(bins, i, names(tile), 1, decimals);
       return [`tile-${tile}`, bins.serials[tile], value === null ? "–" : `${value} ${unit}`];
     });
   }
-  order.sort((a, b) => (bins.estimated ? greatest(b) - greatest(a) : greatest(a) - greatest(b)));
+  const load = order.map((tile) => {
+    const { low, high } = bins.estimated ? { low: 0, high: 1 } : bins.countRange(tile);
+    const value = bins.columns[names(tile)[high > low ? 1 : 0]][i];
+    return value === null ? -Infinity : (value - low) / (high - low);
+  });
+  order.sort((a, b) => load[b] - load[a]);
   const text = order.slice(0, 3).map((tile) => `${bins.serials[tile]} ${span(bins, i, names(tile), 1, decimals) ?? "–"}`).join(", ");
   return [["tiles", "Most loaded", `${text} ${unit}`]];
 }

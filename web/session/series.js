@@ -102,7 +102,7 @@ function shadesOf(context, stops) {
 
 /**
  * Draw a row of colours per tile: max of the bins in each pixel column.
- * @param {{names: string[], low: number, high: number, stops: string[]}} how `names` of the max
+ * @param {{names: string[], ranges: {low: number, high: number}[], stops: string[]}} how `names` of the max
  *   columns, one per row; `high` may be below `low` (counts fall with pressure)
  */
 export function drawHeat(context, bins, begin, end, x, box, how) {
@@ -113,10 +113,11 @@ export function drawHeat(context, bins, begin, end, x, box, how) {
   const best = new Float64Array(width);
   how.names.forEach((name, row) => {
     const values = bins.columns[name];
+    const { low, high } = how.ranges[row] ?? how.ranges[0];
     best.fill(NaN);
     for (let i = begin; i < end; i++) {
       if (values[i] === null) continue;
-      const share = (values[i] - how.low) / (how.high - how.low);
+      const share = (values[i] - low) / (high - low);
       const from = Math.max(0, Math.floor(x(bins.first[i]) - box.left));
       const to = Math.min(width - 1, Math.max(from, Math.ceil(x(bins.edge(i)) - box.left) - 1));
       for (let at = from; at <= to; at++) if (!(best[at] >= share)) best[at] = share;

@@ -63,6 +63,7 @@ def test_bins_of_the_full_zoom_are_the_frames(hopped: Recording) -> None:
     inside = (since_s >= 0.5) & (since_s < 0.7)
     columns = overview["columns"]
     assert overview["begin_t_ns"] == true["t_ns"][0]
+    assert overview["counts_fall"] == [True, True], "of an MPL115A2"
     assert overview["duration_s"] == pytest.approx(since_s[-1])
     assert columns["t_first_s"] == columns["t_last_s"] == pytest.approx(since_s[inside])
     assert columns["grf_n_min"] == columns["grf_n_max"]

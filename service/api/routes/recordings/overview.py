@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any
 
@@ -12,7 +12,9 @@ from anyio import CapacityLimiter
 from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import BaseModel, Field
 
+from devices.chips.pressure_chips import Compensation
 from devices.errors import UsageError
+from devices.frames import TileInfo
 from service.api.routes.common import (
     JSON,
     UNCHANGED,
@@ -85,6 +87,9 @@ class OverviewView(BinsView):
         description="Shift of each part; all 0 unless the node's date was set between two."
     )
     serials: list[str] = Field(description="Serials of the tiles, in the order of the columns.")
+    counts_fall: list[bool] = Field(
+        description="Whether a load lowers the raw counts of each tile's chip."
+    )
     provisional: bool = Field(description="True: not sealed; frames and tares may still come.")
     catching_up: bool = Field(description="True: there are more frames; request again.")
 
@@ -140,7 +145,7 @@ def _encode_preview(
     so_far = server.previews.advance_preview_within_time_limit(sources)
     seen = so_far.get_bins(Slice(query.start_s, query.end_s), query.points)
     flags = {"provisional": True, "catching_up": so_far.is_catching_up}
-    return _encode(session, seen, list(sources.info.serials), flags, query, media_type)
+    return _encode(session, seen, sources.info.tiles, flags, query, media_type)
 
 
 def _encode_sealed(
@@ -152,23 +157,26 @@ def _encode_sealed(
         seen = bin_from_overview_or_rebuild(
             reader, part, query.points, frames_sha256=session.sha256
         )
-        serials = list(reader.info.serials)
+        tiles = reader.info.tiles
     flags = {"provisional": False, "catching_up": False}
-    return _encode(session, seen, serials, flags, query, media_type)
+    return _encode(session, seen, tiles, flags, query, media_type)
 
 
 def _encode(
     session: Session,
     seen: BinnedSlice,
-    serials: list[str],
+    tiles: Sequence[TileInfo],
     remarks: dict[str, bool],
     query: OverviewQuery,
     media_type: str,
 ) -> bytes:
+    chips = Compensation(tiles)
+    kpa_per_count = chips.law.compute_kpa_per_count(chips.temperature_raw_usual)
     columns = _select_columns(times_to_seconds(seen.bins, seen.begin_ns), query.columns)
     about = describe_bins(session, seen.begin_ns, seen.end_ns, seen.frames_per_bin) | {
         "time_axis": seen.time_axis.to_json_list(),
-        "serials": serials,
+        "serials": [tile.serial for tile in tiles],
+        "counts_fall": (kpa_per_count < 0.0).tolist(),
         **remarks,
     }
     if media_type != ARROW_STREAM:
