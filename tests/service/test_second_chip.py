@@ -2,28 +2,45 @@
 
 from __future__ import annotations
 
+import io
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
+import pyarrow as pa
 import pytest
+import pyxdf
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+from scipy.io import loadmat
 
+from devices.acquisition import RangeDetector
+from devices.chips.bmp581 import BMP581
 from devices.chips.mpl115a2 import MPL115A2
 from devices.chips.pressure_chips import Compensation
 from devices.errors import SceneError, UsageError
+from devices.flags import TileFlag
 from devices.frames import ArrayInfo, FrameBatch
 from devices.scene.scene_file import Scene, load_scene, validate_scene
 from service.estimation.estimate import ModelEstimator
 from service.estimation.pipeline.plan import make_plan
+from service.offline.export import ExportOptions, export_session
 from service.offline.simulation import EmulatedRun, SimulationOptions
 from service.rig.emulated_foot import EmulatedFoot
+from storage.formats.writers.registry import FORMATS
 from storage.frame_rules import describe_first_broken_rule
+from storage.journal.node.journal import NodeJournal
 from storage.schema import wire_schema
 from storage.sessions.reader import SealedFileReader
 from storage.sessions.writer import SealedFileWriter
-from storage.wire import decode_message, encode_frames
+from storage.wire import EncodedBatch, decode_message, encode_frames
 from tests.builders.arrays import make_array, make_tile
 from tests.builders.calibrations import make_calibration, make_tare
+from tests.builders.frames import assert_same_bits
+from tests.storage.journal.node.leg import killed, take_in_flight
+from tests.waiting import until
 
 
 def make_scene(**second: object) -> Scene:
@@ -93,6 +110,80 @@ def test_wide_counts_survive_wire_and_file(
         read = FrameBatch.concatenate([batch for batch, _ in reader.read_batches()])
     assert read.pressure_raw.dtype == np.uint32
     assert read.has_equal_values(frames)
+
+
+def test_a_killed_node_has_lost_no_wide_count(
+    recording: tuple[ArrayInfo, FrameBatch, np.ndarray], tmp_path: Path
+) -> None:
+    info, frames, _ = recording
+    journal = NodeJournal(tmp_path / "node", "bench")
+    journal.start_writer()
+    stream = journal.switch_to_new_stream(info)
+    stored = frames.slice_rows(0, 100)
+    message = encode_frames(stored, wire_schema(info))
+    journal.queue_batch_and_limit_memory(
+        stream, EncodedBatch.from_frames_and_payload(stored, message)
+    )
+    until(lambda: stream.stored.last == 99)
+    in_flight = frames.slice_rows(90, 120)
+    in_flight.pressure_raw[20:, 0] = 125_500 * 64  # flagged when the batch is whole
+    take_in_flight(stream.folder, in_flight, info)
+    again = NodeJournal(killed(journal, tmp_path / "node"), "bench")
+    again.start_writer()
+    assert again.wait_for_ended_streams_on_disk()
+    (found,) = again.streams
+    assert found.journal is not None
+    read = FrameBatch.concatenate(list(found.journal.read_frames(0, 119)))
+    assert read.pressure_raw.dtype == np.uint32
+    assert_same_bits(read.slice_rows(0, 110), frames.slice_rows(0, 110))
+    assert (read.tile_flags[110:] == [TileFlag.OVER_RANGE, 0, 0]).all()
+    again.end_streams_and_close()
+
+
+def read_counts(to: str, path: Path) -> Any:
+    """Pressure counts of all tiles, (n, 3), by each format's own reader."""
+    names = [f"pressure_raw_{i}" for i in range(3)]
+    if to == "mcap":
+        reader = make_reader(io.BytesIO(path.read_bytes()), decoder_factories=[DecoderFactory()])
+        found = reader.iter_decoded_messages(topics=["/emulated/frames"])
+        return np.array([[getattr(each[3], name) for name in names] for each in found])
+    if to == "mat":
+        return loadmat(path)["pressure_raw"]
+    if to == "xdf":
+        streams, _ = pyxdf.load_xdf(path)
+        (stream,) = (one for one in streams if one["info"]["name"] == ["emulated frames"])
+        channels = stream["info"]["desc"][0]["channels"][0]["channel"]
+        labels = [channel["label"][0] for channel in channels]
+        return stream["time_series"][:, [labels.index(name) for name in names]]
+    read = {
+        "csv": pd.read_csv,
+        "parquet": pd.read_parquet,
+        "arrow": lambda path: pa.ipc.open_file(path).read_all().to_pandas(),
+    }
+    return read[to](path)[names].to_numpy()
+
+
+@pytest.mark.parametrize("to", [name for name, one in FORMATS.items() if not one.needs_forces])
+def test_each_format_has_the_counts_of_both_kinds(
+    to: str, recording: tuple[ArrayInfo, FrameBatch, np.ndarray], tmp_path: Path
+) -> None:
+    info, frames, _ = recording
+    with SealedFileWriter(tmp_path / "s.parquet", info, {}) as writer:
+        writer.append_frames(frames, {})
+    export_session(tmp_path / "s.parquet", tmp_path / "out", ExportOptions(to))
+    np.testing.assert_array_equal(read_counts(to, tmp_path / "out"), frames.pressure_raw)
+
+
+def test_the_end_of_each_chips_range_is_flagged(
+    recording: tuple[ArrayInfo, FrameBatch, np.ndarray],
+) -> None:
+    info, frames, _ = recording
+    pressed = frames.slice_rows(0, 4).copy()
+    pressed.pressure_raw[:, 0] = [0, 29_999 * 64, 124_999 * 64, 125_001 * 64]
+    RangeDetector(info.tiles).flag_out_of_range(pressed)
+    over = TileFlag.OVER_RANGE
+    assert pressed.tile_flags[:, 0].tolist() == [over, over, 0, over]
+    assert (BMP581.min_kpa, BMP581.max_kpa) == (30.0, 125.0)
 
 
 def test_estimates_take_range_law_and_warmth_of_each_chip(

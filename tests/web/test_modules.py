@@ -125,7 +125,8 @@ def test_counts_of_two_kinds_of_chip_have_each_their_own_scale(ask: Ask) -> None
           const overview = { columns, serials, counts_fall: serials.map((_, i) => i % 2 === 0) };
           const bins = new Bins(overview, { from: 0, to: 1 });
           return [[0, 4, 5].map((i) => bins.countRange(i)),
-            panelsOf(bins, false).slice(0, 2).map(({ unit, factor, group }) => [unit, factor ?? 1, group ?? null]),
+            panelsOf(bins, false).slice(0, 2)
+              .map(({ unit, factor, group }) => [unit, factor ?? 1, group ?? null]),
             readingsOf(bins, 1, panelsOf(bins, true)).at(-1)[2]];
         }""",
     )
