@@ -164,8 +164,7 @@ ESTIMATE_FLAGS: Mapping[EstimateFlag, FlagText] = {
     ),
     EstimateFlag.TARE_OLD: FlagText(
         "tare in doubt",
-        "tare over half an hour old, or a chip 4 counts (0.75 K) off since, without the model "
-        "`temperature`",
+        "tare over half an hour old, or a chip 0.75 K off since, without the model `temperature`",
         Severity.DOUBT,
     ),
     EstimateFlag.BASELINE_LOST: FlagText(

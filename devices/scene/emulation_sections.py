@@ -122,7 +122,7 @@ class EmulationSection(SceneSection):
     """Family of domes and chips: the default one, a broad one for unknown real batches, or the
     paper's six domes, each with its name as serial."""
     noise_kpa: Annotated[float, Field(ge=0, le=100)] = 0.165
-    """Standard deviation of a single reading: core noise, outliers and rounding together."""
+    """Standard deviation of a single reading of an MPL115A2: core noise, outliers and rounding."""
     correlated_ms: NotNegative = 0.0
     """Correlation time of the noise's core; 0: white."""
     repeatability: Annotated[float, Field(ge=0, le=0.5)] = 0.0
@@ -149,7 +149,7 @@ class EmulationSection(SceneSection):
     head_s: NotNegative = 0.0
     """Begin of the hydrostatic pressure, after power-up."""
     clip_kpa: NotNegative = 0.0
-    """Analogue clipping pressure of the chips; 0: none, counts wrap (as in real parts)."""
+    """Analogue clipping pressure of the chips; 0: none, an MPL115A2 wraps (as real parts do)."""
     read_during_conversion: ReadDuringConversion = "stale"
     scl_part: Annotated[float, Field(gt=0, le=4)] = 1.0
     """Real bus clock relative to `array.scl_hz`: 0.625 for a Raspberry Pi whose core idles at
