@@ -203,9 +203,14 @@ def make_rig_scene(
 
 
 def replace_tiles(scene: Scene, serials: Sequence[str]) -> Scene:
-    """Return the scene with other tiles, at consecutive channels and positions."""
+    """Return the scene with other tiles, at consecutive channels and positions.
+
+    Their chips are those of its first one.
+    """
+    kind = scene.tile[0].model_dump(include={"chip", "oversampling", "filter", "mode"})
     tiles = [
-        {
+        kind
+        | {
             "serial": serial,
             "mux": 0x70 + i // 8,
             "channel": i % 8,

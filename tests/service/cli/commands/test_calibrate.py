@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from devices.flags import EstimateFlag, TileFlag
 from tests.service.cli.outcome import Run, Simulate, short_rig
 from tests.storage.sessions.session_files import rewritten
 
@@ -88,3 +89,22 @@ def test_calibrate_prints_each_tiles_fit_and_draws_it(run: Run, bench: Path) -> 
     assert printed["refused"] == {}
     assert json.loads(Path("cal.json").read_text())["id"] == printed["id"]
     assert Path("cal.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow(parts=8)
+def test_a_curve_reaches_the_end_of_a_wider_chip_and_flags_tell_what_is_beyond(
+    run: Run, simulate: Simulate
+) -> None:
+    harder = short_rig().replace("repeats", "load_n = 120\nrepeats").replace("30.303", "84.0")
+    rig = simulate("rig.parquet", harder, "--tiles", "T01", "--chip", "bmp581")
+    (tile,) = run("calibrate", rig, "--out", "cal.json", "--json").printed()["tiles"]
+    assert tile["rig"]["end_absolute_kpa"] > 125.0
+    assert tile["noise_kpa"] < 0.002
+    run("estimate", rig, "--out", "e.parquet", "--calibration", "cal.json").succeeds()
+    frames = pq.read_table("e.parquet")
+    kpa = frames["pressure_raw_0"].to_numpy() / 64_000
+    is_over = (frames["tile_flags_0"].to_numpy() & TileFlag.OVER_RANGE) != 0
+    assert (is_over == (kpa > 125.0)).all()
+    beyond = EstimateFlag.OVER_RATED | EstimateFlag.SATURATED
+    assert (frames["estimate_flags"].to_numpy()[kpa > 125.1] & beyond != 0).all()
+    assert np.isfinite(frames["force_n_0"].to_numpy()[kpa < 125.0]).all()
