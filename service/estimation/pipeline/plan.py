@@ -36,14 +36,15 @@ from service.estimation.pipeline.params import (
 )
 from service.estimation.pipeline.saturation import make_saturation_params
 from service.estimation.records import RecordArray
-from service.estimation.tare.tare import Tare, compute_temperature_change_max_counts
+from service.estimation.tare.tare import (
+    UNLOADED_SIGMA_MIN_KPA,
+    Tare,
+    compute_temperature_change_max_counts,
+)
 from service.estimation.tare.unloaded_windows import compute_variance_inflation
 
 CONTACT_ON_SIGMA = 5.0  # of the GRF unloaded: noise alone does not get there
 CONTACT_OFF_SIGMA = 3.0  # lower than on, so that noise about a threshold does not chatter
-UNLOADED_SIGMA_MIN_KPA = 0.06
-"""Least standard deviation of an unloaded reading about the baseline, however quiet the chip is:
-the rubber keeps one or two parts in a hundred of a load for a second, and 0.2 K are as much."""
 CONTACT_MIN_NS = 10_000_000  # a shorter change is an outlier or a bounce
 SIGNIFICANCE_SIGMAS = 5.0
 """Least GRF for a COP, in its sigmas: below, the first-order variance of a ratio is invalid. Also

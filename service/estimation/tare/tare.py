@@ -117,6 +117,9 @@ SEAL_TEMPERATURE_K = 298.0
 TEMPERATURE_CHANGE_MAX_K = 4.0 / 5.35  # four counts of an MPL115A2
 """Largest change of a chip's temperature since the tare with a valid baseline: 0.75 K are 0.25 kPa,
 half a newton on a tile and one and a half on a foot of four."""
+UNLOADED_SIGMA_MIN_KPA = 0.06
+"""Least standard deviation of an unloaded reading about the baseline, however quiet the chip is:
+the rubber keeps one or two parts in a hundred of a load for a second, and 0.2 K are as much."""
 TREND_OVER_NS = 6 * 3_600_000_000_000
 """Time span of a trend."""
 TREND_SPAN_MIN_NS = 600_000_000_000

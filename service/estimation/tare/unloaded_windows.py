@@ -31,7 +31,7 @@ from devices.errors import TareError
 from devices.flags import FrameFlag
 from devices.frames import FrameBatch, hold_temperature
 from service.estimation.calibration import Calibration
-from service.estimation.tare.tare import Tare, TareSource
+from service.estimation.tare.tare import UNLOADED_SIGMA_MIN_KPA, Tare, TareSource
 
 _LAGS = 64
 """Largest lag of the correlation, in readings; a quarter of the readings if there are fewer."""
@@ -207,6 +207,9 @@ class TareFrames:
             noise_kpa: (tiles,), noise of an unloaded tile.
         """
         found = []
+        noise_kpa = np.maximum(
+            noise_kpa, UNLOADED_SIGMA_MIN_KPA
+        )  # rubber moves behind a quiet chip
         for rows in candidate_rows:
             kpa = self.kpa[rows]
             n = len(kpa)

@@ -71,6 +71,15 @@ def assert_unloaded(tare: Tare) -> None:
 # --- found ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("kpa_per_s", "is_quiet"), [(0.1, True), (1.0, False)])
+def test_a_quiet_chip_is_quiet_while_its_rubber_recovers(kpa_per_s: float, is_quiet: bool) -> None:
+    frames, info = loaded_frames(np.zeros((WINDOW, 2))), make_array(2)
+    recent = TareFrames(frames, Compensation(info.tiles), make_calibration("T01"), info.serials)
+    recent.kpa = UNLOADED_KPA - kpa_per_s * 1e-9 * recent.since_ns[:, None] * [1.0, 0.0]
+    noise_kpa = np.full(2, 0.001)  # of a BMP581 on the rig
+    assert bool(recent.select_quiet_windows([slice(0, WINDOW)], noise_kpa)) == is_quiet
+
+
 def test_a_foot_in_the_air_is_tared_in_its_newest_window() -> None:
     frames = loaded_frames(draw_noise(2000))
     tare = tare_newest(frames)
