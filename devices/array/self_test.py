@@ -81,19 +81,25 @@ def _identify_tile(bus: I2cBus, router: MuxRouter, tile: TileSection) -> TileInf
             where=where,
             remedy="Plug it in, or take it out of the scene file",
         ) from error
+    return make_tile_info(tile, registers)
+
+
+def make_tile_info(tile: TileSection, registers: Registers) -> TileInfo:
+    """Make the description of a scene's tile from its registers, with its usual conversion time."""
+    settings = tile.chip_settings
     return TileInfo(
         serial=tile.serial,
         mux=tile.mux,
         channel=tile.channel,
-        chip=chip.name,
+        chip=tile.chip,
         address=tile.chip_address,
         registers=registers,
-        settings=tile.chip_settings,
+        settings=settings,
         x_m=tile.x_m,
         y_m=tile.y_m,
         z_m=tile.z_m,
         reference=tile.reference,
-        conversion_ms=chip.compute_conversion_ns(tile.chip_settings)[0] / 1e6,
+        conversion_ms=get_chip(tile.chip).compute_conversion_ns(settings)[0] / 1e6,
     )
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 from devices.array.schedules import (
     BusTiming,
@@ -19,6 +20,7 @@ from devices.array.self_test import (
     FoundTile,
     Place,
     find_tiles_on_all_channels,
+    make_tile_info,
     measure_conversion_ns,
     measure_wire_timing,
 )
@@ -105,8 +107,11 @@ def diagnose_bus(
     findings = _match_tiles(find_tiles_on_all_channels(bus, settings), expected)
     sound = [finding for finding in findings if not finding.problem]
     sections = [expected.get(_place(finding)) or _make_section(finding) for finding in sound]
-    well = [(each, _make_tile_info(each, of)) for each, of in zip(sound, sections, strict=True)]
-    if not well:
+    tiles = [
+        make_tile_info(section, finding.registers or ())
+        for section, finding in zip(sections, sound, strict=True)
+    ]
+    if not tiles:
         return BusDiagnosis(
             findings,
             None,
@@ -117,10 +122,10 @@ def diagnose_bus(
             is_rate_reached=False,
             verdict=_describe_no_tiles(findings),
         )
-    wires = measure_wire_timing(bus, clock, well[0][1])
+    wires = measure_wire_timing(bus, clock, tiles[0])
     measured: dict[Place, TileFinding] = {}
     conversions_ns: list[int | None] = []
-    for finding, info in well:
+    for finding, info in zip(sound, tiles, strict=True):
         try:
             conversion_ns = measure_conversion_ns(bus, clock, info, wires)
             never = "its readings never change: it may not be converting"
@@ -132,7 +137,7 @@ def diagnose_bus(
         measured[_place(finding)] = replace(finding, conversion_ms=conversion_ms, problem=problem)
     findings = tuple(measured.get(_place(f), f) for f in findings)
     requested = tuple(measured.values())
-    timing = compute_bus_timing(array, wires, [info for _, info in well], conversions_ns)
+    timing = compute_bus_timing(array, wires, tiles, conversions_ns)
     rates: dict[ScheduleName, float | None] = {
         name: rate
         if count_broadcast_channels(name, timing.muxes) <= array.broadcast_channels
@@ -154,11 +159,11 @@ def diagnose_bus(
         *advice.hints,
         _describe_slowest_tile(requested, timing, schedule, rates[schedule]),
         _advise_oversampling(
-            [info for _, info in well],
+            tiles,
             sections,
             conversions_ns,
-            lambda tiles, times_ns: (
-                1.0 / compute_frame_s(schedule, compute_bus_timing(array, wires, tiles, times_ns))
+            lambda changed, times_ns: (
+                1.0 / compute_frame_s(schedule, compute_bus_timing(array, wires, changed, times_ns))
             ),
             requested_hz,
         ),
@@ -198,35 +203,10 @@ def _match_tiles(
 
 def _make_section(finding: TileFinding) -> TileSection:
     """Make the section of a tile that no scene has."""
-    return TileSection(
-        serial=f"0x{finding.mux:02x}.{finding.channel}",
-        mux=finding.mux,
-        channel=finding.channel,
-        chip=finding.chip,
-        address=finding.address,
-        x_m=0.0,
-        y_m=0.0,
-        z_m=0.0,
-    )
-
-
-def _make_tile_info(finding: TileFinding, section: TileSection) -> TileInfo:
-    assert finding.registers is not None  # noqa: S101  # without a problem there are some
-    settings = section.chip_settings
-    return TileInfo(
-        serial=section.serial,
-        mux=finding.mux,
-        channel=finding.channel,
-        chip=finding.chip,
-        address=finding.address,
-        registers=finding.registers,
-        x_m=0.0,
-        y_m=0.0,
-        z_m=0.0,
-        reference=False,
-        settings=settings,
-        conversion_ms=get_chip(finding.chip).compute_conversion_ns(settings)[0] / 1e6,
-    )
+    mux, channel, chip, address = _place(finding)
+    place = {"mux": mux, "channel": channel, "chip": chip, "address": address}
+    at = dict.fromkeys(("x_m", "y_m", "z_m"), 0.0)
+    return TileSection.model_validate({"serial": f"0x{mux:02x}.{channel}", **place, **at})
 
 
 def _describe_no_tiles(findings: tuple[TileFinding, ...]) -> str:
@@ -338,24 +318,26 @@ def _advise_oversampling(
 
     Longer conversions would set the pace, and of shorter ones several have to be read.
     """
-    free = [i for i, tile in enumerate(tiles) if get_chip(tile.chip).is_free_running(tile.settings)]
+    free = [get_chip(tile.chip).is_free_running(tile.settings) for tile in tiles]
     rates_hz: dict[int, float] = {}
-    for number in get_chip(tiles[free[0]].chip).oversamplings if free else ():
-        changed, times_ns = list(tiles), list(conversions_ns)
-        for i in free:
-            compute_ns = get_chip(tiles[i].chip).compute_conversion_ns
-            settings = sections[i].model_copy(update={"oversampling": number}).chip_settings
-            changed[i] = tiles[i].model_copy(update={"settings": settings})
-            if (known_ns := conversions_ns[i]) is not None:
-                ratio = compute_ns(settings)[0] / compute_ns(tiles[i].settings)[0]
-                times_ns[i] = round(known_ns * ratio)
+    for number in get_chip(tiles[free.index(True)].chip).oversamplings if any(free) else ():
+        changed = [
+            make_tile_info(section.model_copy(update={"oversampling": number}), tile.registers)
+            if is_free
+            else tile
+            for tile, section, is_free in zip(tiles, sections, free, strict=True)
+        ]
+        times_ns = [
+            known and round(known * new.conversion_ms / tile.conversion_ms)
+            for known, new, tile in zip(conversions_ns, changed, tiles, strict=True)
+        ]
         rates_hz[number] = predict_hz(changed, times_ns)
     if not rates_hz:
         return ""
     best_hz = max(rates_hz.values())
     least_hz = requested_hz if 0 < requested_hz <= best_hz else _NEARLY * best_hz
     advised = max(number for number, rate_hz in rates_hz.items() if rate_hz >= least_hz)
-    if all(sections[i].oversampling == advised for i in free):
+    if all(section.oversampling == advised for section in compress(sections, free)):
         return ""
     return (
         f"Set oversampling = {advised}: {rates_hz[advised]:.0f} frames/s, with the least noise at "
