@@ -193,7 +193,7 @@ STORED_MAX = 32
 """Conversions that a free-running part stores until they are read; then the oldest is lost."""
 _EARLY = 0.05
 """Part of the period by which an end may come before its estimate."""
-_NARROW = 0.25
+_NARROW = 0.1
 """Part of the period to which bounds must leave the end of a conversion to fix it."""
 _COUNTED_MIN, _COUNTED_MAX = 200, 4000
 """Conversions between two fixed ends that give the period: a shorter time is less exact, a longer

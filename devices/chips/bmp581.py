@@ -197,7 +197,8 @@ class Bmp581:
         self._read(REGISTER_CHIP_ID, 1)  # a part that is absent is not polled
         with suppress(NoAcknowledgeError):  # a part may not acknowledge its own reset (DS 7.36)
             self._write(REGISTER_COMMAND, RESET_COMMAND)
-        self._wait_until(REGISTER_STATUS, NVM_READY, NVM_READY, "ready after a reset")
+        # With an error in its memory, which holds its trim, a part is not ready.
+        self._wait_until(REGISTER_STATUS, NVM_READY | NVM_ERROR, NVM_READY, "ready after a reset")
         osr, iir, odr = settings
         # Filter and compensation are written in standby only, else they are lost; the mode is last.
         self._write(REGISTER_ODR_CONFIG, odr & ~MODE_BITS)
@@ -216,6 +217,8 @@ class Bmp581:
     def read_registers(self) -> Registers:
         """Read chip, revision and the part's id once, without a check; conversions stop then."""
         chip, revision = self._read(REGISTER_CHIP_ID, 2)
+        if chip != CHIP_ID:
+            return (chip << 8 | revision,)  # another chip is not written to
         (odr,) = self._read(REGISTER_ODR_CONFIG, 1)
         self._write(REGISTER_ODR_CONFIG, odr & ~MODE_BITS)
         self._wait_until(REGISTER_ODR_CONFIG, MODE_BITS, STANDBY, "in standby")

@@ -98,6 +98,7 @@ _ODR_HZ = (
 _FIFO_COUNT = 0x17
 _FIFO_FRAMES = 32  # of one word
 _CATCH_UP = 1024  # conversions that a filter may remember
+_REMEMBERED_NS = 900_000_000  # domes give no older pressure: of a part that was silent for long
 
 SampleFunction = Callable[[int], tuple[float, float]]
 """Function of a sample instant in ns that returns pressure in kPa and temperature in degC."""
@@ -285,7 +286,7 @@ class EmulatedBmp581:
         osr = self._registers[REGISTER_OSR_CONFIG]
         p_code, t_code = osr >> 3 & 7, osr & 7
         half_ns = round(_P_NS[p_code] * self._part.clock_factor) // 2
-        kpa, degc = self._part.sample(end_ns - half_ns)
+        kpa, degc = self._part.sample(max(end_ns - half_ns, self._t_ns - _REMEMBERED_NS))
         noise = self._rng.standard_normal(2).tolist()
         kpa += 1e-3 * _NOISE_PA[p_code] * noise[0]
         degc += _NOISE_K / math.sqrt(1 << t_code) * noise[1]
@@ -327,11 +328,11 @@ class EmulatedBmp581:
     def send_bytes(self, count: int) -> bytes:
         """Send bytes from the pointer on; results do not change within a burst."""
         begin = self._pointer
+        if self._faults.all_ones.is_possible and self._faults.all_ones(self._t_ns):
+            return b"\xff" * count
         if begin == REGISTER_FIFO_DATA:
             return self._send_fifo(count)
         self._pointer = (begin + count) % _REGISTERS
-        if self._faults.all_ones.is_possible and self._faults.all_ones(self._t_ns):
-            return b"\xff" * count
         places = [(begin + i) % _REGISTERS for i in range(count)]
         sent = bytes(self._show(register) for register in places)
         if REGISTER_INT_STATUS in places:
