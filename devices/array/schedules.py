@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from statistics import fmean
 from typing import Protocol, get_args
 
@@ -178,16 +179,13 @@ class BusTiming:
 def compute_frame_s(schedule: ScheduleName, timing: BusTiming) -> float:
     """Compute the frame period of a schedule, in seconds."""
     frame_s = _compute_frame_s(schedule, timing)
-    if timing.bits_per_conversion:
-        # A longer frame finds more conversions, which take longer to read. At the start all are
-        # stored.
-        frame_s = STORED_MAX * max(timing.conversions_s)
+    free_s = [*compress(timing.conversions_s, timing.free_running or ())]
+    if free_s:
+        # A longer frame finds more conversions, which take longer to read; at the start, most.
+        frame_s = STORED_MAX * max(free_s)
         for _ in range(_ROUNDS):
-            further = fmean(
-                min(max(1.0, frame_s / each + _IN_VAIN), STORED_MAX) - 1.0
-                for each in timing.conversions_s
-            )
-            bits = timing.read_bits + further * timing.bits_per_conversion
+            found = [min(max(1.0, frame_s / each + _IN_VAIN), STORED_MAX) for each in free_s]
+            bits = timing.read_bits + (fmean(found) - 1.0) * timing.bits_per_conversion
             frame_s = _compute_frame_s(schedule, replace(timing, read_bits=bits))
     return frame_s
 
