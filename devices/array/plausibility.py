@@ -103,8 +103,12 @@ class PlausibilityCheck:
                 scan.add_flag(tile, TileFlag.IMPLAUSIBLE)
             return counts
         third = self._reread(scan, tile, with_temperature)
-        if third == again and self._tile_io.are_free_running[tile]:
-            return third  # a conversion may have ended behind the first reading
+        if (
+            third is not None
+            and self._tile_io.are_free_running[tile]
+            and self._health[tile].is_near(third[0], again[0])
+        ):
+            return third  # conversions may have ended behind the readings before
         self._disturbed_until_ns = self._clock.now_ns() + DISTURBED_NS
         self._health[tile].fault_counts["disturbed"] += 1
         scan.add_flag(tile, TileFlag.RETRIED)

@@ -353,6 +353,10 @@ class TileHealth:
         limit = self._jump / 2 if is_strict else self._jump
         return abs(pressure_raw - self._median()) > limit or self._is_hot(temperature_raw)
 
+    def is_near(self, pressure_raw: int, other_raw: int) -> bool:
+        """Return whether two pressures differ by less than a jump."""
+        return abs(pressure_raw - other_raw) <= self._jump
+
     def is_far_jump(self, pressure_raw: int, temperature_raw: int) -> bool:
         """Return whether a confirmed reading may come from another tile, or from two at once."""
         if len(self._recent) < _RECENT:

@@ -225,6 +225,19 @@ def test_an_array_reaches_the_rate_that_its_bits_allow(
     assert rate_hz == pytest.approx(predicted_hz, rel=0.02)
 
 
+@pytest.mark.slow
+def test_an_array_that_loses_conversions_in_every_frame_gives_new_ones_with_their_instants() -> (
+    None
+):
+    """Of 80 conversions between two reads a part stores 32; their number is only estimated."""
+    rig = Rig(make_array_scene(64))
+    ends_ns = note_ends(rig)
+    assert not any(any(flags) for flags in rig.scan(2))
+    errors_ns = scan_instant_errors_ns(rig, ends_ns, 20)
+    assert np.abs(errors_ns).max() < 1.1 * max(rig.array._conversions_ns)
+    assert not any(any(flags) for flags in rig.scan(2))
+
+
 def test_a_rarer_temperature_is_no_fault_and_makes_frames_shorter() -> None:
     rates_hz = []
     for temperature_every in (1, 10):
