@@ -102,15 +102,14 @@ class PlausibilityCheck:
             if self._health[tile].is_jump(*counts):
                 scan.add_flag(tile, TileFlag.IMPLAUSIBLE)
             return counts
+        is_free_running, health = self._tile_io.are_free_running[tile], self._health[tile]
+        if is_free_running and health.is_on_the_way(counts[0], again[0]):
+            return counts  # a later conversion, which confirms the first reading
         third = self._reread(scan, tile, with_temperature)
-        if (
-            third is not None
-            and self._tile_io.are_free_running[tile]
-            and self._health[tile].is_near(third[0], again[0])
-        ):
+        if third is not None and is_free_running and health.is_near(third[0], again[0]):
             return third  # conversions may have ended behind the readings before
         self._disturbed_until_ns = self._clock.now_ns() + DISTURBED_NS
-        self._health[tile].fault_counts["disturbed"] += 1
+        health.fault_counts["disturbed"] += 1
         scan.add_flag(tile, TileFlag.RETRIED)
         if third is None or third not in (counts, again):
             scan.add_flag(tile, TileFlag.IMPLAUSIBLE)

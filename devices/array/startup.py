@@ -214,13 +214,21 @@ def choose_scene_schedule(
         SceneError: the schedule does not suit a reference sensor, or tiles that run freely.
     """
     requested = schedule or scene.array.schedule
-    if (has_reference or requested in BROADCASTS) and not all(timing.commanded):
-        beside = "beside a reference sensor" if has_reference else f"in schedule {requested!r}"
+    is_any_commanded, are_all_commanded = any(timing.commanded), all(timing.commanded)
+    if requested in BROADCASTS and not are_all_commanded:
         raise SceneError(
-            f"tiles that convert by themselves {beside}, which starts all at once",
-            where="tile",
-            expected='tiles with mode = "forced"',
+            f"tiles that convert by themselves in schedule {requested!r}, which starts all at once",
+            where="array.schedule",
+            expected='tiles with mode = "forced", or "auto"',
         )
+    if has_reference and is_any_commanded and not are_all_commanded:
+        raise SceneError(
+            "a reference sensor beside tiles that convert by themselves and tiles that do not",
+            where="tile",
+            expected="tiles of one kind: the reference is read at their sample instant",
+        )
+    if has_reference and requested == "auto" and not are_all_commanded:
+        return ScheduleChoice("sequential", "the reference force is followed between two reads")
     if has_reference and requested in ("auto", "simultaneous"):
         return ScheduleChoice(
             "simultaneous", "the reference force is read while all tiles convert at once"

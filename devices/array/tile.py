@@ -156,6 +156,12 @@ class ConversionClock:
         ended = int((now_ns - self._end_ns) / self._period_ns + _EARLY)
         return min(max(1, ended), STORED_MAX)
 
+    def predict_ends_ns(self, until_ns: int) -> list[int]:
+        """Predict the ends of the next conversions until an instant."""
+        period_ns = self._period_ns
+        count = min(int((until_ns - self._end_ns) // period_ns), STORED_MAX)
+        return [round(self._end_ns + n * period_ns) for n in range(1, count + 1)]
+
     def count_conversions(self, count: int, begin_ns: int, end_ns: int) -> int:
         """Count the conversions in a read; return the estimated end of the last one.
 
@@ -356,6 +362,12 @@ class TileHealth:
     def is_near(self, pressure_raw: int, other_raw: int) -> bool:
         """Return whether two pressures differ by less than a jump."""
         return abs(pressure_raw - other_raw) <= self._jump
+
+    def is_on_the_way(self, pressure_raw: int, later_raw: int) -> bool:
+        """Return whether a reading lies between the previous ones and a later one, or near."""
+        before = self._median() if len(self._recent) == _RECENT else later_raw
+        low, high = sorted((before, later_raw))
+        return low - self._jump <= pressure_raw <= high + self._jump
 
     def is_far_jump(self, pressure_raw: int, temperature_raw: int) -> bool:
         """Return whether a confirmed reading may come from another tile, or from two at once."""

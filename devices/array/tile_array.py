@@ -9,9 +9,12 @@ part, and a part that answers with others is another part.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
+
+import numpy as np
 
 from devices.array.bus_recovery import BusMonitor, BusRecovery
 from devices.array.plausibility import ConversionMonitor, PlausibilityCheck
@@ -102,6 +105,8 @@ _REPEATS_MAX = 10
 """Repeated readings of a chip with a status from which its part is set up anew."""
 _PATIENCE = 1.1
 """Conversions of a free-running part in which one surely ends."""
+_REFERENCES_MAX = 16
+"""Readings of a reference beside a free-running part that are kept: of some frames."""
 _DISTURBED_BUDGETS = 4
 """Factor of the retry budget on a line with flipped bits: correct readings before rate."""
 
@@ -191,6 +196,7 @@ class TileArray:
         seeking_ns = 3 * (self._frame_ns + sum(self._conversions_ns))
         self._pause_ns = max((STORED_MAX - 4) * max(self._conversions_ns), seeking_ns)
         self._conversion_clocks = [ConversionClock(each_ns) for each_ns in self._conversions_ns]
+        self._reference_readings: deque[tuple[int, float]] = deque(maxlen=_REFERENCES_MAX)
         self._busy_since_ns = 0
         self._frame_index = 0
 
@@ -396,6 +402,10 @@ class TileArray:
         scan.convert_stop_ns[tile] = ended_ns - self._conversions_ns[tile]
         if not pressures:
             return NOT_READ, NOT_READ
+        if tile == 0 and self._reference_readings:
+            scan.reference_ns = scan.convert_stop_ns[0] + self.sample_delay_ns[0]
+            at_ns, forces_n = zip(*self._reference_readings, strict=True)
+            scan.reference_n = float(np.interp(scan.reference_ns, at_ns, forces_n))
         temperature_raw = self._tile_io.read_temperature(tile) if with_temperature else NOT_READ
         return pressures[-1], temperature_raw
 
@@ -455,10 +465,25 @@ class TileArray:
         """Sleep until a conversion is finished; read the reference at the sample instant."""
         if self._read_reference_n is not None and scan.reference_ns is None:
             scan.reference_ns = self._started_ns[0] + self.sample_delay_ns[0]
-            self._clock.sleep_until_ns(scan.reference_ns)
-            scan.reference_n = self._read_reference_n()
+            if self._tile_io.are_free_running[0]:
+                self._follow_reference(self._read_reference_n, ready_ns)
+            else:
+                self._clock.sleep_until_ns(scan.reference_ns)
+                scan.reference_n = self._read_reference_n()
         self._clock.sleep_until_ns(ready_ns)
         self._busy_since_ns = self._clock.now_ns()  # waiting is not charged to the budget
+
+    def _follow_reference(self, read_n: Callable[[], float], until_ns: int) -> None:
+        """Read the reference now, at each expected sample of a free-running part, and at the end.
+
+        The part's clock is known only after the read; so the force is interpolated then.
+        """
+        after_end_ns = self.sample_delay_ns[0] - self._conversions_ns[0]
+        ends_ns = self._conversion_clocks[0].predict_ends_ns(until_ns - after_end_ns)
+        for at_ns in (0, *(end_ns + after_end_ns for end_ns in ends_ns), until_ns):
+            if not 0 < at_ns <= self._clock.now_ns():
+                self._clock.sleep_until_ns(at_ns)
+                self._reference_readings.append((self._clock.now_ns(), read_n()))
 
     # Once per frame
 

@@ -145,15 +145,11 @@ def _read_scene(name_or_path: str) -> Scene:
 def replace_chips(scene: Scene, chip: str) -> Scene:
     """Return the scene with another kind of pressure chip in all tiles, at its usual address.
 
-    Beside a reference sensor the tiles convert on command, all at once.
-
     Raises:
         SceneError: there is no such kind, or two tiles would have one address.
     """
     content = scene.model_dump()
     changed = {"chip": chip, "address": None, "oversampling": 1, "filter": 0, "mode": None}
-    if scene.reference is not None:
-        changed["mode"] = "forced"
     content["tile"] = [tile | changed for tile in content["tile"]]
     return validate_scene(content, where=f"scene {scene.name} with {chip}")
 

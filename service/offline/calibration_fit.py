@@ -334,14 +334,20 @@ def _split_by_tile(session: SealedFileReader) -> tuple[list[Indentation], tuple[
     # loaded beyond its chip's range. Of a chip whose counts do not wrap it is no pressure.
     below_kpa = np.where(compensation.wrap_counts > 0, np.inf, np.nan)
     kpa = np.where(readable_kpa < compensation.min_kpa, below_kpa, readable_kpa)
+    # Tiles that convert on command are sampled together, with the reference; others in between.
+    free = [get_chip(tile.chip).is_free_running(tile.settings) for tile in session.info.tiles]
+    later_ns = np.where(free, 1000 * frames.sample_offset_us.astype(np.int64), 0)
+    read_s, force_n = (frames.t_ns - frames.t_ns[0]) * 1e-9, frames.reference_force_n.astype(float)
     tiles = [
         Indentation(
             serial=tile.serial,
             chip=get_chip(tile.chip),
             where=str(session.path),
-            t_ns=frames.t_ns,
+            t_ns=frames.t_ns + later_ns[:, i],
             kpa=kpa[:, i],
-            reference_n=frames.reference_force_n.astype(np.float64),
+            reference_n=np.interp(read_s + 1e-9 * later_ns[:, i], read_s, force_n)
+            if later_ns[:, i].any()
+            else force_n,
             phase=phase,
             is_under_indenter=pressed == tile.serial,
             temperature_raw=np.where(

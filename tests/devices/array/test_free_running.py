@@ -33,13 +33,22 @@ def make_scene(name: str = "standing", **tile: Any) -> Scene:
 class Rig:
     """An emulated foot of BMP581 tiles, and its array."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, *, has_reference: bool = False) -> None:
         self.clock = VirtualClock()
         self.world = World(scene, self.clock)
         self.clock.sleep_until_ns(10_000_000)
         bus = open_bus("emulated", self.world.i2c_adapter)
-        self.ready: ReadyArray = prepare_array(bus, scene, self.clock)
+        self.ready: ReadyArray = prepare_array(
+            bus,
+            scene,
+            self.clock,
+            read_reference_n=self._read_reference_n if has_reference else None,
+        )
         self.array = self.ready.array
+
+    def _read_reference_n(self) -> float:
+        now_ns = np.array([self.clock.now_ns()])
+        return float(self.world.compute_truth(now_ns).true_force_n[0, 0])
 
     def chip(self, tile: int) -> EmulatedBmp581:
         chip = self.world.chips[tile]
@@ -163,6 +172,38 @@ def test_a_pause_in_which_conversions_are_lost_costs_one_frame_and_no_instant(
         assert np.abs(errors_ns).max() < 300_000
         assert rig.clock.now_ns() - before_ns < 30_000_000
         assert not any(any(flags) for flags in rig.scan(20))
+
+
+def test_a_fast_load_and_its_reference_belong_to_the_same_instant() -> None:
+    """30 N within 20 ms, so that most readings of a stroke are jumps, and are read again."""
+    content = make_scene("indentation").model_dump()
+    content["tile"] = content["tile"][:1]
+    content["ground"] |= {"stroke_s": 0.02, "repeats": 5}
+    content["emulation"] |= {"repeatability": 0.0}
+    rig = Rig(validate_scene(content, where="test"), has_reference=True)
+    assert rig.ready.choice.schedule == "sequential"
+    scans = [rig.array.scan_frame() for _ in range(1400)]
+    rows = [i for i, scan in enumerate(scans) if not scan.tile_flags[0]][600:]
+    sampled_ns = np.array([scan.convert_stop_ns[0] for scan in scans])
+    sampled_ns += rig.array.sample_delay_ns[0]
+    true_n = rig.world.compute_truth(sampled_ns).true_force_n[:, 0]
+    true_kpa = rig.world.compute_dome_kpa(sampled_ns)[:, 0]
+    loaded = [i for i in rows if 1.0 < true_n[i] < 29.0]
+    assert len(loaded) > 50
+    error_n = [scans[i].reference_n - true_n[i] for i in loaded]
+    error_kpa = [scans[i].pressure_raw[0] / bmp581.COUNTS_PER_KPA - true_kpa[i] for i in loaded]
+    assert np.median(np.abs(error_n)) < 0.1, "a millisecond would be 1.5 N"
+    assert np.percentile(np.abs(error_n), 95) < 0.6
+    assert np.median(np.abs(error_kpa)) < 0.05, "a conversion would be 1.5 kPa"
+    assert np.percentile(np.abs(error_kpa), 95) < 0.2
+
+
+def test_tiles_that_convert_by_themselves_and_others_have_no_common_reference() -> None:
+    content = load_scene("indentation").model_dump()
+    first, *others = content["tile"]
+    content["tile"] = [first | {"chip": "bmp581"}, *others]
+    with pytest.raises(SceneError, match="a reference sensor beside"):
+        Rig(validate_scene(content, where="test"), has_reference=True)
 
 
 def test_no_reading_of_a_healthy_array_is_flagged_or_repeated() -> None:
