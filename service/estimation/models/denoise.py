@@ -31,6 +31,9 @@ WINDOW_READINGS_MAX = 2 * int(WINDOW_REACHES[-1]) + 2
 AGREEMENT_SIGMAS = 2.25
 """Largest difference of two windows' values, in standard uncertainties; chance exceeds it in one of
 forty. A compromise between noise in quiet stance and lag at an impact."""
+MOVE_SIGMAS = 10.0
+"""Change of a reading between its own instant and the frame's, in its standard deviations, from
+which noise does not hide it."""
 VARIANCE_REDUCTION_MIN = 1e-6
 """Relative reduction of variance below which a longer window differs by rounding only."""
 DETERMINANT_MIN = 1e-5
@@ -132,7 +135,7 @@ def denoise_sample(
     line_low, line_high, bent_low, bent_high = within
     nothing = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     moments = _add_sample(nothing, (t_ns[i, j] - at_ns) * 1e-6, values[i, j])
-    best = shorter = shortest = values[i, j]
+    best = shorter = shortest = _move_along_line(columns, i, j, at_ns, rows)
     variance = shorter_variance = shortest_variance = 1.0
     kept_values[0], kept_variances[0], kept_bent[0] = best, variance, 1.0
     stored = 1
@@ -202,6 +205,21 @@ def denoise_sample(
     if sigma > 0.0:
         variance += max(0.0, (bend / sigma) ** 2 - of_bend)
     return (best, variance, bend, of_bend), (straight_low, straight_high, low, high)
+
+
+@jit_cached
+def _move_along_line(
+    columns: SampleColumns, i: int, j: int, at_ns: int, rows: tuple[int, int]
+) -> float:
+    """Return a value at another instant, if the move exceeds its noise; else the value itself."""
+    values, sigmas, t_ns, run = columns
+    value: float = values[i, j]
+    k = i - 1 if at_ns < t_ns[i, j] else i + 1
+    if k < rows[0] or k > rows[1] or run[k] != run[i] or t_ns[k, j] == t_ns[i, j]:
+        return value
+    part = float(at_ns - t_ns[i, j]) / float(t_ns[k, j] - t_ns[i, j])
+    step = part * (values[k, j] - value)
+    return value + step if part <= 1.0 and abs(step) > MOVE_SIGMAS * sigmas[i, j] else value
 
 
 @jit_inlined

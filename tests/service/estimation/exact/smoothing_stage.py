@@ -213,11 +213,11 @@ def denoised(
     take lines and grow.
     """
     out: list[Any] = []
-    for i, own in enumerate(values):
-        if own is None:
+    for i, as_read in enumerate(values):
+        if as_read is None:
             out.append(None)
             continue
-        sigma = sigmas[i]
+        own, sigma = as_read, sigmas[i]
         reachable = [
             j
             for j in range(len(values))
@@ -226,6 +226,12 @@ def denoised(
             <= frame_ns[j]
             <= max(frame_ns[i] + look_ns, frame_ns[i])
         ]
+        k = i - 1 if at_ns[i] < t_ns[i] else i + 1
+        if k in reachable and values[k] is not None and t_ns[k] != t_ns[i]:
+            part = mpf(at_ns[i] - t_ns[i]) / (t_ns[k] - t_ns[i])
+            step = part * (values[k] - own)
+            if part <= 1 and abs(step) > mpf(denoise.MOVE_SIGMAS) * sigma:
+                own += step
         lines: set[int] = set(reachable)
         if within is not None and within[i] is not None:
             lines, most = within[i]

@@ -185,6 +185,16 @@ def test_averages_are_of_the_requested_instants() -> None:
     assert out[10:] == pytest.approx(5.0 + 40.0e-9 * t_ns[10:], abs=1e-11)
 
 
+@pytest.mark.parametrize("early_ns", [-700_000, 700_000])
+def test_readings_finer_than_any_curve_are_of_the_requested_instants(early_ns: int) -> None:
+    """Noise hides no bend, so no window is accepted: the line to the neighbour is all there is."""
+    t_ns = PERIOD_NS * np.arange(50)
+    values = 5.0 + np.sin(3e-7 * t_ns)
+    out, left, *_ = average(values, t_ns=t_ns, at_ns=t_ns - early_ns, sigma_n=1e-5)
+    assert out[1:-10] == pytest.approx(np.interp(t_ns - early_ns, t_ns, values)[1:-10], abs=1e-12)
+    assert (left == 1.0).all()
+
+
 @pytest.mark.parametrize("apart_ns", [0, 1, 17])
 def test_samples_at_two_crowded_instants_give_no_parabola(apart_ns: int) -> None:
     # Ill-conditioned by ten digits; a curve through them would swing by newtons.
