@@ -214,12 +214,15 @@ def _move_along_line(
     """Return a value at another instant, if the move exceeds its noise; else the value itself."""
     values, sigmas, t_ns, run = columns
     value: float = values[i, j]
-    k = i - 1 if at_ns < t_ns[i, j] else i + 1
-    if k < rows[0] or k > rows[1] or run[k] != run[i] or t_ns[k, j] == t_ns[i, j]:
+    way = -1 if at_ns < t_ns[i, j] else 1
+    k, at = i, i + way
+    while rows[0] <= at <= rows[1] and run[at] == run[i] and way * (at_ns - t_ns[at, j]) > 0:
+        k, at = at, at + way
+    if at < rows[0] or at > rows[1] or run[at] != run[i] or t_ns[at, j] == t_ns[k, j]:
         return value
-    part = float(at_ns - t_ns[i, j]) / float(t_ns[k, j] - t_ns[i, j])
-    step = part * (values[k, j] - value)
-    return value + step if part <= 1.0 and abs(step) > MOVE_SIGMAS * sigmas[i, j] else value
+    part = float(at_ns - t_ns[k, j]) / float(t_ns[at, j] - t_ns[k, j])
+    moved = values[k, j] + part * (values[at, j] - values[k, j])
+    return moved if abs(moved - value) > MOVE_SIGMAS * sigmas[i, j] else value
 
 
 @jit_inlined

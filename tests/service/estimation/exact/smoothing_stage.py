@@ -226,12 +226,15 @@ def denoised(
             <= frame_ns[j]
             <= max(frame_ns[i] + look_ns, frame_ns[i])
         ]
-        k = i - 1 if at_ns[i] < t_ns[i] else i + 1
-        if k in reachable and values[k] is not None and t_ns[k] != t_ns[i]:
-            part = mpf(at_ns[i] - t_ns[i]) / (t_ns[k] - t_ns[i])
-            step = part * (values[k] - own)
-            if part <= 1 and abs(step) > mpf(denoise.MOVE_SIGMAS) * sigma:
-                own += step
+        way = -1 if at_ns[i] < t_ns[i] else 1
+        k = i
+        while k + way in reachable and way * (at_ns[i] - t_ns[k + way]) > 0:
+            k += way
+        near, far = values[k], values[k + way] if k + way in reachable else None
+        if near is not None and far is not None and t_ns[k + way] != t_ns[k]:
+            moved = near + mpf(at_ns[i] - t_ns[k]) / (t_ns[k + way] - t_ns[k]) * (far - near)
+            if abs(moved - own) > mpf(denoise.MOVE_SIGMAS) * sigma:
+                own = moved
         lines: set[int] = set(reachable)
         if within is not None and within[i] is not None:
             lines, most = within[i]
