@@ -18,6 +18,7 @@ from smbus2 import SMBus, i2c_msg
 from smbus2.smbus2 import I2C_RDWR, i2c_rdwr_ioctl_data
 
 from devices.buses.device_files import DeviceReopener
+from devices.buses.usb_adapters import find_bus_file
 from devices.errors import (
     BusFaultError,
     BusLostError,
@@ -234,9 +235,10 @@ def _classify_error(error: OSError, bus: str, messages: tuple[i2c_msg, ...]) -> 
 
 def _open_adapter(name: str, emulated: I2cAdapter | None) -> I2cAdapter:
     adapter = emulated
+    file = name if adapter is not None else find_bus_file(name)
     try:
         if adapter is None:
-            adapter = _Smbus(name)
+            adapter = _Smbus(file)
         adapter.set_timeout(TIMEOUT_10MS)
     except OSError as error:
         if adapter is not None:
@@ -254,7 +256,7 @@ def _open_adapter(name: str, emulated: I2cAdapter | None) -> I2cAdapter:
 
 
 def open_bus(name: str, emulated: I2cAdapter | None = None) -> I2cBus:
-    """Open the bus `name`: a device such as `/dev/i2c-1`, or `"emulated"`.
+    """Open the bus `name`: a device such as `/dev/i2c-1`, a USB adapter, or `"emulated"`.
 
     The caller creates and passes the emulated adapter.
 

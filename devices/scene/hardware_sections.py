@@ -42,7 +42,7 @@ class ArraySection(SceneSection):
     """`[array]`: the bus and its schedule."""
 
     bus: str = EMULATED
-    """Device such as /dev/i2c-1, or "emulated"."""
+    """Device such as /dev/i2c-1, a USB adapter such as usb:1c40:0534, or "emulated"."""
     scl_hz: Annotated[float, Field(ge=10_000, le=1_000_000)] = 400_000.0
     """Bus clock of the emulation; on hardware it is set in config.txt. The bounds catch kHz."""
     schedule: AnySchedule = "auto"

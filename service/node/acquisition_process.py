@@ -271,7 +271,8 @@ def _open_rig(
 def _may_recover(error: FootTileError) -> bool:
     """Return whether absent hardware may appear without a change of the configuration."""
     if isinstance(error, (BusSetupError, SpiSetupError)):
-        return getattr(error.__cause__, "errno", None) in _ABSENT
+        number = error.errno or getattr(error.__cause__, "errno", None)
+        return number in _ABSENT
     return not isinstance(error, BusMisuseError)
 
 

@@ -63,7 +63,8 @@ class BusDiagnosis:
 
     Attributes:
         tiles: findings for all tiles of the scene and all others found.
-        scl_hz: measured bus clock; None without a working tile.
+        scl_hz: measured bus clock; None without a working tile, or where the adapter's own time
+            hides it.
         configured_scl_hz: configured bus clock.
         transaction_overhead_s: overhead of a transaction beyond its bits.
         rates_hz: frames per second by schedule; None if it would open too many channels.
@@ -171,7 +172,7 @@ def diagnose_bus(
     )
     return BusDiagnosis(
         findings,
-        wires.scl_hz,
+        wires.scl_hz if wires.is_scl_measured else None,
         array.scl_hz,
         wires.transaction_overhead_s,
         rates,
@@ -242,7 +243,7 @@ def _make_advice(
         wrong.append(f"{names} {'needs' if len(ill) == 1 else 'need'} attention first.")
     if array.scl_hz > SCL_MAX_HZ:
         hints.append(f"The multiplexers are rated for {SCL_MAX_HZ / 1e3:.0f} kHz only.")
-    part = timing.scl_hz / array.scl_hz
+    part = timing.scl_hz / array.scl_hz  # of a hidden clock it is more than one
     if part < _MIN_CLOCK_SHARE:
         slow = f"The bus runs at {timing.scl_hz / 1e3:.0f} kHz where {array.scl_hz / 1e3:.0f} are"
         if abs(part - _PI_CLOCK_RATIO) < _PI_CLOCK_TOLERANCE:

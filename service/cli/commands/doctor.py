@@ -11,6 +11,7 @@ import typer
 from rich.table import Table
 
 from devices.buses.i2c import I2cBus, open_bus
+from devices.buses.usb_adapters import UsbAdapter, find_adapter
 from devices.clock import Clock, SystemClock, VirtualClock
 from devices.errors import UsageError, require_extra
 from devices.scene.hardware_sections import EMULATED, ServoSection
@@ -30,7 +31,8 @@ def doctor_command(
         typer.Option(help="Scene with the expected tiles; default: accept any."),
     ] = None,
     bus: Annotated[
-        str | None, typer.Option(help="I2C bus, /dev/i2c-1 or emulated; default: the scene's.")
+        str | None,
+        typer.Option(help="I2C bus: /dev/i2c-1, usb:1c40:0534 or emulated; default: the scene's."),
     ] = None,
     rate_hz: Annotated[
         float, typer.Option(min=0.0, help="Required frame rate; 0: the scene's, or the highest.")
@@ -60,6 +62,7 @@ def doctor_command(
         the_scene = load_scene(_EMULATED_SCENE)
     with ExitStack() as stack, show_progress(f"examining {name}"):
         opened, clock = _open_bus(name, the_scene)
+        adapter = find_adapter(name)
         stack.callback(opened.close)
         diagnosis = diagnose_bus(opened, clock, the_scene, requested_hz=rate_hz)
     wanted = the_scene.servo if the_scene is not None else None
@@ -72,12 +75,12 @@ def doctor_command(
                 opened_port = stack.enter_context(_open_servo(the_scene, wanted))
             found = diagnose_servo(opened_port, SystemClock(), wanted)
     if as_json:
-        print_json(_make_json(name, diagnosis, port, found))
+        print_json(_make_json(name, adapter, diagnosis, port, found))
     else:
-        _print_diagnosis(name, diagnosis, the_scene)
+        _print_diagnosis(name, adapter, diagnosis, the_scene)
         if found is not None:
             echo(f"Servo at {port}: {found.verdict}")
-    if diagnosis.scl_hz is None:
+    if not diagnosis.rates_hz:
         raise typer.Exit(1)
     if not diagnosis.is_rate_reached or (found is not None and not found.is_well):
         raise typer.Exit(3)
@@ -109,10 +112,15 @@ def _open_bus(name: str, scene: Scene | None) -> tuple[I2cBus, Clock]:
 
 
 def _make_json(
-    name: str, diagnosis: BusDiagnosis, port: str, servo: ServoDiagnosis | None
+    name: str,
+    adapter: UsbAdapter | None,
+    diagnosis: BusDiagnosis,
+    port: str,
+    servo: ServoDiagnosis | None,
 ) -> dict[str, object]:
     return {
         "bus": name,
+        "adapter": None if adapter is None else asdict(adapter),
         "tiles": [asdict(tile) for tile in diagnosis.tiles],
         "scl_hz": diagnosis.scl_hz,
         "asked_scl_hz": diagnosis.configured_scl_hz,
@@ -125,11 +133,15 @@ def _make_json(
     }
 
 
-def _print_diagnosis(name: str, diagnosis: BusDiagnosis, scene: Scene | None) -> None:
+def _print_diagnosis(
+    name: str, adapter: UsbAdapter | None, diagnosis: BusDiagnosis, scene: Scene | None
+) -> None:
     where = f"{name}, scene {scene.name}" if scene is not None else name
     if name == EMULATED:
         where += ", in virtual time"
     echo(f"Bus {where}")
+    if adapter is not None:
+        echo(f"Adapter {adapter} at {adapter.bus}; its name in a scene stays when it is replugged")
     tiles = Table("tile", "mux", "channel", "chip", "registers", "conversion", "problem")
     for tile in diagnosis.tiles:
         words = tile.registers
@@ -143,10 +155,12 @@ def _print_diagnosis(name: str, diagnosis: BusDiagnosis, scene: Scene | None) ->
             tile.problem or "none",
         )
     stdout.print(tiles)
-    if diagnosis.scl_hz is not None:
+    if diagnosis.rates_hz:
+        scl = "SCL hidden by the adapter's own time"
+        if diagnosis.scl_hz is not None:
+            scl = f"SCL {diagnosis.scl_hz / 1e3:.1f} kHz measured"
         echo(
-            f"SCL {diagnosis.scl_hz / 1e3:.1f} kHz measured, "
-            f"{diagnosis.configured_scl_hz / 1e3:.0f} asked for; "
+            f"{scl}, {diagnosis.configured_scl_hz / 1e3:.0f} asked for; "
             f"{diagnosis.transaction_overhead_s * 1e6:.0f} us per transaction beyond its bits"
         )
         rates = Table("schedule", "frames/s predicted", "")

@@ -170,6 +170,30 @@ def measure_ns(wires: Wires, tile: int = 0, clock: VirtualClock | None = None) -
     return measure_conversion_ns(wires.bus, clock or wires.clock, wires.infos[tile], timing)
 
 
+@settings(max_examples=40)
+@given(
+    jitter_us=st.sampled_from([0.0, 5.0, 50.0, 500.0, 5000.0]),
+    scl_hz=st.sampled_from([400_000, 100_000]),
+    label=st.integers(0, 10**6).map(str),
+)
+def test_a_bus_clock_is_right_or_said_to_be_hidden(
+    jitter_us: float, scl_hz: int, label: str
+) -> None:
+    """A USB adapter takes milliseconds a transaction, some more and some less."""
+    wires, rng = part_with(1_600_000, "stale", noisy(label), scl_hz), make_rng(label)
+    wires.after_transaction = lambda: wires.clock.sleep_until_ns(
+        wires.clock.now_ns() + 2_000_000 + round(1e3 * jitter_us * rng.exponential())
+    )
+    found = measure_wire_timing(wires.bus, wires.clock, wires.infos[0])
+    assert found.is_scl_measured or jitter_us > 5.0
+    assert not found.is_scl_measured or jitter_us < 5000.0
+    assert 0.0019 < found.transaction_overhead_s < 0.0021 + 2e-6 * jitter_us
+    if found.is_scl_measured:
+        assert found.scl_hz == pytest.approx(scl_hz, rel=0.25)
+    else:  # nor is a conversion timed: the data sheet's longest is safe
+        assert measure_conversion_ns(wires.bus, wires.clock, wires.infos[0], found) == 3_000_000
+
+
 @settings(max_examples=12, deadline=None)
 @given(
     tc_ns=st.integers(1_200_000, 2_999_999),

@@ -133,6 +133,7 @@ NOT_YET = [
     refusal(errno.ENOENT),
     refusal(errno.ENODEV),
     refusal(errno.EBUSY),
+    BusSetupError("no I2C adapter with these ids is plugged in", errno=errno.ENOENT),
 ]
 NEVER = [
     BusMisuseError("the adapter refused the transfer"),
