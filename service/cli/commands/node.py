@@ -39,7 +39,8 @@ def node_command(
         typer.Option(help=f"Address of the server; default {SERVER}, with --record: none."),
     ] = None,
     bus: Annotated[
-        str | None, typer.Option(help="I2C bus, /dev/i2c-1 or emulated; default: the scene's.")
+        str | None,
+        typer.Option(help="I2C bus: /dev/i2c-1, usb:1c40:0534 or emulated; default: the scene's."),
     ] = None,
     servo: Annotated[
         str | None,
@@ -143,9 +144,12 @@ def node_command(
 async def _run_node(options: NodeOptions) -> NodeOutcome:
     from devices.realtime import freeze_garbage_collector
     from service.node.running_node import run_node
+    from service.systemd import report_to_systemd
 
     freeze_garbage_collector()
-    return await run_node(options, stop=create_stop_event(), report=remark)
+    stop = create_stop_event()
+    async with report_to_systemd():
+        return await run_node(options, stop=stop, report=remark)
 
 
 def _choose_name(name: str | None) -> str:

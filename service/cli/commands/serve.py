@@ -105,9 +105,11 @@ def serve_command(
 
 
 async def _run_server(settings: Settings) -> None:
+    from service.systemd import report_to_systemd
+
     stop = create_stop_event()
     with _listen(settings) as listening_server:
-        async with _serve(settings, listening_server):
+        async with _serve(settings, listening_server), report_to_systemd():
             await stop.wait()
 
 
