@@ -113,6 +113,7 @@ class EmulatedI2cAdapter:
         self._opened_ns = clock.now_ns()
         self._devices_by_routing: dict[tuple[int, ...], dict[int, list[I2cDevice]]] = {}
         self._present_devices = self._devices_by_address()
+        self._disturbed: FaultyWires | None = None
 
     def set_timeout(self, units_10ms: int) -> None:
         """Set the timeout of a wedged transfer, as by the ioctl I2C_TIMEOUT, and open the adapter.
@@ -158,62 +159,75 @@ class EmulatedI2cAdapter:
             OSError: EINVAL and EOPNOTSUPP for transfers that the kernel or the adapter refuses,
                 EREMOTEIO for a missing acknowledge, ETIMEDOUT if SCL is stuck.
         """
-        begin_ns = self._clock.now_ns()
         _check_supported(i2c_msgs)
-        disturbed = None if self.line.is_healthy else self.line
-        if disturbed is not None:
-            if self._was_unplugged(begin_ns):
-                # First the USB transfers in flight fail, then the device is gone.
-                self._refused += 1
-                raise _make_os_error(
-                    errno.EIO if self._refused <= _FAILING_TRANSFERS else errno.ENODEV
-                )
-            for mux in self._muxes:
-                mux.apply_faults(begin_ns)
-            self._present_devices = self._devices_by_address()
-            if self._run_on_stuck_wires(i2c_msgs, begin_ns):
-                return
-        addressed: list[I2cDevice] = []
-        bits = 0
-        routed = disturbed is not None
+        begin_ns = self._clock.now_ns()
+        if not self.line.is_healthy and self._was_unplugged(begin_ns):
+            # First the USB transfers in flight fail, then the device is gone.
+            self._refused += 1
+            raise _make_os_error(errno.EIO if self._refused <= _FAILING_TRANSFERS else errno.ENODEV)
+        self.begin_transaction()
+        if self._disturbed is not None and self._run_on_stuck_wires(i2c_msgs, begin_ns):
+            return
         try:
             for message in i2c_msgs:
-                bits += 10  # START or repeated START, address with direction, acknowledge
-                address, length = message.addr, message.len
-                reading = bool(message.flags & _FLAG_READ)
-                t_ns = begin_ns + round(bits * self._ns_per_bit)
-                listeners = self._present_devices.get(address, _NO_DEVICE)
-                if disturbed is not None:
-                    listeners = self._find_addressed(address, reading, t_ns, disturbed)
-                if len(listeners) == 1:
-                    if not listeners[0].on_address(reading, t_ns):
-                        listeners = _NO_DEVICE
-                else:
-                    listeners = [device for device in listeners if device.on_address(reading, t_ns)]
-                addressed += listeners
-                if not routed:
-                    routed = address in self._mux_addresses
-                if not listeners or (
-                    disturbed is not None and disturbed.draw_lost_acknowledge(t_ns)
-                ):
-                    raise _make_os_error(errno.EREMOTEIO)
-                if reading:
-                    bits += 9 * length
-                    _read(message, listeners, t_ns, disturbed)
-                    continue
-                acknowledged = _write(message, listeners, t_ns, disturbed)
-                bits += 9 * length
-                if acknowledged < length:
-                    bits -= 9 * (length - acknowledged - 1)
-                    raise _make_os_error(errno.EREMOTEIO)
+                self.run_message(message)
         finally:
-            stop_ns = begin_ns + round((bits + 1) * self._ns_per_bit)
-            for device in addressed:
-                device.on_stop(stop_ns)
-            # Routing changes only at STOP, and only if a mux was addressed.
-            if routed:
-                self._present_devices = self._devices_by_address()
-            self._clock.sleep_until_ns(stop_ns)
+            self.stop_transaction()
+
+    def begin_transaction(self) -> None:
+        """Begin a transaction of messages that are known one by one, as a USB adapter gets them."""
+        self._begin_ns = self._clock.now_ns()
+        self._bits = 0
+        self._addressed: list[I2cDevice] = []
+        self._disturbed = None if self.line.is_healthy else self.line
+        self._is_routed = self._disturbed is not None
+        if self._is_routed:
+            for mux in self._muxes:
+                mux.apply_faults(self._begin_ns)
+            self._present_devices = self._devices_by_address()
+
+    def run_message(self, message: i2c_msg) -> None:
+        """Run a START, or a repeated one, and the bytes of a message.
+
+        Raises:
+            OSError: EREMOTEIO for a missing acknowledge.
+        """
+        self._bits += 10  # START or repeated START, address with direction, acknowledge
+        address, length, disturbed = message.addr, message.len, self._disturbed
+        reading = bool(message.flags & _FLAG_READ)
+        t_ns = self._begin_ns + round(self._bits * self._ns_per_bit)
+        listeners = self._present_devices.get(address, _NO_DEVICE)
+        if disturbed is not None:
+            listeners = self._find_addressed(address, reading, t_ns, disturbed)
+        if len(listeners) == 1:
+            if not listeners[0].on_address(reading, t_ns):
+                listeners = _NO_DEVICE
+        else:
+            listeners = [device for device in listeners if device.on_address(reading, t_ns)]
+        self._addressed += listeners
+        if address in self._mux_addresses:
+            self._is_routed = True
+        if not listeners or (disturbed is not None and disturbed.draw_lost_acknowledge(t_ns)):
+            raise _make_os_error(errno.EREMOTEIO)
+        if reading:
+            self._bits += 9 * length
+            _read(message, listeners, t_ns, disturbed)
+            return
+        acknowledged = _write(message, listeners, t_ns, disturbed)
+        self._bits += 9 * length
+        if acknowledged < length:
+            self._bits -= 9 * (length - acknowledged - 1)
+            raise _make_os_error(errno.EREMOTEIO)
+
+    def stop_transaction(self) -> None:
+        """Run the STOP, and wait until all bits have passed."""
+        stop_ns = self._begin_ns + round((self._bits + 1) * self._ns_per_bit)
+        for device in self._addressed:
+            device.on_stop(stop_ns)
+        # Routing changes only at STOP, and only if a mux was addressed.
+        if self._is_routed:
+            self._present_devices = self._devices_by_address()
+        self._clock.sleep_until_ns(stop_ns)
 
     def _find_addressed(
         self, address: int, reading: bool, t_ns: int, disturbed: FaultyWires
