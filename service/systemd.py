@@ -10,20 +10,27 @@ from contextlib import asynccontextmanager, suppress
 
 
 @asynccontextmanager
-async def report_to_systemd() -> AsyncIterator[None]:
-    """Context manager: tell systemd begin and end of a block, and in it that the event loop runs.
+async def report_to_systemd(stop: asyncio.Event) -> AsyncIterator[None]:
+    """Context manager: tell systemd that a block has begun, runs, and ends, or is to: `stop`.
 
     An event loop that hangs tells nothing, and systemd restarts the service after `WatchdogSec`.
     Does nothing outside systemd.
     """
     _notify("READY=1")
-    feeding = asyncio.create_task(_feed_watchdog())
+    tasks = [asyncio.create_task(_feed_watchdog()), asyncio.create_task(_report_end(stop))]
     try:
         yield
     finally:
-        feeding.cancel()
-        await asyncio.gather(feeding, return_exceptions=True)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
         _notify("STOPPING=1")
+
+
+async def _report_end(stop: asyncio.Event) -> None:
+    """Tell systemd that the service ends: it may deliver and seal for a while."""
+    await stop.wait()
+    _notify("STOPPING=1")
 
 
 async def _feed_watchdog() -> None:
@@ -42,4 +49,5 @@ def _notify(state: str) -> None:
     if not address.startswith(("/", "@")):
         return
     with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
+        link.setblocking(False)  # a systemd that does not read must not hold the event loop
         link.sendto(state.encode(), "\0" + address[1:] if address[0] == "@" else address)

@@ -85,7 +85,7 @@ def find_bus_file(name: str) -> str:
         raise BusSetupError(
             f"{len(found)} adapters have these ids: {there}",
             where=name,
-            remedy="Unplug one, or add the serial number behind a colon",
+            remedy="Unplug one, or add a serial number that only one has behind a colon",
         )
     raise BusSetupError(
         f"no I2C adapter with these ids is plugged in; plugged in: {there or 'none'}",

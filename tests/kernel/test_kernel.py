@@ -188,7 +188,6 @@ def test_a_session_over_silence_and_unplugging(
         guest.call("attach", HOST, foot.array_socket.port, 2)
         assert until(lambda: _find_bus(guest)) != before
         time.sleep(8.0)
-        time.sleep(8.0)
         with session.named("back"):
             time.sleep(12.0)
     foot.adapter.hangs = True

@@ -62,8 +62,8 @@ def doctor_command(
         the_scene = load_scene(_EMULATED_SCENE)
     with ExitStack() as stack, show_progress(f"examining {name}"):
         opened, clock = _open_bus(name, the_scene)
-        adapter = find_adapter(name)
         stack.callback(opened.close)
+        adapter = find_adapter(name)
         diagnosis = diagnose_bus(opened, clock, the_scene, requested_hz=rate_hz)
     wanted = the_scene.servo if the_scene is not None else None
     port = servo or (wanted.port if wanted is not None else "none")

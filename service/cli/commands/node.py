@@ -148,7 +148,7 @@ async def _run_node(options: NodeOptions) -> NodeOutcome:
 
     freeze_garbage_collector()
     stop = create_stop_event()
-    async with report_to_systemd():
+    async with report_to_systemd(stop):
         return await run_node(options, stop=stop, report=remark)
 
 

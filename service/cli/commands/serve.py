@@ -109,7 +109,7 @@ async def _run_server(settings: Settings) -> None:
 
     stop = create_stop_event()
     with _listen(settings) as listening_server:
-        async with _serve(settings, listening_server), report_to_systemd():
+        async with _serve(settings, listening_server), report_to_systemd(stop):
             await stop.wait()
 
 

@@ -9,6 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from smbus2 import i2c_msg
 
+from devices.array import self_test
 from devices.array.self_test import (
     WireTiming,
     find_tiles_on_all_channels,
@@ -16,6 +17,8 @@ from devices.array.self_test import (
     measure_conversion_ns,
     measure_wire_timing,
 )
+from devices.buses.i2c import I2cBus
+from devices.buses.usb_adapters import UsbAdapter
 from devices.clock import VirtualClock
 from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart
 from devices.emulation.parts import make_rng
@@ -192,6 +195,17 @@ def test_a_bus_clock_is_right_or_said_to_be_hidden(
         assert found.scl_hz == pytest.approx(scl_hz, rel=0.25)
     else:  # nor is a conversion timed: the data sheet's longest is safe
         assert measure_conversion_ns(wires.bus, wires.clock, wires.infos[0], found) == 3_000_000
+
+
+def test_the_frames_of_usb_are_no_slow_bus_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    adapter = UsbAdapter("/dev/i2c-5", "i2c-tiny-usb", "1c40:0534", "")
+    monkeypatch.setattr(self_test, "find_adapter", {"/dev/i2c-5": adapter}.get)
+    wires = part_with(1_600_000, "stale", noisy("usb"))
+    wires.after_transaction = lambda: wires.clock.sleep_until_ns(
+        -(-wires.clock.now_ns() // 1_000_000) * 1_000_000
+    )
+    found = measure_wire_timing(I2cBus(wires, "/dev/i2c-5"), wires.clock, wires.infos[0])
+    assert not found.is_scl_measured
 
 
 @settings(max_examples=12, deadline=None)
