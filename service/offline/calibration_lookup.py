@@ -123,10 +123,8 @@ def _calibrate_on_rig(
     scene: Scene, parts_seed: int, folder: Path | None, progress: ProgressCallback
 ) -> Calibration:
     serial = scene.tile[0].serial
-    # The name contains version and rig scene, because the result depends on both.
-    made_by = hashlib.sha256(
-        f"{SOFTWARE_VERSION}/{parts_seed}/{scene.model_dump_json(exclude_defaults=True)}".encode()
-    )
+    # The name contains version and rig scene, defaults too, because the result depends on all.
+    made_by = hashlib.sha256(f"{SOFTWARE_VERSION}/{parts_seed}/{scene.model_dump_json()}".encode())
     name = f"{serial}-{made_by.hexdigest()[:16]}.json"
     kept = folder / name if folder is not None else None
     if kept is not None and (found := _read_cached(kept, serial, progress)) is not None:

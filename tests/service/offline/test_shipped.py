@@ -5,9 +5,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -50,6 +52,22 @@ def test_no_built_in_scene_waits_for_the_mill(tmp_path: Path) -> None:
     find_calibration(EMULATED_RIG, TILES, cache_folder=tmp_path, on_progress=refuse)
     assert list(tmp_path.iterdir()) == []
     assert len(list(SHIPPED_FOLDER.iterdir())) == len(TILES)  # none is left of a version before
+
+
+def test_a_changed_default_names_another_calibration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hashed: list[bytes] = []
+
+    def compute_hash(content: bytes) -> Any:
+        hashed.append(content)
+        return hashlib.new("sha256", content)
+
+    monkeypatch.setattr(hashlib, "sha256", compute_hash)
+    find_calibration(EMULATED_RIG, TILES[:1], cache_folder=tmp_path, on_progress=refuse)
+    scene = load_scene("indentation")
+    for section in (scene.emulation, scene.ground, scene.array):
+        assert section.model_dump_json().encode() in hashed[0]
 
 
 @pytest.mark.slow(parts=8)
