@@ -143,14 +143,16 @@ def _read_scene(name_or_path: str) -> Scene:
 
 
 def replace_chips(scene: Scene, chip: str) -> Scene:
-    """Return the scene with another kind of pressure chip in all tiles, at its usual address.
+    """Return the scene with a kind of pressure chip in all tiles, at its usual address.
+
+    Tiles that have it already stay as they are.
 
     Raises:
         SceneError: there is no such kind, or two tiles would have one address.
     """
     content = scene.model_dump()
-    changed = {"chip": chip, "address": None, "oversampling": 1, "filter": 0, "mode": None}
-    content["tile"] = [tile | changed for tile in content["tile"]]
+    usual = {"chip": chip, "address": None, "oversampling": 1, "filter": 0, "mode": None}
+    content["tile"] = [tile if tile["chip"] == chip else tile | usual for tile in content["tile"]]
     return validate_scene(content, where=f"scene {scene.name} with {chip}")
 
 

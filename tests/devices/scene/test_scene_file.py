@@ -30,7 +30,13 @@ from devices.scene.hardware_sections import (
     ServoSection,
     TileSection,
 )
-from devices.scene.scene_file import Scene, list_builtin_scenes, load_scene, parse_scene
+from devices.scene.scene_file import (
+    Scene,
+    list_builtin_scenes,
+    load_scene,
+    parse_scene,
+    replace_chips,
+)
 
 TILE = """
 [[tile]]
@@ -406,3 +412,15 @@ def test_a_path_without_a_text_is_refused(tmp_path: Path) -> None:
     for path in (tmp_path / "scene.toml", tmp_path):
         with pytest.raises(SceneError, match=re.escape(str(path))):
             load_scene(str(path))
+
+
+def test_a_tile_that_has_the_chip_already_keeps_its_settings_and_its_address() -> None:
+    chip, set_up = '\nchip = "bmp581"\n', "oversampling = 8\nfilter = 3\n"
+    mixed = scene(
+        tiles=tile("T01", more=chip + set_up)
+        + tile("T02", more=chip + "address = 0x47\n")
+        + tile("T03", channel="1")
+    )
+    first, second, third = replace_chips(mixed, "bmp581").tile
+    assert (first, second) == mixed.tile[:2]
+    assert third == mixed.tile[2].model_copy(update={"chip": "bmp581"})
