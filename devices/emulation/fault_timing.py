@@ -152,9 +152,10 @@ class PartFaults:
     """Faults of one part.
 
     `no_answer`: no acknowledge, as with RST low; registers and conversion go on. `unplugged`: no
-    supply; afterwards its registers are zero. `replaced`: unplugged, then another part in its
-    place. `stale`: conversions never end. `slow`: they take 2.9 ms, still within the data sheet.
-    `all_ones`: the part is lost between address and data, so that the line floats high.
+    supply; afterwards its registers are as after power-up. `replaced`: unplugged, then another
+    part in its place. `stale`: conversions never end. `slow`: they take longer, an MPL115A2's
+    2.9 ms, still within its data sheet, a BMP581's 1.3 times its own, beyond it. `all_ones`: the
+    part is lost between address and data, so that the line floats high.
     """
 
     no_answer: FaultTiming = field(default_factory=FaultTiming)
