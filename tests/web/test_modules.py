@@ -137,6 +137,35 @@ def test_counts_of_two_kinds_of_chip_have_each_their_own_scale(ask: Ask) -> None
     assert most.startswith("0 300")
 
 
+def test_texts_of_the_scales_of_two_tiles_do_not_overlap(ask: Ask) -> None:
+    """Text is 12 px high, and the second tile is 7 px below the first."""
+    closest_px = ask(
+        "session/plots",
+        """({ Plots }) => {
+          const nothing = () => {};
+          const context = { beginPath: nothing, moveTo: nothing, lineTo: nothing, stroke: nothing };
+          let closest = Infinity;
+          for (const heightPx of [32, 46, 55, 83]) {
+            for (let n = 0; n < 500; n++) {
+              const rows = [];
+              context.fillText = (text, x, y) => rows.push(y);
+              for (const top of [0, heightPx + 7]) {
+                const box = { left: 0, right: 9, top, bottom: top + heightPx };
+                const low = 6.8 + 0.0007 * ((n * (top + 1)) % 97);
+                const scale = { low, high: low + 0.002 * (1 + n) };
+                const y = (v) => box.bottom - ((v - low) / (scale.high - low)) * heightPx;
+                Plots.prototype.drawScale.call({ colours: {} }, context, box, scale, y);
+              }
+              rows.sort((a, b) => a - b);
+              rows.slice(1).forEach((row, i) => { closest = Math.min(closest, row - rows[i]); });
+            }
+          }
+          return closest;
+        }""",
+    )
+    assert closest_px >= 12
+
+
 def test_of_a_cut_stance_a_bound_of_zero_is_left_out(ask: Ask) -> None:
     found = ask(
         "session/stances",

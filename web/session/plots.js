@@ -194,7 +194,8 @@ export class Plots {
   drawScale(context, box, scale, y) {
     const { colours } = this;
     context.lineWidth = 1;
-    const most = Math.max(3, Math.floor((box.bottom - box.top) / 28));
+    const height = box.bottom - box.top;
+    const most = Math.max(height < 45 ? 2 : 3, Math.floor(height / 28));
     const { step, values } = ticks(scale.low, scale.high, most);
     context.textAlign = "right";
     for (const value of values) {
@@ -205,7 +206,9 @@ export class Plots {
       context.lineTo(box.right, row);
       context.stroke();
       context.fillStyle = colours.text;
-      if (!scale.empty) context.fillText(number(value, decimalsOf(step)), box.left - 6, row);
+      // Not beyond the panel: the next tile's scale begins 7 px below it.
+      const textRow = Math.min(Math.max(row, box.top + 3), box.bottom - 3);
+      if (!scale.empty) context.fillText(number(value, decimalsOf(step)), box.left - 6, textRow);
     }
     context.strokeStyle = colours.edge;
     context.beginPath();
