@@ -5,7 +5,8 @@ Source: BMP581 data sheet BST-BMP581-DS004, "DS" below; open points are marked i
 repeated reading is told from a new one. It converts by itself (CONTINUOUS) or on command (FORCED).
 
 A part is told by the id that is burnt into its memory. Its settings are OSR_CONFIG, DSP_IIR and
-ODR_CONFIG; they are read back, since a write that a part ignores is acknowledged.
+ODR_CONFIG. All registers written are read back: a write that a part ignores is acknowledged, and a
+flipped bit may leave plausible pressures without compensation.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ no pin need be wired (DS 4.7)."""
 COMPENSATE, SHOW_FILTERED = 0x03, 0x78
 """Bits of DSP_CONFIG: compensation of both words; data registers and FIFO behind the filter."""
 FIFO_PRESSURES = 2
-"""FIFO_SELECT: the FIFO stores the pressure of each conversion, 32 of them."""
+"""FIFO_SELECT: the FIFO stores the pressure of each conversion, 32 in all; bits 2 to 4 decimate."""
 PRESSURE_ON = 0x40
 """Bit of OSR_CONFIG."""
 NOT_DEEP, MODE_BITS = 0x80, 0x03
@@ -173,6 +174,13 @@ def make_law(registers: Registers) -> PressureLaw:
     return PressureLaw(0.0, 1.0 / COUNTS_PER_KPA, 0.0, 0.0, 1.0, 0.0)
 
 
+def _encode_registers(settings: Registers) -> tuple[int, ...]:
+    """Encode INT_SOURCE, FIFO_SELECT, DSP_CONFIG, and the three registers of the settings."""
+    osr, iir, odr = settings
+    select = FIFO_PRESSURES if is_free_running(settings) else 0
+    return DATA_READY, select, COMPENSATE | (SHOW_FILTERED if iir else 0), iir, osr, odr
+
+
 class Bmp581:
     """Transfers to the parts at an address that the multiplexers connect (`ChipDriver`)."""
 
@@ -199,13 +207,13 @@ class Bmp581:
             self._write(REGISTER_COMMAND, RESET_COMMAND)
         # With an error in its memory, which holds its trim, a part is not ready.
         self._wait_until(REGISTER_STATUS, NVM_READY | NVM_ERROR, NVM_READY, "ready after a reset")
-        osr, iir, odr = settings
+        source, select, dsp, iir, osr, odr = _encode_registers(settings)
         # Filter and compensation are written in standby only, else they are lost; the mode is last.
         self._write(REGISTER_ODR_CONFIG, odr & ~MODE_BITS)
-        self._write(REGISTER_DSP_CONFIG, COMPENSATE | (SHOW_FILTERED if iir else 0), iir)
-        self._write(REGISTER_INT_SOURCE, DATA_READY)
-        if is_free_running(settings):
-            self._write(REGISTER_FIFO_SELECT, FIFO_PRESSURES)
+        self._write(REGISTER_DSP_CONFIG, dsp, iir)
+        self._write(REGISTER_INT_SOURCE, source)
+        if select:
+            self._write(REGISTER_FIFO_SELECT, select)
         self._write(REGISTER_OSR_CONFIG, osr, odr)
         if not self._has_settings(settings):
             raise TileSetupError(
@@ -323,11 +331,11 @@ class Bmp581:
         return int.from_bytes(self._read(REGISTER_NVM_DATA, 2), "little")
 
     def _has_settings(self, settings: Registers) -> bool:
-        (iir,) = self._read(REGISTER_DSP_IIR, 1)
-        osr, odr = self._read(REGISTER_OSR_CONFIG, 2)
+        source, _, _, select = self._read(REGISTER_INT_SOURCE, 4)
+        dsp, iir, *_, osr, odr = self._read(REGISTER_DSP_CONFIG, 8)
         if not is_free_running(settings):
             odr &= ~MODE_BITS  # a conversion may be running
-        return (osr, iir, odr) == settings
+        return (source, select, dsp, iir, osr, odr) == _encode_registers(settings)
 
     def _wait_until(self, register: int, mask: int, value: int, what: str) -> None:
         message = i2c_msg.read(self._address, 1)

@@ -90,6 +90,7 @@ _NOISE_PA = (0.78, 0.58, 0.41, 0.30, 0.21, 0.15, 0.11, 0.08)  # DS table 9
 _NOISE_K = 0.0055  # of a real part, once sampled
 _TOLERANCE, _TOLERANCE_MAX = 0.017, 0.05  # of the clock: one sigma, and the data sheet's bound
 _SLOW_FACTOR = 1.3
+_UNCOMPENSATED = 1.02  # an assumption: plausible, but wrong
 _ODR_HZ = (
     *(240.0, 218.537, 199.111, 179.2, 160.0, 149.333, 140.0, 129.855, 120.0, 110.164, 100.299),
     *(89.6, 80.0, 70.0, 60.0, 50.056, 45.025, 40.0, 35.0, 30.0, 25.005, 20.0, 15.0, 10.0, 5.0),
@@ -167,6 +168,7 @@ class EmulatedBmp581:
         self._commands: list[int] = []
         self._mode = STANDBY
         self._fifo: deque[bytes] = deque()
+        self._ended_count = 0
         self._standby_ns = 0
         self._next_end_ns: int | None = None
         self._begin_ns = 0
@@ -290,13 +292,18 @@ class EmulatedBmp581:
         noise = self._rng.standard_normal(2).tolist()
         kpa += 1e-3 * _NOISE_PA[p_code] * noise[0]
         degc += _NOISE_K / math.sqrt(1 << t_code) * noise[1]
-        filtered = self._filter(kpa, degc)
         shows = self._registers[REGISTER_DSP_CONFIG]
+        if shows & COMPENSATE != COMPENSATE:
+            kpa *= _UNCOMPENSATED
+        filtered = self._filter(kpa, degc)
         temperature = _encode_degc(filtered[1] if shows & 0x08 else degc)
         pressure = _encode_kpa(filtered[0] if shows & 0x20 else kpa)
         self._set_word(REGISTER_TEMPERATURE, temperature)
         self._set_word(REGISTER_PRESSURE, pressure if osr & PRESSURE_ON else NO_DATA)
-        select = self._registers[REGISTER_FIFO_SELECT] & 3
+        select = self._registers[REGISTER_FIFO_SELECT]
+        self._ended_count += 1
+        if self._ended_count % (1 << (select >> 2 & 7)):
+            select = 0  # decimated
         stored = b""
         if select & 1:
             stored += _encode_degc(filtered[1] if shows & 0x10 else degc).to_bytes(3, "little")

@@ -129,6 +129,7 @@ def test_a_free_running_part_converts_at_its_own_rate(osr: int, factor: float) -
     )
     ended_ns = []
     bench.wait_ms(2)
+    bench.driver.has_new_counts()  # one may have ended before
     for _ in range(20):
         while not bench.driver.has_new_counts():
             assert bench.clock.now_ns() < 10**10
@@ -200,6 +201,32 @@ def test_settings_that_are_lost_are_said() -> None:
     bench.chip._write = lambda register, value: None  # type: ignore[method-assign]
     with pytest.raises(TileSetupError, match="ignores its settings"):
         bench.driver.start_up(CONTINUOUS)
+
+
+@pytest.mark.parametrize("settings", [CONTINUOUS, FORCED])
+@pytest.mark.parametrize(("register", "bit"), [(0x15, 0x01), (0x18, 0x04), (0x30, 0x03)])
+def test_a_flipped_bit_of_any_register_is_seen(
+    register: int, bit: int, settings: tuple[int, ...]
+) -> None:
+    bench = Bench()
+    bench.driver.start_up(settings)
+    assert bench.driver.is_set_up_as((0x5032, *PART_ID), settings)
+    bench.chip._registers[register] ^= bit
+    assert not bench.driver.is_set_up_as((0x5032, *PART_ID), settings)
+    assert bench.driver.read_registers() == (0x5032, *PART_ID)
+
+
+def test_a_part_without_compensation_or_with_a_decimated_fifo_gives_plausible_pressures() -> None:
+    bench = Bench()
+    bench.driver.start_up(CONTINUOUS)
+    bench.wait_ms(20)
+    usual = bench.driver.read_new_pressures(33)
+    bench.chip._registers[0x30], bench.chip._registers[0x18] = 0, bmp581.FIFO_PRESSURES | 4
+    bench.wait_ms(20)
+    found = bench.driver.read_new_pressures(33)
+    assert len(found) == pytest.approx(len(usual) / 2, abs=1)
+    assert all(0.5 < abs(word / 64_000 - 100.0) < 10.0 for word in found)
+    assert not any(bench.driver.classify_counts(word, NOT_READ) for word in found)
 
 
 def test_registers_of_standby_ignore_a_write_in_between() -> None:
