@@ -96,6 +96,52 @@ def test_a_part_that_is_ill_is_flagged_alone_and_comes_back_with_right_instants(
     assert not any(any(frame[:TILE] + frame[TILE + 1 :]) for frame in flags)
 
 
+@pytest.mark.parametrize("temperature_every", [1, 10])
+def test_an_old_reading_is_told_without_its_temperature(temperature_every: int) -> None:
+    content = make_scene("rolling", mode="forced").model_dump()
+    content["array"] |= {"temperature_every": temperature_every}
+    rig = Rig(validate_scene(content, where="test"))
+    rig.scan(20)
+    resets = 0
+
+    def interrupt_supply(reset: Callable[[], None] = rig.chip(TILE).interrupt_supply) -> None:
+        nonlocal resets
+        resets += 1
+        reset()
+
+    rig.chip(TILE).interrupt_supply = interrupt_supply  # type: ignore[method-assign]
+    with rig.world.inject_fault("stale", f"T0{TILE + 1}"):
+        rig.scan(1)  # its conversion may have ended before
+        old_raw = rig.array._last_counts[TILE][0]
+        scans = [rig.array.scan_frame() for _ in range(150)]
+    assert all(scan.pressure_raw[TILE] != old_raw for scan in scans)
+    assert all(scan.tile_flags[TILE] & TileFlag.UNUSABLE for scan in scans)
+    assert resets, "it is set up anew"
+
+
+def test_a_conversion_that_ends_behind_its_read_is_read_again() -> None:
+    """The status is asked later: without another read an old reading would pass as new."""
+    rig = Rig(make_scene("rolling", mode="forced"))
+    rig.scan(20)
+    io = rig.array._tile_io
+    ask = io.has_new_counts
+    was_asked = []
+
+    def end_and_ask(tile: int) -> bool:
+        if tile == 0:
+            was_asked.append(True)
+            rig.clock.sleep_until_ns(rig.clock.now_ns() + 5_000_000)
+        return ask(tile)
+
+    io.has_new_counts = end_and_ask  # type: ignore[method-assign]
+    rig.array._conversion_monitor.wait_ns[:] = [100_000] * 4  # each read is too early
+    old_raw = rig.array._last_counts[0][0]
+    scan = rig.array.scan_frame()
+    assert was_asked
+    assert scan.pressure_raw[0] != old_raw
+    assert not scan.tile_flags[0]
+
+
 @pytest.mark.parametrize(
     ("register", "value", "message"),
     [(0x01, 0x60, "chip id 0x60, a BME280"), (0x28, 0x06, "memory is damaged")],
