@@ -147,7 +147,7 @@ class ConversionClock:
         self._counted = 0
 
     def set_end(self, end_ns: int) -> None:
-        """Begin with the known end of a conversion, the last one in the next read."""
+        """Begin with the known end of a conversion, just before the next read."""
         self._end_ns = self._fixed_ns = end_ns
         self._last_read_ns, self._counted = None, 0
 
@@ -174,14 +174,18 @@ class ConversionClock:
         if last is None:
             if self._fixed_ns is None:
                 self._end_ns = begin_ns - self._period_ns / 2
-            return round(self._end_ns)
-        if count >= STORED_MAX:  # some may be lost, and the period tells how many
-            ended = max(count, (begin_ns - self._end_ns) // self._period_ns)
-            self._end_ns += ended * self._period_ns
-            self._fixed_ns = None
+            else:  # the known end is the last one's, unless time for others has passed
+                self._counted = int((begin_ns - self._end_ns) // self._period_ns)
+                self._end_ns += self._counted * self._period_ns
             return round(self._end_ns)
         low_ns = max(last[0] + (count - 1) * self._period_ns, begin_ns - self._period_ns)
         high_ns = min(end_ns, last[1] + count * self._period_ns)
+        if count >= STORED_MAX or low_ns > high_ns:
+            # Some are lost, or one is miscounted, and the period tells how many ended.
+            ended = (begin_ns - self._end_ns) // self._period_ns
+            self._end_ns += max(count if count >= STORED_MAX else 0, ended) * self._period_ns
+            self._fixed_ns = None
+            return round(self._end_ns)
         self._end_ns = min(max(self._end_ns + count * self._period_ns, low_ns), high_ns)
         self._counted += count
         if high_ns - low_ns < _NARROW * self._period_ns:

@@ -84,6 +84,30 @@ def test_the_clock_of_a_part_is_followed_by_the_number_of_its_conversions(
     assert np.abs(errors_ns[2000:]).max() < 0.06 * period_ns
 
 
+def test_a_pause_behind_the_known_end_may_contain_conversions() -> None:
+    clock = ConversionClock(2_000_000)
+    clock.set_end(10_000_000)
+    assert clock.count_conversions(2, 13_000_000, 13_100_000) == 12_000_000
+    assert clock.count_conversions(1, 15_000_000, 15_100_000) == 14_000_000
+
+
+@pytest.mark.parametrize(("every", "lost_at"), [(1, 1600), (1, 2500), (3, 2500), (6, 2900)])
+def test_a_lost_conversion_does_not_move_the_clock(every: int, lost_at: int) -> None:
+    """It contradicts the bounds, which would fix a wrong end and then a wrong period."""
+    period_ns = 2_001_000.0
+    clock = ConversionClock(2_000_000)
+    read_ns, counted = 1_000_000_000.0, 0
+    errors_ns = []
+    for read in range(5000):
+        ended = int(read_ns // period_ns)
+        count = ended - counted - (read == lost_at)
+        end_ns = clock.count_conversions(count, round(read_ns), round(read_ns))
+        errors_ns.append(abs(end_ns - ended * period_ns))
+        counted = ended
+        read_ns += period_ns * (every + 0.002)
+    assert max(errors_ns[1500:]) < 0.1 * period_ns
+
+
 Ends = list[dict[int, int | None]]
 
 
