@@ -251,7 +251,8 @@ def choose_scene_schedule(
 def identify_and_measure(bus: I2cBus, scene: Scene, clock: Clock) -> MeasuredTiles:
     """Identify the tiles of a scene and measure their timing.
 
-    With `array.wait_ms` the conversion times are not measured. A part that cannot be measured is
+    With `array.wait_ms` the conversion times are measured of chips with a status only: the wait is
+    the scene's, but the clock of a free-running part must be known. A part that cannot be measured is
     assigned the data sheet's longest time.
 
     Raises:
@@ -262,8 +263,8 @@ def identify_and_measure(bus: I2cBus, scene: Scene, clock: Clock) -> MeasuredTil
     wires = measure_wire_timing(bus, clock, tiles[0])
     unmeasured = []
     conversions_ns: list[int | None] = [None] * len(tiles)
-    if scene.array.wait_ms is None:
-        for index, tile in enumerate(tiles):
+    for index, tile in enumerate(tiles):
+        if scene.array.wait_ms is None or get_chip(tile.chip).has_status:
             conversion_ns = measure_conversion_ns(bus, clock, tile, wires)
             conversions_ns[index] = conversion_ns
             if conversion_ns is None:

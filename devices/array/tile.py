@@ -194,6 +194,8 @@ class ConversionClock:
                 period_ns = (self._end_ns - self._fixed_ns) / self._counted
                 if abs(period_ns / self._measured_ns - 1) < _RATE_ERROR_MAX:
                     self._period_ns = period_ns
+                else:  # a miscount, unless the next one agrees
+                    self._measured_ns, self._fixed_ns = period_ns, None
             if self._fixed_ns is None or self._counted >= _COUNTED_MAX:
                 self._fixed_ns, self._counted = self._end_ns, 0
         return round(self._end_ns)

@@ -103,8 +103,9 @@ def test_an_old_reading_is_told_without_its_temperature(temperature_every: int) 
     rig = Rig(validate_scene(content, where="test"))
     rig.scan(20)
     resets = 0
+    reset = rig.chip(TILE).interrupt_supply
 
-    def interrupt_supply(reset: Callable[[], None] = rig.chip(TILE).interrupt_supply) -> None:
+    def interrupt_supply() -> None:
         nonlocal resets
         resets += 1
         reset()

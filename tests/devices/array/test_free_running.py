@@ -84,6 +84,20 @@ def test_the_clock_of_a_part_is_followed_by_the_number_of_its_conversions(
     assert np.abs(errors_ns[2000:]).max() < 0.06 * period_ns
 
 
+def test_a_period_that_was_measured_wrongly_is_corrected() -> None:
+    period_ns = 2_060_000.0
+    clock = ConversionClock(2_000_000)
+    read_ns, counted = 1_000_000_000.0, 0
+    errors_ns = []
+    for _ in range(6000):
+        ended = int(read_ns // period_ns)
+        end_ns = clock.count_conversions(ended - counted, round(read_ns), round(read_ns))
+        errors_ns.append(abs(end_ns - ended * period_ns))
+        counted = ended
+        read_ns += period_ns * 1.01
+    assert max(errors_ns[3000:]) < 0.1 * period_ns
+
+
 def test_a_pause_behind_the_known_end_may_contain_conversions() -> None:
     clock = ConversionClock(2_000_000)
     clock.set_end(10_000_000)
@@ -148,6 +162,15 @@ def scan_instant_errors_ns(rig: Rig, ends_ns: Ends, frames: int) -> np.ndarray:
                 errors_ns.append(estimated_ns - true_ns)
     assert len(errors_ns) > frames / 2
     return np.array(errors_ns)
+
+
+@pytest.mark.parametrize("wait_ms", [2.2, 7.0])
+def test_samples_have_their_instants_at_an_interval_of_the_scene(wait_ms: float) -> None:
+    content = make_scene("rolling").model_dump()
+    content["array"] |= {"wait_ms": wait_ms}
+    rig = Rig(validate_scene(content, where="test"))
+    errors_ns = scan_instant_errors_ns(rig, note_ends(rig), 600)
+    assert np.abs(errors_ns).max() < 0.1 * max(rig.array._conversions_ns)
 
 
 @pytest.mark.parametrize(
