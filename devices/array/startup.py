@@ -251,9 +251,8 @@ def choose_scene_schedule(
 def identify_and_measure(bus: I2cBus, scene: Scene, clock: Clock) -> MeasuredTiles:
     """Identify the tiles of a scene and measure their timing.
 
-    With `array.wait_ms` the conversion times are measured of chips with a status only: the wait is
-    the scene's, but the clock of a free-running part must be known. A part that cannot be measured is
-    assigned the data sheet's longest time.
+    With `array.wait_ms` only parts with a status are measured: the clock of a free-running one must
+    be known. A part that cannot be measured is assigned the data sheet's longest time.
 
     Raises:
         TileSetupError, I2cError: as for `prepare_array`.

@@ -154,11 +154,12 @@ def compute_conversion_ns(settings: Registers) -> tuple[int, int]:
 def compute_sample_delay_ns(settings: Registers, conversion_ns: int) -> int:
     """Return the time from a conversion's begin to the middle of its pressure sample.
 
-    The pressure is taken to be the second part of a conversion. The measured time of one that is
+    The output of the filter with the coefficient c is c conversions old in the mean. The pressure is taken to be the second part of a conversion. The measured time of one that is
     commanded is the longest, so that its start is late by half of what starts differ by.
     """
     late_ns = 0 if is_free_running(settings) else START_SPREAD_NS // 2
-    return conversion_ns - late_ns - CONVERSION_P_NS[settings[0] >> 3 & 7] // 2
+    filtered_ns = FILTER_COEFFICIENTS[settings[1] >> 3 & 7] * conversion_ns
+    return conversion_ns - late_ns - filtered_ns - CONVERSION_P_NS[settings[0] >> 3 & 7] // 2
 
 
 def make_law(registers: Registers) -> PressureLaw:

@@ -155,8 +155,11 @@ def scan_instant_errors_ns(rig: Rig, ends_ns: Ends, frames: int) -> np.ndarray:
     for _ in range(frames):
         scan = rig.array.scan_frame()
         for tile, ends in enumerate(ends_ns):
-            half_ns = bmp581.CONVERSION_P_NS[rig.array.tiles[tile].settings[0] >> 3 & 7] // 2
-            estimated_ns = scan.convert_stop_ns[tile] + rig.array.sample_delay_ns[tile] + half_ns
+            osr, iir, _ = rig.array.tiles[tile].settings
+            half_ns = bmp581.CONVERSION_P_NS[osr >> 3 & 7] // 2
+            lag_ns = bmp581.FILTER_COEFFICIENTS[iir >> 3 & 7] * rig.array._conversions_ns[tile]
+            estimated_ns = scan.convert_stop_ns[tile] + rig.array.sample_delay_ns[tile]
+            estimated_ns += half_ns + lag_ns
             true_ns = ends.get(scan.pressure_raw[tile])
             if true_ns is not None and not scan.tile_flags[tile] & TileFlag.UNUSABLE:
                 errors_ns.append(estimated_ns - true_ns)

@@ -261,6 +261,21 @@ def test_the_filter_is_the_data_sheets(c: int) -> None:
         assert 110.0 - kpa == pytest.approx(10.0 * (c / (c + 1)) ** n, abs=0.01)
 
 
+@pytest.mark.parametrize("c", [0, 1, 3, 7])
+def test_a_filtered_pressure_is_that_of_its_sample_instant(c: int) -> None:
+    bench = Bench(lambda t_ns: (100.0 + 1e-8 * t_ns, 25.0))
+    settings = BMP581.encode_settings(ChipSettings(filter=c))
+    delay_ns = BMP581.compute_sample_delay_ns(settings, 2_000_000)
+    bench.driver.start_up(settings)
+    errors_ns: list[float] = []
+    bench.chip.on_conversion = lambda begin_ns, counts, _: errors_ns.append(
+        (counts[0] / 64_000 - 100.0) * 1e8 - begin_ns - delay_ns
+    )
+    bench.wait_ms(400)
+    bench.driver.read_pressure()
+    assert abs(sum(errors_ns[-50:]) / 50) < 100_000
+
+
 @pytest.mark.parametrize(
     ("register", "value", "message"),
     [
