@@ -11,6 +11,7 @@ flipped bit may leave plausible pressures without compensation.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 
 import numpy as np
@@ -95,7 +96,10 @@ START_SPREAD_NS = 1_200_000
 _TOLERANCE_PERCENT = 5  # of a conversion's time (DS table 4)
 
 FIFO_FRAMES, _FIFO_FRAME_BYTES = 32, 3
-_POLLS = 200  # more than 4 ms at 1 MHz; a change of mode takes 2.5, a reset 2 (DS table 4)
+_POLLED_BITS = 3500
+"""Bits of polling until a part that is not ready has failed: 3.5 ms at 1 MHz, 9 ms at 400 kHz. A
+change of mode takes 2.5 ms, a reset 2 (DS table 4). A driver has no clock."""
+_POLL_BITS, _SILENT_BITS = 39, 11
 _COLD_DEGC, _HOT_DEGC = -60.0, 110.0  # beyond the rated -40 to 85
 
 
@@ -154,8 +158,9 @@ def compute_conversion_ns(settings: Registers) -> tuple[int, int]:
 def compute_sample_delay_ns(settings: Registers, conversion_ns: int) -> int:
     """Return the time from a conversion's begin to the middle of its pressure sample.
 
-    The output of the filter with the coefficient c is c conversions old in the mean. The pressure is taken to be the second part of a conversion. The measured time of one that is
-    commanded is the longest, so that its start is late by half of what starts differ by.
+    The pressure is taken to be the second part of a conversion, and what a filter c gives is c
+    conversions older in the mean. The measured time of a commanded conversion is the longest, so
+    that its start is late by half of what starts differ by.
     """
     late_ns = 0 if is_free_running(settings) else START_SPREAD_NS // 2
     filtered_ns = FILTER_COEFFICIENTS[settings[1] >> 3 & 7] * conversion_ns
@@ -206,8 +211,7 @@ class Bmp581:
         self._read(REGISTER_CHIP_ID, 1)  # a part that is absent is not polled
         with suppress(NoAcknowledgeError):  # a part may not acknowledge its own reset (DS 7.36)
             self._write(REGISTER_COMMAND, RESET_COMMAND)
-        # With an error in its memory, which holds its trim, a part is not ready.
-        self._wait_until(REGISTER_STATUS, NVM_READY | NVM_ERROR, NVM_READY, "ready after a reset")
+        self._check_memory(self._where)
         source, select, dsp, iir, osr, odr = _encode_registers(settings)
         # Filter and compensation are written in standby only, else they are lost; the mode is last.
         self._write(REGISTER_ODR_CONFIG, odr & ~MODE_BITS)
@@ -230,7 +234,7 @@ class Bmp581:
             return (chip << 8 | revision,)  # another chip is not written to
         (odr,) = self._read(REGISTER_ODR_CONFIG, 1)
         self._write(REGISTER_ODR_CONFIG, odr & ~MODE_BITS)
-        self._wait_until(REGISTER_ODR_CONFIG, MODE_BITS, STANDBY, "in standby")
+        self._wait_until(REGISTER_ODR_CONFIG, lambda odr: odr & MODE_BITS == STANDBY, "in standby")
         part_id = [self._read_memory(row) for row in NVM_ID_ROWS]
         self._write(REGISTER_ODR_CONFIG, odr)
         return (chip << 8 | revision, *part_id)
@@ -249,13 +253,7 @@ class Bmp581:
                 expected=f"0x{CHIP_ID:02x}, a BMP581",
                 remedy="Correct the scene's key `chip`, or check that SDA is not stuck",
             )
-        (status,) = self._read(REGISTER_STATUS, 1)
-        if status & (NVM_READY | NVM_ERROR) != NVM_READY:
-            raise TileSetupError(
-                f"the part's memory is damaged: status 0x{status:02x}",
-                where=where,
-                remedy="Cycle its supply; if it stays so, replace the tile: its trim is lost",
-            )
+        self._check_memory(where)
         readings = {self.read_registers() for _ in range(2)}
         if len(readings) > 1:
             raise TileSetupError(
@@ -324,11 +322,29 @@ class Bmp581:
             return TileFlag.IMPLAUSIBLE
         return 0
 
+    def _check_memory(self, where: str) -> None:
+        """Wait until a part is ready, and check the memory of its trim.
+
+        Raises:
+            TileSetupError: it does not become ready, or the memory is damaged.
+        """
+        status = self._wait_until(
+            REGISTER_STATUS, lambda status: status & (NVM_READY | NVM_ERROR), "ready", where
+        )
+        if status & NVM_ERROR:
+            raise TileSetupError(
+                f"the part's memory is damaged: status 0x{status:02x}",
+                where=where,
+                remedy="Cycle its supply; if it stays so, replace the tile: its trim is lost",
+            )
+
     def _read_memory(self, row: int) -> int:
         self._write(REGISTER_NVM_ADDRESS, row)
         for command in NVM_COMMAND:
             self._write(REGISTER_COMMAND, command)
-        self._wait_until(REGISTER_STATUS, NVM_READY, NVM_READY, "ready after a read of its memory")
+        self._wait_until(
+            REGISTER_STATUS, lambda status: status & NVM_READY, "ready after a read of its memory"
+        )
         return int.from_bytes(self._read(REGISTER_NVM_DATA, 2), "little")
 
     def _has_settings(self, settings: Registers) -> bool:
@@ -338,16 +354,23 @@ class Bmp581:
             odr &= ~MODE_BITS  # a conversion may be running
         return (source, select, dsp, iir, osr, odr) == _encode_registers(settings)
 
-    def _wait_until(self, register: int, mask: int, value: int, what: str) -> None:
+    def _wait_until(
+        self, register: int, is_ready: Callable[[int], int], what: str, where: str = ""
+    ) -> int:
+        """Poll a register until it is as expected; return it."""
         message = i2c_msg.read(self._address, 1)
-        for _ in range(_POLLS):
+        left_bits = _POLLED_BITS
+        while left_bits > 0:
+            left_bits -= _SILENT_BITS
             with suppress(NoAcknowledgeError):  # a part in its reset is silent
                 self._bus.transfer_once(i2c_msg.write(self._address, [register]), message)
-                if bytes(message)[0] & mask == value:
-                    return
+                (value,) = bytes(message)
+                if is_ready(value):
+                    return value
+                left_bits -= _POLL_BITS - _SILENT_BITS
         raise TileSetupError(
             f"the part is not {what}",
-            where=self._where,
+            where=where or self._where,
             remedy="Check its supply, and that SDA is not stuck",
         )
 

@@ -145,7 +145,11 @@ def test_a_conversion_that_ends_behind_its_read_is_read_again() -> None:
 
 @pytest.mark.parametrize(
     ("register", "value", "message"),
-    [(0x01, 0x60, "chip id 0x60, a BME280"), (0x28, 0x06, "memory is damaged")],
+    [
+        (0x01, 0x60, "chip id 0x60, a BME280"),
+        (0x28, 0x06, "memory is damaged"),
+        (0x28, 0x00, "not ready"),
+    ],
 )
 def test_a_wrong_chip_or_a_damaged_memory_ends_the_start(
     register: int, value: int, message: str

@@ -36,11 +36,12 @@ class Bench:
         self,
         sample: Callable[[int], tuple[float, float]] = lambda _: (100.0, 25.0),
         clock_factor: float = 1.0,
+        scl_hz: int = 400_000,
     ) -> None:
         self.clock = VirtualClock()
         self.chip = EmulatedBmp581(EmulatedPart(PART_ID, clock_factor, sample, "bench"), 0x46)
         mux = EmulatedTca9548a(0x70, [(2, self.chip)])
-        adapter = EmulatedI2cAdapter([mux], self.clock, 400_000)
+        adapter = EmulatedI2cAdapter([mux], self.clock, scl_hz)
         self.bus: I2cBus = open_bus("emulated", adapter)
         self.bus.transfer(i2c_msg.write(0x70, [0b100]))
         self.driver = Bmp581(self.bus, 0x46)
@@ -282,7 +283,8 @@ def test_a_filtered_pressure_is_that_of_its_sample_instant(c: int) -> None:
         (0x01, 0x51, "chip id 0x51, a BMP585"),
         (0x01, 0x60, "chip id 0x60, a BME280"),
         (0x28, 0x06, "memory is damaged: status 0x06"),
-        (0x28, 0x00, "memory is damaged: status 0x00"),
+        (0x28, 0x04, "memory is damaged: status 0x04"),
+        (0x28, 0x00, "the part is not ready"),
     ],
 )
 def test_another_chip_and_a_damaged_memory_are_named(
@@ -292,6 +294,27 @@ def test_another_chip_and_a_damaged_memory_are_named(
     bench.chip._registers[register] = value
     with pytest.raises(TileSetupError, match=message):
         bench.driver.identify(where="tile T01")
+
+
+def test_a_part_that_still_loads_its_memory_is_waited_for() -> None:
+    bench = Bench()
+    bench.chip._memory_ready_ns = bench.clock.now_ns() + 2_000_000
+    assert bench.driver.identify(where="here") == (0x5032, *PART_ID)
+
+
+@pytest.mark.parametrize("scl_hz", [400_000, 1_000_000])
+@pytest.mark.parametrize("is_silent", [False, True])
+def test_a_part_that_never_is_ready_is_polled_for_some_milliseconds(
+    scl_hz: int, is_silent: bool
+) -> None:
+    bench = Bench(scl_hz=scl_hz)
+    bench.chip._memory_ready_ns = 10**12
+    begin_ns = bench.clock.now_ns()
+    if is_silent:
+        bench.chip.on_address = lambda reading, t_ns: False  # type: ignore[method-assign]
+    with pytest.raises(TileSetupError, match="not ready"):
+        bench.driver._check_memory("here")
+    assert 3_000_000 < bench.clock.now_ns() - begin_ns < 10_000_000
 
 
 @pytest.mark.parametrize(
