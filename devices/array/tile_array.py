@@ -358,8 +358,9 @@ class TileArray:
             is_repeated = False
             if self._tile_io.chips[tile].has_status and counts[0] == self._last_counts[tile][0]:
                 is_repeated = not self._tile_io.has_new_counts(tile)
-                if not is_repeated:  # it may have ended behind the read
+                if not is_repeated:  # it may have ended behind the read, or long before it
                     counts = self._tile_io.read_counts(tile, with_temperature)
+                    is_repeated = with_temperature and counts == self._last_counts[tile]
 
         answers = self._run_with_retry(scan, [tile], transfers)
         self._is_converting[tile] = False

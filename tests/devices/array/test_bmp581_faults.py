@@ -120,6 +120,26 @@ def test_an_old_reading_is_told_without_its_temperature(temperature_every: int) 
     assert resets, "it is set up anew"
 
 
+def test_a_late_conversion_is_flagged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The status may be of an earlier conversion, since it is asked of repeated counts only."""
+    rig = Rig(make_scene("rolling", mode="forced"))
+    rig.scan(20)
+    monkeypatch.setattr(emulation, "_START_UP_NS", (300_000, bmp581.START_UP_MAX_NS))
+    before = rig.array.scan_frame()
+    late = 0
+    for _ in range(300):
+        scan = rig.array.scan_frame()
+        for tile, raw in enumerate(scan.pressure_raw):
+            late += bool(scan.tile_flags[tile] & TileFlag.NOT_CONVERTED)
+            is_old = (raw, scan.temperature_raw[tile]) == (
+                before.pressure_raw[tile],
+                before.temperature_raw[tile],
+            )
+            assert scan.tile_flags[tile] or not is_old
+        before = scan
+    assert late > 20
+
+
 def test_a_conversion_that_ends_behind_its_read_is_read_again() -> None:
     """The status is asked later: without another read an old reading would pass as new."""
     rig = Rig(make_scene("rolling", mode="forced"))
