@@ -205,16 +205,20 @@ class EmulatedBmp581:
         register, self._pointer = self._pointer, (self._pointer + 1) % _REGISTERS
         if register == REGISTER_COMMAND:
             return self._receive_command(value)
-        if register in _WRITABLE and (register not in _IN_STANDBY_ONLY or self._mode == STANDBY):
+        if register in _WRITABLE and (register not in _IN_STANDBY_ONLY or self._is_in_standby):
             self._write(register, value)
         return True
+
+    @property
+    def _is_in_standby(self) -> bool:
+        return self._mode == STANDBY and self._t_ns >= self._standby_ns
 
     def _receive_command(self, value: int) -> bool:
         self._commands.append(value)
         if value == RESET_COMMAND:
             self.interrupt_supply()
             return self.acknowledges_reset
-        if tuple(self._commands[-2:]) == NVM_COMMAND and self._mode == STANDBY:
+        if tuple(self._commands[-2:]) == NVM_COMMAND and self._is_in_standby:
             row = self._registers[REGISTER_NVM_ADDRESS] & 0x3F
             word = self._memory_rows.get(row, 0) if row < _NVM_ROWS else 0
             self._registers[REGISTER_NVM_DATA : REGISTER_NVM_DATA + 2] = word.to_bytes(2, "little")
@@ -239,7 +243,7 @@ class EmulatedBmp581:
             if self._next_end_ns is not None:
                 self._standby_ns = min(self._next_end_ns, self._t_ns + _TO_STANDBY_NS)
             self._mode, self._next_end_ns = STANDBY, None
-        elif self._mode == STANDBY and self._t_ns >= self._standby_ns:
+        elif self._is_in_standby:
             deep = not self._registers[REGISTER_ODR_CONFIG] & NOT_DEEP
             self._mode = mode
             if mode != FORCED:
@@ -358,8 +362,7 @@ class EmulatedBmp581:
     def _show(self, register: int) -> int:
         value = self._registers[register]
         if register == REGISTER_ODR_CONFIG:
-            is_idle = self._mode == STANDBY and self._t_ns >= self._standby_ns
-            value |= STANDBY if is_idle else self._mode or CONTINUOUS
+            value |= STANDBY if self._is_in_standby else self._mode or CONTINUOUS
         elif register == _FIFO_COUNT:
             value = len(self._fifo)
         elif register == REGISTER_STATUS and self._t_ns < self._memory_ready_ns:

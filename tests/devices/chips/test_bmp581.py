@@ -238,6 +238,19 @@ def test_registers_of_standby_ignore_a_write_in_between() -> None:
     assert bench.read(bmp581.REGISTER_DSP_IIR) == b"\x00"
 
 
+def test_registers_of_standby_ignore_a_write_until_the_mode_is_left() -> None:
+    bench = Bench()
+    bench.driver.start_up(BMP581.encode_settings(ChipSettings(oversampling=8)))
+    bench.wait_ms(8)
+    bench.write(bmp581.REGISTER_ODR_CONFIG, bmp581.NOT_DEEP)
+    assert bench.read(bmp581.REGISTER_ODR_CONFIG)[0] & 3 == bmp581.CONTINUOUS
+    bench.write(bmp581.REGISTER_DSP_IIR, 0x09)
+    assert bench.read(bmp581.REGISTER_DSP_IIR) == b"\x00"
+    bench.wait_ms(3)
+    bench.write(bmp581.REGISTER_DSP_IIR, 0x09)
+    assert bench.read(bmp581.REGISTER_DSP_IIR) == b"\x09"
+
+
 def test_a_mode_is_left_through_standby_only() -> None:
     bench = Bench()
     bench.driver.start_up(CONTINUOUS)
