@@ -207,7 +207,7 @@ _EARLY = 0.05
 """Part of the period by which an end may come before its estimate."""
 _NARROW = 0.1
 """Part of the period to which bounds must leave the end of a conversion to fix it."""
-_COUNTED_MIN, _COUNTED_MAX = 200, 4000
+_COUNTED_MIN, _COUNTED_MAX = 200, 1000
 """Conversions between two fixed ends that give the period: a shorter time is less exact, a longer
 one late when the period changes."""
 _RATE_ERROR_MAX = 0.01

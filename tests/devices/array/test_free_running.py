@@ -84,6 +84,24 @@ def test_the_clock_of_a_part_is_followed_by_the_number_of_its_conversions(
     assert np.abs(errors_ns[2000:]).max() < 0.06 * period_ns
 
 
+def test_a_drift_of_the_parts_clock_is_followed() -> None:
+    """0.2 % and back in a minute, of reads that are 0.4 % slower, as planned."""
+    clock = ConversionClock(2_000_000)
+    read_ns, counted = 1_000_000_000.0, 0
+    next_ns = read_ns + 1_000_000
+    errors_ns = []
+    for _ in range(20_000):
+        while next_ns <= read_ns:
+            end_ns, counted = next_ns, counted + 1
+            next_ns += 2_000_000 * (1 + 0.002 * np.sin(2 * np.pi * next_ns / 60e9))
+        if counted:
+            found_ns = clock.count_conversions(counted, round(read_ns), round(read_ns))
+            errors_ns.append(abs(found_ns - end_ns))
+        counted = 0
+        read_ns += 2_000_000 * 1.004
+    assert max(errors_ns[3000:]) < 0.1 * 2_000_000
+
+
 def test_a_period_that_was_measured_wrongly_is_corrected() -> None:
     period_ns = 2_060_000.0
     clock = ConversionClock(2_000_000)
