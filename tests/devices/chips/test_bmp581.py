@@ -140,6 +140,22 @@ def test_a_free_running_part_converts_at_its_own_rate(osr: int, factor: float) -
     assert mean_ns <= longest_ns + 10_000
 
 
+@pytest.mark.parametrize("is_whole", [False, True])
+def test_an_empty_word_of_the_fifo_that_is_torn_is_no_pressure(is_whole: bool) -> None:
+    """100.86 kPa, if the chip writes while it sends; also a possible pressure."""
+    torn = 0x627F7F
+    bench = Bench()
+    bench.driver.start_up(CONTINUOUS)
+    bench.wait_ms(10)
+    bench.driver.read_new_pressures(33)
+    bench.chip._mode, bench.chip._next_end_ns = bmp581.STANDBY, None
+    if is_whole:
+        bench.chip._registers[0x20:0x23] = torn.to_bytes(3, "little")
+    sent = (6_400_000).to_bytes(3, "little") + torn.to_bytes(3, "little")
+    bench.chip._send_fifo = lambda count: sent.ljust(count, b"\x7f")  # type: ignore[method-assign]
+    assert bench.driver.read_new_pressures(3) == [6_400_000, torn][: 1 + is_whole]
+
+
 def test_data_ready_needs_its_source_and_no_wire() -> None:
     bench = Bench()
     bench.driver.start_up(CONTINUOUS)
