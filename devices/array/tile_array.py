@@ -196,7 +196,11 @@ class TileArray:
         seeking_ns = 3 * (self._frame_ns + sum(self._conversions_ns))
         self._pause_ns = max((STORED_MAX - 4) * max(self._conversions_ns), seeking_ns)
         self._conversion_clocks = [ConversionClock(each_ns) for each_ns in self._conversions_ns]
-        self._reference_readings: deque[tuple[int, float]] = deque(maxlen=_REFERENCES_MAX)
+        # Behind a filter the sample instant is some conversions ago.
+        filtered = max(0, -self.sample_delay_ns[0] // self._conversions_ns[0])
+        self._reference_readings: deque[tuple[int, float]] = deque(
+            maxlen=_REFERENCES_MAX + 3 * filtered
+        )
         self._busy_since_ns = 0
         self._frame_index = 0
 

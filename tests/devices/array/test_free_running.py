@@ -266,6 +266,19 @@ def test_a_fast_load_and_its_reference_belong_to_the_same_instant() -> None:
     assert np.percentile(np.abs(error_kpa), 95) < 0.2
 
 
+def test_a_reference_belongs_to_the_instant_of_a_filtered_pressure() -> None:
+    content = make_scene("indentation", filter=31).model_dump()
+    content["tile"] = content["tile"][:1]
+    content["ground"] |= {"stroke_s": 0.2}
+    rig = Rig(validate_scene(content, where="test"), has_reference=True)
+    scans = [rig.array.scan_frame() for _ in range(900)][100:]
+    sampled_ns = np.array([scan.convert_stop_ns[0] for scan in scans])
+    true_n = rig.world.compute_truth(sampled_ns + rig.array.sample_delay_ns[0]).true_force_n[:, 0]
+    error_n = np.array([scan.reference_n for scan in scans]) - true_n
+    assert np.ptp(true_n) > 5.0
+    assert np.percentile(np.abs(error_n), 95) < 0.2
+
+
 def test_tiles_that_convert_by_themselves_and_others_have_no_common_reference() -> None:
     content = load_scene("indentation").model_dump()
     first, *others = content["tile"]
