@@ -1,4 +1,4 @@
-"""Calibrations that come with the program: of every tile of a built-in scene, and not out of date.
+"""Calibrations that come with the program: of a built-in scene's tiles, for each chip, and not old.
 
 `FOOTTILE_WRITE_RIG=1 sh scripts/test tests/service/offline/test_shipped.py` makes them anew.
 """
@@ -8,11 +8,13 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from devices.chips.pressure_chips import PRESSURE_CHIPS
 from devices.scene.scene_file import list_builtin_scenes, load_scene
 from service.estimation.calibration import Calibration, TileCalibration
 from service.offline import calibration_lookup
@@ -33,25 +35,32 @@ def refuse(message: str) -> None:
     pytest.fail(f"a first start waits: {message}")
 
 
-def pressed(serial: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calibration:
+def pressed(serial: str, chip: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calibration:
     """A tile on the bench, as if none had come with the program."""
     monkeypatch.setattr(calibration_lookup, "SHIPPED_FOLDER", tmp_path / "nothing")
-    return find_calibration(EMULATED_RIG, [serial], cache_folder=tmp_path / "cache")
+    return find_calibration(
+        EMULATED_RIG, [serial], chips={serial: chip}, cache_folder=tmp_path / "cache"
+    )
 
 
 @pytest.mark.skipif("FOOTTILE_WRITE_RIG" not in os.environ, reason="writes them")
 def test_shipped_calibrations_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for serial in TILES:
-        pressed(serial, tmp_path, monkeypatch)
+    for serial, chip in product(TILES, PRESSURE_CHIPS):
+        pressed(serial, chip, tmp_path, monkeypatch)
     shutil.rmtree(SHIPPED_FOLDER, ignore_errors=True)
     shutil.copytree(tmp_path / "cache", SHIPPED_FOLDER)
 
 
 def test_no_built_in_scene_waits_for_the_mill(tmp_path: Path) -> None:
     assert [f"T0{number}" for number in range(1, 9)] == TILES
-    find_calibration(EMULATED_RIG, TILES, cache_folder=tmp_path, on_progress=refuse)
+    for chip in PRESSURE_CHIPS:
+        chips = dict.fromkeys(TILES, chip)
+        find_calibration(
+            EMULATED_RIG, TILES, chips=chips, cache_folder=tmp_path, on_progress=refuse
+        )
     assert list(tmp_path.iterdir()) == []
-    assert len(list(SHIPPED_FOLDER.iterdir())) == len(TILES)  # none is left of a version before
+    # None is left of a version before.
+    assert len(list(SHIPPED_FOLDER.iterdir())) == len(TILES) * len(PRESSURE_CHIPS)
 
 
 def test_a_changed_default_names_another_calibration(
@@ -71,14 +80,17 @@ def test_a_changed_default_names_another_calibration(
 
 
 @pytest.mark.slow(parts=8)
+@pytest.mark.parametrize("chip", PRESSURE_CHIPS)
 @pytest.mark.parametrize(
     "serial", [TILES[0], *(pytest.param(each, marks=pytest.mark.soak) for each in TILES[1:])]
 )
 def test_pressed_anew_a_tile_is_as_it_was(
-    serial: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    serial: str, chip: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shipped = find_calibration(EMULATED_RIG, [serial], cache_folder=tmp_path / "empty").tiles[0]
-    (anew,) = pressed(serial, tmp_path, monkeypatch).tiles
+    (shipped,) = find_calibration(
+        EMULATED_RIG, [serial], chips={serial: chip}, cache_folder=tmp_path / "empty"
+    ).tiles
+    (anew,) = pressed(serial, chip, tmp_path, monkeypatch).tiles
     (numbers, words), (as_numbers, as_words) = map(told, (shipped, anew))
     assert as_words == words
     # Processors round sums and products differently, and the fits end elsewhere by 3e-5 at most.
