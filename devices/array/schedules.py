@@ -17,7 +17,7 @@ from itertools import compress
 from statistics import fmean
 from typing import Protocol, get_args
 
-from devices.array.tile import STORED_MAX, Scan
+from devices.array.tile import Scan
 from devices.errors import SceneError
 from devices.scene.hardware_sections import ScheduleName
 
@@ -98,6 +98,9 @@ ADDRESS_BITS = 29
 """SCL periods before a read takes its data: START, address, register, START, address."""
 _READ_BITS = 30  # START, address, register, repeated START, address, STOP
 _BYTE_BITS = 9  # eight bits and the acknowledge
+
+STORED_MAX = 32
+"""Conversions that a free-running part stores until they are read; then the oldest is lost."""
 
 BROADCASTS: tuple[ScheduleName, ...] = ("simultaneous", "per_mux")
 """Schedules that start several tiles by one command, which a free-running part does not need."""

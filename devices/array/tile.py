@@ -41,6 +41,7 @@ class TileIo:
             chip.is_free_running(tile.settings)
             for tile, chip in zip(tiles, self.chips, strict=True)
         )
+        self.conversions_ns = tuple(round(tile.conversion_ms * 1e6) for tile in tiles)
         self.silent_tiles: tuple[int, ...] = ()
         """Tiles whose address nobody acknowledged at the last start of conversions."""
         self._masks: dict[tuple[int, ...], dict[int, int]] = {
@@ -130,88 +131,6 @@ class TileIo:
             self._masks[tiles] = masks
         return self._masks[tiles]
 
-
-class ConversionClock:
-    """Clock of a free-running part, followed by the number of its conversions in each read.
-
-    Of n conversions since the read before, the first ended behind that one, the last before this
-    one, and the next ends behind this one. Reads come at another interval than conversions, so now
-    and then n is not one: then these bounds leave little room, and two such reads give the period.
-    """
-
-    def __init__(self, period_ns: int) -> None:
-        self._period_ns = self._measured_ns = float(period_ns)
-        self._end_ns = 0.0
-        self._last_read_ns: tuple[int, int] | None = None
-        self._fixed_ns: float | None = None
-        self._counted = 0
-
-    def set_end(self, end_ns: int) -> None:
-        """Begin with the known end of a conversion, just before the next read."""
-        self._end_ns = self._fixed_ns = end_ns
-        self._last_read_ns, self._counted = None, 0
-
-    def estimate_new(self, now_ns: int) -> int:
-        """Estimate how many conversions a read finds now: at least one."""
-        ended = int((now_ns - self._end_ns) / self._period_ns + _EARLY)
-        return min(max(1, ended), STORED_MAX)
-
-    def predict_ends_ns(self, until_ns: int) -> list[int]:
-        """Predict the ends of the next conversions until an instant."""
-        period_ns = self._period_ns
-        count = min(int((until_ns - self._end_ns) // period_ns), STORED_MAX)
-        return [round(self._end_ns + n * period_ns) for n in range(1, count + 1)]
-
-    def count_conversions(self, count: int, begin_ns: int, end_ns: int) -> int:
-        """Count the conversions in a read; return the estimated end of the last one.
-
-        Args:
-            count: conversions that ended since the last read.
-            begin_ns: begin of this read.
-            end_ns: its end.
-        """
-        last, self._last_read_ns = self._last_read_ns, (begin_ns, end_ns)
-        if last is None:
-            if self._fixed_ns is None:
-                self._end_ns = begin_ns - self._period_ns / 2
-            else:  # the known end is the last one's, unless time for others has passed
-                self._counted = int((begin_ns - self._end_ns) // self._period_ns)
-                self._end_ns += self._counted * self._period_ns
-            return round(self._end_ns)
-        low_ns = max(last[0] + (count - 1) * self._period_ns, begin_ns - self._period_ns)
-        high_ns = min(end_ns, last[1] + count * self._period_ns)
-        if count >= STORED_MAX or low_ns > high_ns:
-            # Some are lost, or one is miscounted, and the period tells how many ended.
-            ended = (begin_ns - self._end_ns) // self._period_ns
-            self._end_ns += max(count if count >= STORED_MAX else 0, ended) * self._period_ns
-            self._fixed_ns = None
-            return round(self._end_ns)
-        self._end_ns = min(max(self._end_ns + count * self._period_ns, low_ns), high_ns)
-        self._counted += count
-        if high_ns - low_ns < _NARROW * self._period_ns:
-            self._end_ns = (low_ns + high_ns) / 2
-            if self._fixed_ns is not None and self._counted >= _COUNTED_MIN:
-                period_ns = (self._end_ns - self._fixed_ns) / self._counted
-                if abs(period_ns / self._measured_ns - 1) < _RATE_ERROR_MAX:
-                    self._period_ns = period_ns
-                else:  # a miscount, unless the next one agrees
-                    self._measured_ns, self._fixed_ns = period_ns, None
-            if self._fixed_ns is None or self._counted >= _COUNTED_MAX:
-                self._fixed_ns, self._counted = self._end_ns, 0
-        return round(self._end_ns)
-
-
-STORED_MAX = 32
-"""Conversions that a free-running part stores until they are read; then the oldest is lost."""
-_EARLY = 0.05
-"""Part of the period by which an end may come before its estimate."""
-_NARROW = 0.1
-"""Part of the period to which bounds must leave the end of a conversion to fix it."""
-_COUNTED_MIN, _COUNTED_MAX = 200, 1000
-"""Conversions between two fixed ends that give the period: a shorter time is less exact, a longer
-one late when the period changes."""
-_RATE_ERROR_MAX = 0.01
-"""Largest relative error of a measured period; a larger one is a miscount."""
 
 _BUS_FAULTS_MAX = 2  # each may cost the adapter's timeout, 30 ms
 

@@ -9,27 +9,22 @@ part, and a part that answers with others is another part.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 
-import numpy as np
-
 from devices.array.bus_recovery import BusMonitor, BusRecovery
+from devices.array.free_running import FreeRunningTiles
 from devices.array.plausibility import ConversionMonitor, PlausibilityCheck
 from devices.array.schedules import (
-    ADDRESS_BITS,
     SCHEDULES,
     BusTiming,
     check_broadcast_channels,
     compute_frame_s,
     compute_turns_s,
-    count_read_bits,
 )
-from devices.array.tile import STORED_MAX, ConversionClock, Scan, TileHealth, TileIo
+from devices.array.tile import Scan, TileHealth, TileIo
 from devices.buses.i2c import I2cBus
-from devices.chips.pressure_chip import Counts
 from devices.clock import Clock
 from devices.errors import BusFaultError, NoAcknowledgeError, TileSetupError
 from devices.flags import TileFlag
@@ -103,10 +98,6 @@ _LEARN_NS, _FORGET_NS = 10_000, 2_000
 """Largest increase, and fixed decrease, of a tile's learnt turn in each frame."""
 _REPEATS_MAX = 10
 """Repeated readings of a chip with a status from which its part is set up anew."""
-_PATIENCE = 1.1
-"""Conversions of a free-running part in which one surely ends."""
-_REFERENCES_MAX = 16
-"""Readings of a reference beside a free-running part that are kept: of some frames."""
 _DISTURBED_BUDGETS = 4
 """Factor of the retry budget on a line with flipped bits: correct readings before rate."""
 
@@ -153,11 +144,10 @@ class TileArray:
         self.health = tuple(TileHealth(tile) for tile in tiles)
         self._clock = clock
         self._tile_io = TileIo(bus, tiles)
-        self._conversions_ns = [round(tile.conversion_ms * 1e6) for tile in tiles]
         self.sample_delay_ns = tuple(
             chip.compute_sample_delay_ns(tile.settings, conversion_ns)
             for tile, chip, conversion_ns in zip(
-                tiles, self._tile_io.chips, self._conversions_ns, strict=True
+                tiles, self._tile_io.chips, self._tile_io.conversions_ns, strict=True
             )
         )
         """Delay from a conversion's begin, at the STOP of a CONVERT, to its assumed sample instant.
@@ -186,20 +176,8 @@ class TileArray:
         self._is_converting = [False] * len(tiles)
         self._last_counts = [(NOT_READ, NOT_READ)] * len(tiles)
         self._repeat_counts = [0] * len(tiles)
-        self._read_ns = list(self._started_ns)
-        # The part is read when its address has passed.
-        self._bit_ns = 1e9 / timing.scl_hz
-        self._address_ns = round(ADDRESS_BITS * self._bit_ns)
-        self._has_unknown_phase = [True] * len(tiles)
-        # Before conversions are lost, but longer than a frame in which all phases are sought, else
-        # these would follow one another.
-        seeking_ns = 3 * (self._frame_ns + sum(self._conversions_ns))
-        self._pause_ns = max((STORED_MAX - 4) * max(self._conversions_ns), seeking_ns)
-        self._conversion_clocks = [ConversionClock(each_ns) for each_ns in self._conversions_ns]
-        # Behind a filter the sample instant is some conversions ago.
-        filtered = max(0, -self.sample_delay_ns[0] // self._conversions_ns[0])
-        self._reference_readings: deque[tuple[int, float]] = deque(
-            maxlen=_REFERENCES_MAX + 3 * filtered
+        self._free_running = FreeRunningTiles(
+            self._tile_io, clock, timing, self.sample_delay_ns, self._frame_ns
         )
         self._busy_since_ns = 0
         self._frame_index = 0
@@ -297,7 +275,8 @@ class TileArray:
         now_ns = self._clock.now_ns()
         for i in tiles:
             # The next conversion of a free-running part ends a conversion's time after its read.
-            self._started_ns[i] = self._read_ns[i] if self._tile_io.are_free_running[i] else now_ns
+            is_free = self._tile_io.are_free_running[i]
+            self._started_ns[i] = self._free_running.read_ns[i] if is_free else now_ns
             # A lost tile may have missed the broadcast.
             self._is_converting[i] = i in called and self.health[i].is_present
 
@@ -331,7 +310,7 @@ class TileArray:
             scan.add_flag(tile, TileFlag.NO_ANSWER)
             return
         if not health.is_present:
-            self._has_unknown_phase[tile] = True
+            self._free_running.forget_phase(tile)
             if self._may_retry(scan, tile):
                 self._reconnector.probe_if_due(scan, tile)
             else:
@@ -355,7 +334,7 @@ class TileArray:
             self._tile_io.connect_tile(tile)
             self._wait_for_conversion(scan, ready_ns)
             if self._tile_io.are_free_running[tile]:
-                counts = self._read_free_conversions(scan, tile, with_temperature)
+                counts = self._free_running.read_last_counts(scan, tile, with_temperature)
                 is_repeated = counts[0] == NOT_READ
                 return
             counts = self._tile_io.read_counts(tile, with_temperature)
@@ -382,54 +361,10 @@ class TileArray:
             if self._tile_io.are_free_running[tile] and scan.pressure_raw[tile] != counts[0]:
                 # A later conversion was read in its place: it has an instant of its own.
                 with scan.charge_retry(self._clock), suppress(NoAcknowledgeError):
-                    self._read_free_conversions(scan, tile, with_temperature=False)
+                    self._free_running.read_last_counts(scan, tile, with_temperature=False)
         else:
             scan.add_flag(tile, TileFlag.NO_ANSWER)
             health.mark_lost(self._clock.now_ns())
-
-    def _read_free_conversions(self, scan: Scan, tile: int, with_temperature: bool) -> Counts:
-        """Read the last conversion of a free-running tile, and follow its clock."""
-        conversion_clock = self._conversion_clocks[tile]
-        is_late = self._clock.now_ns() - self._read_ns[tile] > self._pause_ns
-        if is_late or self._has_unknown_phase[tile]:
-            self._find_phase(tile)
-        begin_ns = self._read_ns[tile] = self._clock.now_ns()
-        # One more than have ended since the last read, which tells that there is no more.
-        at_once = conversion_clock.estimate_new(begin_ns) + 1
-        pressures = self._tile_io.read_new_pressures(tile, at_once)
-        # A read that was full is followed by another one, here an empty one.
-        reads = 2 if pressures and len(pressures) % at_once == 0 else 1
-        n_bytes = at_once * self._tile_io.chips[tile].bytes_per_conversion
-        data_ns = round(reads * count_read_bits(n_bytes) * self._bit_ns) - self._address_ns
-        ended_ns = conversion_clock.count_conversions(
-            len(pressures), begin_ns + self._address_ns, self._clock.now_ns() - data_ns
-        )
-        scan.convert_stop_ns[tile] = ended_ns - self._conversions_ns[tile]
-        if not pressures:
-            return NOT_READ, NOT_READ
-        if tile == 0 and self._reference_readings:
-            scan.reference_ns = scan.convert_stop_ns[0] + self.sample_delay_ns[0]
-            at_ns, forces_n = zip(*self._reference_readings, strict=True)
-            scan.reference_n = float(np.interp(scan.reference_ns, at_ns, forces_n))
-        temperature_raw = self._tile_io.read_temperature(tile) if with_temperature else NOT_READ
-        return pressures[-1], temperature_raw
-
-    def _find_phase(self, tile: int) -> None:
-        """Wait for the end of a free-running tile's conversion, which its status tells.
-
-        It is sought once, for at most a conversion, so that a part that does not convert holds up
-        the others no further.
-        """
-        # What has ended before is read, so that the next read finds the one that ends now.
-        self._tile_io.read_new_pressures(tile, STORED_MAX)
-        self._tile_io.has_new_counts(tile)
-        since_ns = last_ns = read_ns = self._clock.now_ns()
-        while not self._tile_io.has_new_counts(tile):
-            if read_ns - since_ns > _PATIENCE * self._conversions_ns[tile]:
-                break
-            last_ns, read_ns = read_ns, self._clock.now_ns()
-        self._conversion_clocks[tile].set_end((last_ns + read_ns) // 2 + self._address_ns)
-        self._has_unknown_phase[tile] = False
 
     # Retries
 
@@ -471,24 +406,12 @@ class TileArray:
         if self._read_reference_n is not None and scan.reference_ns is None:
             scan.reference_ns = self._started_ns[0] + self.sample_delay_ns[0]
             if self._tile_io.are_free_running[0]:
-                self._follow_reference(self._read_reference_n, ready_ns)
+                self._free_running.follow_reference(self._read_reference_n, ready_ns)
             else:
                 self._clock.sleep_until_ns(scan.reference_ns)
                 scan.reference_n = self._read_reference_n()
         self._clock.sleep_until_ns(ready_ns)
         self._busy_since_ns = self._clock.now_ns()  # waiting is not charged to the budget
-
-    def _follow_reference(self, read_n: Callable[[], float], until_ns: int) -> None:
-        """Read the reference now, at each expected sample of a free-running part, and at the end.
-
-        The part's clock is known only after the read; so the force is interpolated then.
-        """
-        after_end_ns = self.sample_delay_ns[0] - self._conversions_ns[0]
-        ends_ns = self._conversion_clocks[0].predict_ends_ns(until_ns - after_end_ns)
-        for at_ns in (0, *(end_ns + after_end_ns for end_ns in ends_ns), until_ns):
-            if not 0 < at_ns <= self._clock.now_ns():
-                self._clock.sleep_until_ns(at_ns)
-                self._reference_readings.append((self._clock.now_ns(), read_n()))
 
     # Once per frame
 

@@ -207,9 +207,8 @@ class TareFrames:
             noise_kpa: (tiles,), noise of an unloaded tile.
         """
         found = []
-        noise_kpa = np.maximum(
-            noise_kpa, UNLOADED_SIGMA_MIN_KPA
-        )  # rubber moves behind a quiet chip
+        # The rubber moves behind a quiet chip.
+        noise_kpa = np.maximum(noise_kpa, UNLOADED_SIGMA_MIN_KPA)
         for rows in candidate_rows:
             kpa = self.kpa[rows]
             n = len(kpa)

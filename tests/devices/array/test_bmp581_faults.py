@@ -89,7 +89,7 @@ def test_a_part_that_is_ill_is_flagged_alone_and_comes_back_with_right_instants(
         assert any(flag & expected for flag in ill)
     while rig.scan(1)[0][TILE]:
         assert rig.clock.now_ns() < 10**10
-    bound_ns = 0.1 * max(rig.array._conversions_ns) + 700_000 * (settings == "forced")
+    bound_ns = 0.1 * max(rig.array._tile_io.conversions_ns) + 700_000 * (settings == "forced")
     assert np.abs(scan_instant_errors_ns(rig, ends_ns, 50)).max() < bound_ns
     flags += rig.scan(50)
     assert not any(flags[-1])

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from devices.array.free_running import ConversionClock
 from devices.array.schedules import compute_frame_s
 from devices.array.startup import ReadyArray, prepare_array
-from devices.array.tile import ConversionClock
 from devices.buses.i2c import open_bus
 from devices.chips import bmp581
 from devices.clock import VirtualClock
@@ -175,7 +175,9 @@ def scan_instant_errors_ns(rig: Rig, ends_ns: Ends, frames: int) -> np.ndarray:
         for tile, ends in enumerate(ends_ns):
             osr, iir, _ = rig.array.tiles[tile].settings
             half_ns = bmp581.CONVERSION_P_NS[osr >> 3 & 7] // 2
-            lag_ns = bmp581.FILTER_COEFFICIENTS[iir >> 3 & 7] * rig.array._conversions_ns[tile]
+            lag_ns = (
+                bmp581.FILTER_COEFFICIENTS[iir >> 3 & 7] * rig.array._tile_io.conversions_ns[tile]
+            )
             estimated_ns = scan.convert_stop_ns[tile] + rig.array.sample_delay_ns[tile]
             estimated_ns += half_ns + lag_ns
             true_ns = ends.get(scan.pressure_raw[tile])
@@ -191,7 +193,7 @@ def test_samples_have_their_instants_at_an_interval_of_the_scene(wait_ms: float)
     content["array"] |= {"wait_ms": wait_ms}
     rig = Rig(validate_scene(content, where="test"))
     errors_ns = scan_instant_errors_ns(rig, note_ends(rig), 600)
-    assert np.abs(errors_ns).max() < 0.1 * max(rig.array._conversions_ns)
+    assert np.abs(errors_ns).max() < 0.1 * max(rig.array._tile_io.conversions_ns)
 
 
 @pytest.mark.parametrize(
@@ -202,7 +204,7 @@ def test_samples_of_free_running_tiles_have_their_instants_from_the_first_frame_
 ) -> None:
     rig = Rig(make_scene("rolling", oversampling=oversampling))
     errors_ns = scan_instant_errors_ns(rig, note_ends(rig), frames)
-    conversion_ns = max(rig.array._conversions_ns)
+    conversion_ns = max(rig.array._tile_io.conversions_ns)
     assert np.abs(errors_ns).max() < 0.1 * conversion_ns, "unfollowed it would be a half"
     assert np.std(errors_ns) < 0.03 * conversion_ns
 
@@ -356,7 +358,7 @@ def test_an_array_that_loses_conversions_in_every_frame_gives_new_ones_with_thei
     ends_ns = note_ends(rig)
     assert not any(any(flags) for flags in rig.scan(2))
     errors_ns = scan_instant_errors_ns(rig, ends_ns, 20)
-    assert np.abs(errors_ns).max() < 1.1 * max(rig.array._conversions_ns)
+    assert np.abs(errors_ns).max() < 1.1 * max(rig.array._tile_io.conversions_ns)
     assert not any(any(flags) for flags in rig.scan(2))
 
 
