@@ -28,7 +28,16 @@ from service.api import problems
 from service.api.access import AccessGuard, Logins
 from service.api.connection_limits import ConnectionLimiter, open_files_max
 from service.api.protocols import LimitedConfig, LimitedHttp, LimitedWebSocket, accept_connections
-from service.api.routes import calibrations, common, downloads, index, login, nodes, weighings
+from service.api.routes import (
+    calibrations,
+    common,
+    downloads,
+    index,
+    login,
+    metrics,
+    nodes,
+    weighings,
+)
 from service.api.routes.recordings import comparisons, integrity, overview, sessions, stances, takes
 from service.api.routes.sockets.ingest import serve_node
 from service.api.routes.sockets.live import serve_live
@@ -107,6 +116,7 @@ def make_app(
     app.state.find_urls = find_urls
     problems.install_handlers(app)
     app.router.routes.extend(_make_api_routes())
+    app.include_router(metrics.router, include_in_schema=False)
     _add_security_scheme(app)
 
     @app.websocket(LIVE_PATH)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -109,6 +110,8 @@ class ServerNode:
         """Faults of the present stream by serial and reason, from its last status."""
         self.refused_ahead_frames = 0
         """Frames of the present stream that were refused because they are ahead of time."""
+        self.received_frames = self.received_bytes = 0
+        """Frames received since the server was started, and their bytes."""
         self.last_seq: int | None = None
         self.last_t_ns: int | None = None
         self.last_seen_t_ns: int | None = None
@@ -176,6 +179,23 @@ class ServerNode:
     def present_stream_backlog_frames(self) -> int:
         """Number of missing frames that the node can still send."""
         return (self.present_stream_lost_or_pending & self.present_stream.obtainable).number_count
+
+    def compute_backlog_age_s(self, now_t_ns: int) -> float | None:
+        """Return the age of the backlog's oldest frame, to a batch; 0: none; None: unknown.
+
+        Args:
+            now_t_ns: the server's UTC.
+        """
+        oldest = (self.present_stream_lost_or_pending & self.present_stream.obtainable).first
+        if oldest is None:
+            return 0.0
+        t_ns = None
+        if self.journal is not None:
+            with suppress(StorageError):  # it writes what still waits
+                t_ns = self.journal.find_batch_t_ns_near(oldest, at_or_before=True)
+        if t_ns is None:
+            return None
+        return (now_t_ns - self.to_server_t_ns_or_unchanged(t_ns)) * 1e-9
 
     @property
     def present_stream_lost_by_reason(self) -> dict[str, int]:
@@ -316,6 +336,8 @@ class ServerNode:
         except StorageError as error:  # live goes on; nothing is acknowledged
             self.storage_problem = str(error)
         first, last = int(frames.seq[0]), int(frames.seq[-1])
+        self.received_frames += len(frames)
+        self.received_bytes += len(payload)
         self.last_seen_t_ns = now_t_ns
         if stream is not self.present_stream:
             return []

@@ -136,6 +136,8 @@ class Server:
         self.comparison_series = ComparisonSeriesCache()
         """Cache of comparison series."""
         self.links: dict[str, NodeLink] = {}
+        self.sync_count, self.sync_total_s = 0, 0.0
+        """Number and total time of successful syncs of journals since the start."""
         self._last_progress: dict[str, SessionProgress] = {}
         """Progress that subscribers were sent last, by session."""
         self._failures: dict[str, tuple[str, float]] = {}
@@ -374,6 +376,7 @@ class Server:
     async def _sync_stream(self, node: ServerNode, stream: ServerStream) -> None:
         unsynced, stream.unsynced = stream.unsynced, Intervals()
         unacked, stream.unacked = stream.unacked, Intervals()
+        began_s = time.monotonic()
         try:
             await asyncio.to_thread(stream.sync)
             self.data_folder.check_still_in_place()
@@ -385,6 +388,8 @@ class Server:
             if not isinstance(error, StorageError):
                 raise
             return
+        self.sync_count += 1
+        self.sync_total_s += time.monotonic() - began_s
         link = self.links.get(node.name)
         if link is not None and unacked:
             link.queue_ack(stream.stream_id, unacked)
