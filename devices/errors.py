@@ -77,7 +77,9 @@ def escape_control_chars(text: str, *, keep_line_breaks: bool = False) -> str:
     )
 
 
-Extra = Literal["server", "client", "emulation", "plot", "gpio", "rig", "archive", "mocap", "mcap"]
+Extra = Literal[
+    "server", "client", "emulation", "discovery", "plot", "gpio", "rig", "archive", "mocap", "mcap"
+]
 
 OUR_PACKAGES = ("devices", "storage", "service", "studies", "foottile")
 

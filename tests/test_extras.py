@@ -27,7 +27,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 BLOCKER = """
 import sys
 absent = ["fastapi", "httptools", "httpx", "psutil", "starlette", "uvicorn"]
-absent += ["matplotlib", "uvloop"]
+absent += ["matplotlib", "uvloop", "zeroconf", "zeroconf.asyncio"]
 if not any("spawn_main" in word for word in sys.orig_argv):
     absent += ["numba", "scipy"]  # which an emulated foot needs, where a robot has a real one
 sys.modules.update(dict.fromkeys(absent))
@@ -101,6 +101,7 @@ def test_a_node_that_records_alone_seals_raw_frames_and_estimates_are_added_late
         (("sessions",), "client"),
         (("pull", "id", "--out", "."), "client"),
         (("stream",), "client"),
+        (("find",), "discovery"),
         (("doctor", "--bus", "emulated"), "emulation"),
     ],
 )

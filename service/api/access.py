@@ -17,7 +17,7 @@ import ipaddress
 import re
 import secrets
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from http import HTTPStatus
@@ -243,13 +243,13 @@ class AccessGuard:
 
     Args:
         app: application behind it.
-        hosts: names of the server, in addition to addresses of this machine.
+        hosts: names of the server, in addition to addresses of this machine; may grow.
         logins: required for every change of state, and for ingest.
     """
 
-    def __init__(self, app: ASGIApp, *, hosts: Iterable[str], logins: Logins) -> None:
+    def __init__(self, app: ASGIApp, *, hosts: Collection[str], logins: Logins) -> None:
         self._app = app
-        self._hosts = frozenset(host.lower() for host in hosts)
+        self._hosts = hosts
         self._logins = logins
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -319,7 +319,7 @@ class AccessGuard:
         if found is None:
             return False
         name = (found["name"] or found["address"]).lower()
-        if name == "localhost" or name in self._hosts:
+        if name == "localhost" or any(name == own.lower() for own in self._hosts):
             return True
         try:
             # DNS rebinding can point a name here, but not an address.

@@ -7,7 +7,7 @@ import logging
 import os
 import socket
 import sys
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager, suppress
 from functools import cache
 from http import HTTPStatus
@@ -79,7 +79,7 @@ def make_app(
     server: Server,
     *,
     logins: Logins,
-    hosts: Iterable[str] = (),
+    hosts: Collection[str] = (),
     find_urls: Callable[[], Sequence[str]] = tuple,
 ) -> FastAPI:
     """Build the application.
@@ -147,7 +147,7 @@ def make_app(
 
     app.mount("/static", page, name="static")
     app.add_middleware(HeadFromGet)
-    app.add_middleware(AccessGuard, hosts=tuple(hosts), logins=logins)
+    app.add_middleware(AccessGuard, hosts=hosts, logins=logins)
     return app
 
 

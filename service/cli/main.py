@@ -46,6 +46,7 @@ SUMMARIES = {
     "demo": "Run a server and an emulated node, and print a link to the live page.",
     "serve": "Run the server: live view, recording, REST API.",
     "node": "Read an array, keep its frames on disk and send them to a server.",
+    "find": "List servers and nodes in the local network, with their addresses.",
     "invite": "Create a one-time login link, and on a terminal its QR code.",
     "accept-node": "Accept another machine under the name of a node.",
     "sessions": "List recorded sessions, newest first.",

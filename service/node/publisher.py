@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import socket as sockets
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import TypeVar
 
@@ -51,6 +51,7 @@ class Publisher:
         token: the server's token; None: the token of this user's server on this machine.
         ca_path: file or folder of CA certificates, in addition to the system's.
         report: called with a message for every change.
+        find_server: returns the address in place of `server`, anew before each attempt.
     """
 
     def __init__(
@@ -61,10 +62,13 @@ class Publisher:
         token: str | None,
         report: Callable[[str], None],
         ca_path: Path | None = None,
+        find_server: Callable[[], Awaitable[str]] | None = None,
     ) -> None:
         self._server = server
+        self._find_server = find_server
         self._url = make_ingest_url(server)
-        self._context = make_context(ca_path) if self._url.startswith("wss:") else None
+        is_tls = find_server is not None or self._url.startswith("wss:")
+        self._context = make_context(ca_path) if is_tls else None
         self._source = source
         self._token = token
         self._report = report
@@ -92,11 +96,14 @@ class Publisher:
         back_off = ReconnectBackoff()
         while True:
             self._new_stream_began.clear()
-            # Before each attempt: the server may be started after its node.
-            local = None if self._token else find_local_server(self._server)
-            server, token = (local.url, local.token) if local else (self._server, self._token)
-            self._url = make_ingest_url(server)
+            self._url = ""
             try:
+                # Before each attempt: the server may be started after its node.
+                if self._find_server is not None:
+                    self._server = await self._find_server()
+                local = None if self._token else find_local_server(self._server)
+                server, token = (local.url, local.token) if local else (self._server, self._token)
+                self._url = make_ingest_url(server)
                 tcp = await connect_tcp(self._url)
                 try:
                     await self._serve_connection(tcp, token, back_off)
@@ -107,7 +114,8 @@ class Publisher:
                 if _is_wrong_identity(error):
                     self._is_refused = True
                     reason += f" (this machine: {self._fingerprint or 'its disk keeps no secret'})"
-                self._report_change(f"not connected to {self._url}: {reason}; trying again")
+                where = f" to {self._url}" if self._url else ""
+                self._report_change(f"not connected{where}: {reason}; trying again")
                 back_off.set_delays_for(error)
             self.is_connected = False
             await asyncio.sleep(back_off.next_delay_s())
@@ -118,7 +126,7 @@ class Publisher:
         async with connect(
             self._url,
             sock=tcp,
-            ssl=self._context,
+            ssl=self._context if self._url.startswith("wss:") else None,
             create_connection=AsyncWebsocket,
             subprotocols=[SUBPROTOCOL],  # type: ignore[list-item]  # a NewType of str
             compression=None,  # costs three times the CPU, saves little (performance.md)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import takewhile
@@ -59,6 +59,8 @@ class NodeOptions:
         calibration_problem: reason why there is no calibration.
         token: the server's token; None: the token of this user's server on this machine.
         ca_path: file or folder of CA certificates, in addition to the system's.
+        find_server: returns the server's address now, in place of `server_url`, from the ids of
+            servers that share a secret with this node.
     """
 
     rig_options: RigOptions
@@ -69,6 +71,7 @@ class NodeOptions:
     calibration_problem: str | None = None
     token: str | None = None
     ca_path: Path | None = None
+    find_server: Callable[[Collection[str]], Awaitable[str]] | None = None
 
 
 _POLL_S = 0.02
@@ -261,6 +264,13 @@ class RunningNode:
             self._report(notice)
 
     def _start_publisher(self, server: str) -> None:
+        secrets = ServerSecrets(self._journal.folder, self._report)
+        find_server = self._options.find_server
+
+        async def find() -> str:
+            assert find_server is not None  # noqa: S101  # only then it is passed on
+            return await find_server(await asyncio.to_thread(secrets.list_server_ids))
+
         self._publisher = Publisher(
             server,
             NodeCallbacks(
@@ -269,7 +279,7 @@ class RunningNode:
                 make_hello=lambda: make_hello(
                     self._options, self._journal, self._get_present_stream()
                 ),
-                get_secret=ServerSecrets(self._journal.folder, self._report).get_or_create_secret,
+                get_secret=secrets.get_or_create_secret,
                 make_status=self._make_status,
                 on_retention_request=self._on_retention_request,
                 on_damaged_frames=self._journal.queue_invalidation,
@@ -277,6 +287,7 @@ class RunningNode:
             token=self._options.token,
             ca_path=self._options.ca_path,
             report=self._report,
+            find_server=None if find_server is None else find,
         )
         self._publishing = asyncio.create_task(self._publisher.publish_forever())
         self._publishing.add_done_callback(self._on_publisher_end)
@@ -474,6 +485,13 @@ class ServerSecrets:
             self._report_once(f"no secret is shared with the server: {error}")
             return None
         return known
+
+    def list_server_ids(self) -> list[str]:
+        """Return the ids of the servers that share a secret with the node."""
+        try:
+            return list(self._read())
+        except StorageError:
+            return []
 
     def _read(self) -> dict[str, str]:
         try:

@@ -5,9 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
+
+from tests.waiting import until
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -23,6 +27,41 @@ def can_make_networks() -> bool:
 needs_networks = pytest.mark.skipif(
     not can_make_networks(), reason="no network namespaces here: they need root and iproute2"
 )
+
+
+class Machine:
+    """A namespace that stands for a machine; its interface is `cable`."""
+
+    def __init__(self) -> None:
+        self._holder = subprocess.Popen(["unshare", "--net", "sleep", "1000"])
+        own = os.readlink("/proc/self/ns/net")
+        until(lambda: os.readlink(f"/proc/{self.pid}/ns/net") != own)
+        self.run("ip link set lo up")
+
+    @property
+    def pid(self) -> int:
+        return self._holder.pid
+
+    @property
+    def before(self) -> tuple[str, ...]:
+        """Words before a command that runs on this machine."""
+        return ("nsenter", f"--net=/proc/{self.pid}/ns/net")
+
+    def run(self, lines: str) -> None:
+        subprocess.run([*self.before, "sh", "-ec", lines], check=True)
+
+    def close(self) -> None:
+        self._holder.kill()
+        self._holder.wait()
+
+
+@contextmanager
+def connected_machines() -> Iterator[tuple[Machine, Machine]]:
+    """Two machines with a cable between, whose interfaces are still down."""
+    with closing(Machine()) as one, closing(Machine()) as other:
+        words = f"ip link add cable netns {one.pid} type veth peer name cable netns {other.pid}"
+        subprocess.run(words.split(), check=True)
+        yield one, other
 
 
 def run_in_network(interfaces: dict[str, str], code: str, **environment: str) -> str:

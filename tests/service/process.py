@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +24,13 @@ Start = Callable[..., "Process"]
 class Process:
     """`foottile` as a process; its output is read as it comes."""
 
-    def __init__(self, *arguments: object, folder: Path, **environment: str) -> None:
+    def __init__(
+        self, *arguments: object, folder: Path, before: Sequence[str] = (), **environment: str
+    ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         # The package is found by where it is installed, not by the working directory.
         self.process = subprocess.Popen(
-            [str(BIN / "foottile"), *map(str, arguments)],
+            [*before, str(BIN / "foottile"), *map(str, arguments)],
             cwd=folder,
             env={
                 **os.environ,

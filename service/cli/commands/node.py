@@ -6,10 +6,13 @@ import asyncio
 import os
 import re
 import socket
+import sys
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import click
 import typer
 
 from devices.errors import StorageError, UsageError
@@ -24,11 +27,14 @@ from service.cli.options import (
     load_adapted_scene,
     remark,
 )
+from service.node.server_finder import LOCAL_URL
+from service.version import SOFTWARE_VERSION
 
 if TYPE_CHECKING:
     from service.node.running_node import NodeOptions, NodeOutcome
 
-SERVER = "http://127.0.0.1:8000"
+_SEARCH_S = 1.5
+"""Duration of the search for servers before a person is asked; answers take a fifth of a second."""
 
 
 @add_options
@@ -36,7 +42,10 @@ def node_command(
     scene: Annotated[str, typer.Option(help="Scene file, or a built-in scene.")],
     server: Annotated[
         str | None,
-        typer.Option(help=f"Address of the server; default {SERVER}, with --record: none."),
+        typer.Option(
+            help="Address of the server; default: one on this machine, else one found in the "
+            "network; with --record: none."
+        ),
     ] = None,
     bus: Annotated[
         str | None,
@@ -70,6 +79,7 @@ def node_command(
     Every frame is journaled. Frames of sessions stay until the server has stored them, others for
     ten minutes. It reconnects by itself: frames follow after an interrupted link or a restart.
     With --record it needs no server: at Ctrl-C the session is sealed in the folder of --journal.
+    A server found in the network may be started later, and elsewhere; `foottile find` lists all.
     The server's token is FOOTTILE_TOKEN, or that of a server of this user on this machine. Options
     from --load on are for emulated tiles.
 
@@ -88,12 +98,11 @@ def node_command(
         from devices import realtime
 
         realtime.terminate_with_parent()
-    if server is None and record is None:
-        server = SERVER
+    searches = server is None and record is None
     if server is not None:
         make_ingest_url(server)  # refuse a wrong address before anything else
     if ca is not None:
-        if server is None or not server.startswith(("https:", "wss:")):
+        if not searches and not (server or "").startswith(("https:", "wss:")):
             raise UsageError("--ca is for a --server with https://")
         make_context(ca)  # and what is no certificate
     folder = resolve_user_folder("state", journal, "--journal")
@@ -111,18 +120,20 @@ def node_command(
     calibration, problem = find_scene_calibration(rig, remark)
     with suppress(StorageError):  # an unwritable card is reported later
         set_umask_and_create_private_folder(folder)
+    chosen_id = _ask_for_server(folder / "journal" / rig.node_name, ca) if searches else None
     outcome = asyncio.run(
         _run_node(
             NodeOptions(
                 rig_options=rig,
                 node_folder=folder,
-                server_url=server,
+                server_url=LOCAL_URL if searches else server,
                 session_name=record,
                 calibration=calibration,
                 calibration_problem=problem,
                 token=read_token(),
                 ca_path=ca,
-            )
+            ),
+            chosen_id,
         )
     )
     if outcome.recorded_session_id is not None:
@@ -141,15 +152,60 @@ def node_command(
         raise typer.Exit(3)
 
 
-async def _run_node(options: NodeOptions) -> NodeOutcome:
+async def _run_node(options: NodeOptions, chosen_id: str | None) -> NodeOutcome:
+    """Run a node that other machines can find.
+
+    Args:
+        options: options of the node.
+        chosen_id: id of a chosen server, empty: any; None: it looks for no server.
+    """
     from devices.realtime import freeze_garbage_collector
+    from service.discovery import (
+        NODES,
+        SERVERS,
+        Announcement,
+        Discovery,
+        list_interface_addresses,
+    )
     from service.node.running_node import run_node
+    from service.node.server_finder import ServerFinder
     from service.systemd import report_to_systemd
 
     freeze_garbage_collector()
     stop = create_stop_event()
-    async with report_to_systemd(stop):
+    name = options.rig_options.node_name
+    host = f"foottile-node-{re.sub(r'[^A-Za-z0-9]', '-', name)}"
+    texts = {"machine": socket.gethostname(), "version": SOFTWARE_VERSION}
+    announced = Announcement(NODES, name, host, 0, texts, list_interface_addresses)
+    browsed = (SERVERS,) if chosen_id is not None else ()
+    async with (
+        report_to_systemd(stop),
+        Discovery(browsed, announced, report=remark) as discovery,
+    ):
+        if chosen_id is not None:
+            finder = ServerFinder(discovery, chosen_id=chosen_id, ca_path=options.ca_path)
+            options = replace(options, find_server=finder.find)
         return await run_node(options, stop=stop, report=remark)
+
+
+def _ask_for_server(folder: Path, ca: Path | None) -> str:
+    """Return the id of a server that a person chooses on a terminal; empty: there is no choice."""
+    from foottile.local_server import find_local_server
+    from service.discovery import SERVERS, search_once
+    from service.node.running_node import ServerSecrets
+    from service.node.server_finder import describe_candidates, list_candidates
+
+    if not sys.stdin.isatty() or find_local_server(LOCAL_URL) is not None:
+        return ""
+    found = asyncio.run(search_once((SERVERS,), _SEARCH_S, remark))[SERVERS]
+    known_ids = ServerSecrets(folder, remark).list_server_ids()
+    candidates = list_candidates(found, known_ids, needs_tls=ca is not None)
+    if len(candidates) < 2:  # nothing to choose
+        return ""
+    for number, line in enumerate(describe_candidates(candidates), 1):
+        remark(f"{number}: {line}")
+    chosen: int = typer.prompt("server", type=click.IntRange(1, len(candidates)), err=True)
+    return candidates[chosen - 1].server_id
 
 
 def _choose_name(name: str | None) -> str:

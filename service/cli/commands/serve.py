@@ -8,11 +8,12 @@ import os
 import shlex
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager, suppress
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from socket import gethostname
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_origin
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 import typer
 
@@ -46,11 +47,13 @@ from service.cli.tickets import (
     remark_unreachable,
     show_qr_code,
 )
+from service.version import SOFTWARE_VERSION
 
 if TYPE_CHECKING:
     import socket
 
     from service.api.access import Logins
+    from service.discovery import Discovery
     from service.server.server import Server
 
 
@@ -159,14 +162,41 @@ async def _serve(
 
     server, listening, logins, find_urls = listening_server
     urls = find_urls()
-    hosts = (*settings.allow_host, *list_own_names(), get_host(urls[0]))
-    app = make_app(server, logins=logins, hosts=hosts, find_urls=find_urls)
-    async with serve_app(app, listening, settings):
+    hosts = {*settings.allow_host, *list_own_names(), get_host(urls[0])}
+    announced: list[str] = []
+
+    def on_announced(host: str) -> None:
+        hosts.add(host)
+        announced[:] = [f"{urlsplit(urls[-1]).scheme}://{host}:{listening.getsockname()[1]}"]
+        remark(f"it is also at {announced[0]}, for machines that resolve names by mDNS")
+
+    def find_all_urls() -> list[str]:
+        first, *others = find_urls()
+        return [first, *announced, *others]
+
+    app = make_app(server, logins=logins, hosts=hosts, find_urls=find_all_urls)
+    async with serve_app(app, listening, settings), AsyncExitStack() as stack:
         freeze_garbage_collector()
         is_stored = not settings.token
         print_addresses(urls, settings.data, logins, is_stored=is_stored, is_demo=is_demo)
         remark_unreachable(urls, settings.host)
+        if is_reachable(f"http://{listening.getsockname()[0]}"):
+            discovery = _make_discovery(server, listening, on_announced)
+            await stack.enter_async_context(discovery)
         yield server
+
+
+def _make_discovery(
+    server: Server, listening: socket.socket, on_announced: Callable[[str], None]
+) -> Discovery:
+    """Return the discovery that announces a server."""
+    from service.api.address import list_announced_addresses
+    from service.discovery import SERVERS, Announcement, Discovery
+
+    texts = {"id": server.id, "tls": "0", "version": SOFTWARE_VERSION, "machine": gethostname()}
+    port, find_addresses = listening.getsockname()[1], partial(list_announced_addresses, listening)
+    announcement = Announcement(SERVERS, "foottile", "foottile", port, texts, find_addresses)
+    return Discovery(announcement=announcement, on_announced=on_announced, report=remark)
 
 
 def print_addresses(
