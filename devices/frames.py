@@ -8,7 +8,7 @@ the last value.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +23,9 @@ from devices.types import (
     Identifier,
     Metres,
     OffsetNs,
+    Seq,
     StrictModel,
+    TMonoNs,
     UInt16,
 )
 
@@ -122,6 +124,16 @@ def allocate_columns(
         name: np.zeros((frame_count, tile_count) if per_tile else frame_count, dtype)
         for name, (dtype, per_tile) in get_frame_columns(raw_type).items()
     }
+
+
+class Edge(NamedTuple):
+    """Edge on a sync line, between the frames of a stream."""
+
+    number: Seq
+    """Number since the node was started, from 1; dropped ones are counted, too."""
+    t_mono_ns: TMonoNs
+    """CLOCK_MONOTONIC, as the kernel stamped it."""
+    is_rising: bool
 
 
 HOLD_MAX_NS = 1_000_000_000

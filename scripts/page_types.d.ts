@@ -227,6 +227,9 @@ type MarkerView = {
   id: string;
   label: string;
   t_ns: number;
+  stream_id: string | null;
+  t_mono_ns: number | null;
+  bound_ns: number | null;
   revision: string;
 };
 

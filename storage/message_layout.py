@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import pyarrow as pa
 
 from devices.errors import FileFormatError
+from storage.edges import EDGES_KEY, read_edges
 from storage.schema import frames_from_record_batch
 
 _RECORD_BATCH = 3
@@ -246,7 +247,9 @@ class MessageLayoutCache:
             record = pa.ipc.read_record_batch(found, self.schema)
             record.validate(full=True)  # checks the values, which the header does not describe
             frames_from_record_batch(record)
-            if len(head) <= _MAX_CACHED_HEADER_BYTES:
+            if EDGES_KEY in head:
+                read_edges(message, self.schema)  # its header is like no other's
+            elif len(head) <= _MAX_CACHED_HEADER_BYTES:
                 if len(self._cache) >= _MAX_CACHED_HEADERS:
                     self._cache.clear()
                 self._cache[head] = layout

@@ -23,8 +23,9 @@ import pyarrow as pa
 
 from devices.arrays import Ints
 from devices.errors import FileFormatError
-from devices.frames import ArrayInfo, FrameBatch, get_frame_columns
+from devices.frames import ArrayInfo, Edge, FrameBatch, get_frame_columns
 from devices.types import SEQ_END
+from storage.edges import encode_record_batch
 from storage.intervals import Intervals
 from storage.message_layout import MessageLayout, MessageLayoutCache
 from storage.schema import frames_to_record_batch, numpy_dtype_of, wire_schema
@@ -58,19 +59,32 @@ class EncodedBatch:
         return Intervals([(self.seq_first, self.seq_last)])
 
 
-def encode_frames(batch: FrameBatch, schema: pa.Schema) -> bytes:
+def encode_frames(batch: FrameBatch, schema: pa.Schema, edges: Sequence[Edge] = ()) -> bytes:
     """Encode frames as one message of a stream with this schema (`storage.schema.wire_schema`)."""
-    return frames_to_record_batch(batch, schema).serialize().to_pybytes()
+    return encode_record_batch(frames_to_record_batch(batch, schema), edges)
 
 
-def encode_as_messages(consecutive_frames: FrameBatch, info: ArrayInfo) -> Iterator[EncodedBatch]:
-    """Encode frames as messages of the size that nodes send."""
+_EDGES_BEFORE_NS = 1_000_000_000
+"""Edges this much older than the first frame were in an earlier message, of 25 ms."""
+
+
+def encode_as_messages(
+    consecutive_frames: FrameBatch, info: ArrayInfo, edges: Sequence[Edge] = ()
+) -> Iterator[EncodedBatch]:
+    """Encode frames as messages of the size that nodes send, each with the edges up to its end.
+
+    Edges after the last frame are left out. The first message may repeat earlier ones.
+    """
     schema = wire_schema(info)
+    begin_ns = int(consecutive_frames.t_mono_ns[0]) - _EDGES_BEFORE_NS
     for begin in range(0, len(consecutive_frames), _MAX_BATCH_FRAMES):
         rows = consecutive_frames.slice_rows(
             begin, min(begin + _MAX_BATCH_FRAMES, len(consecutive_frames))
         )
-        yield EncodedBatch.from_frames_and_payload(rows, encode_frames(rows, schema))
+        end_ns = int(rows.t_mono_ns[-1])
+        own = [edge for edge in edges if begin_ns < edge.t_mono_ns <= end_ns]
+        yield EncodedBatch.from_frames_and_payload(rows, encode_frames(rows, schema, own))
+        begin_ns = end_ns
 
 
 class Decoder:
@@ -81,6 +95,7 @@ class Decoder:
     """
 
     def __init__(self, schema: pa.Schema) -> None:
+        self.schema = schema
         self._layouts = MessageLayoutCache(schema)
         frame_columns = get_frame_columns(_get_raw_type(schema))
         self._columns = [(name, *frame_columns[name]) for name in schema.names]

@@ -33,6 +33,7 @@ from devices.scene.hardware_sections import (
     RecoverySection,
     ReferenceSection,
     ServoSection,
+    SyncSection,
     TileSection,
 )
 from devices.scene.scene_file import Scene, list_builtin_scenes, load_scene
@@ -55,13 +56,16 @@ README = (ROOT / "README.md").read_text("utf-8")
 COMMANDS = README + (ROOT / "docs" / "commands.md").read_text("utf-8")
 
 GROUNDS = get_args(get_args(GroundSection)[0])
-SECTIONS = {"array", "tile", "servo", "reference", "recovery", "ground", "emulation", "fault"}
+SECTIONS = {
+    *("array", "tile", "servo", "reference", "recovery", "sync", "ground", "emulation", "fault")
+}
 
 
 @pytest.mark.parametrize(
     "section",
     [
         *(Scene, ArraySection, TileSection, ServoSection, ReferenceSection, RecoverySection),
+        SyncSection,
         *(EmulationSection, FaultSection, *GROUNDS),
     ],
 )
@@ -85,6 +89,7 @@ def test_every_ground_and_builtin_scene_is_documented() -> None:
         ("[servo]", ServoSection),
         ("[reference]", ReferenceSection),
         ("[recovery]", RecoverySection),
+        ("[sync]", SyncSection),
         ("[emulation]", EmulationSection),
     ],
 )

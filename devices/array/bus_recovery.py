@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
@@ -29,6 +29,21 @@ from devices.scene.hardware_sections import RecoverySection
 
 if TYPE_CHECKING:
     from gpiod import LineRequest
+
+
+@contextmanager
+def translate_gpio_errors(chip: str, lines: Sequence[int], section: str) -> Iterator[None]:
+    """Context manager: turn errors of GPIO lines into `BusSetupError` while the block runs."""
+    try:
+        yield
+    except OSError as error:
+        raise BusSetupError(
+            f"GPIO lines cannot be used ({error.strerror or error})",
+            where=f"{chip}, lines {', '.join(map(str, lines))}",
+            remedy=f"Check {section}, that this user is in the group gpio, and that no other "
+            "program holds the lines (gpioinfo)",
+            errno=error.errno,
+        ) from error
 
 
 _TOOLS = ("pinctrl", "raspi-gpio")
@@ -113,19 +128,13 @@ class GpioLines:
         open_drain = gpiod.LineSettings(
             direction=Direction.OUTPUT, drive=Drive.OPEN_DRAIN, output_value=Value.ACTIVE
         )
-        try:
-            with gpiod.request_lines(
+        with (
+            translate_gpio_errors(self._scene.gpiochip, lines, "[recovery]"),
+            gpiod.request_lines(
                 self._scene.gpiochip, consumer="foottile", config={lines: open_drain}
-            ) as request:
-                yield request
-        except OSError as error:
-            raise BusSetupError(
-                f"GPIO lines cannot be used ({error.strerror or error})",
-                where=f"{self._scene.gpiochip}, lines {', '.join(map(str, lines))}",
-                remedy="Check [recovery], that this user is in the group gpio, and that no other "
-                "program holds the lines (gpioinfo)",
-                errno=error.errno,
-            ) from error
+            ) as request,
+        ):
+            yield request
 
     def _restore_pin_function(self) -> None:
         try:

@@ -4,14 +4,22 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from devices.chips.dynamixel.protocol import FIRMWARES
 from devices.chips.pressure_chip import ChipSettings, Registers
 from devices.chips.pressure_chips import PRESSURE_CHIPS
 from devices.chips.tca9548a import ADDRESSES, CHANNELS
 from devices.errors import UsageError
-from devices.types import Identifier
+from devices.types import Identifier, check_user_name
 
 # A quantity beyond a million is a typing error or a wrong unit.
 Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
@@ -225,4 +233,39 @@ class RecoverySection(SceneSection):
     def _lines_differ(self) -> Self:
         if len({self.scl_line, self.sda_line, self.reset_line}) < 3:
             raise ValueError("scl_line, sda_line and reset_line have to be different lines")
+        return self
+
+
+class SyncSection(SceneSection):
+    """`[sync]`: TTL lines of a Raspberry Pi: edges that become markers, and a recording signal."""
+
+    gpiochip: str = "/dev/gpiochip0"
+    input_line: GpioLineNumber | None = None
+    """Line whose edges become markers; absent: not wired."""
+    edge: Literal["rising", "falling", "both"] = "rising"
+    label: Annotated[
+        str, Field(min_length=1, max_length=100, pattern=r"\S"), AfterValidator(check_user_name)
+    ] = "sync"
+    """Label of the markers; with `edge = "both"` the edge's direction follows it."""
+    bias: Literal["as_is", "disabled", "pull_up", "pull_down"] = "as_is"
+    debounce_us: Annotated[int, Field(ge=0, le=1_000_000)] = 0
+    """Time for which a level has to last, us. The kernel then stamps the edge that much later."""
+    output_line: GpioLineNumber | None = None
+    """Line that is high while a session is recorded; absent: not wired."""
+
+    @property
+    def bound_ns(self) -> int:
+        """Bound of the error of an edge's time stamp: interrupt latency, and the debouncing.
+
+        A debounced edge is stamped at a tick of the kernel, of up to 10 ms, after that time.
+        """
+        debounce_ns = 1000 * self.debounce_us + 10_000_000 if self.debounce_us else 0
+        return 200_000 + debounce_ns
+
+    @model_validator(mode="after")
+    def _lines_are_named_and_differ(self) -> Self:
+        if self.input_line == self.output_line:
+            raise ValueError(
+                "names no line, or one line twice; give input_line, output_line or both"
+            )
         return self

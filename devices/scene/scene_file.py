@@ -36,6 +36,7 @@ from devices.scene.hardware_sections import (
     ReferenceSection,
     SceneSection,
     ServoSection,
+    SyncSection,
     TileSection,
 )
 from devices.types import MODELS_MAX, RATE_HZ_MIN, Identifier
@@ -60,6 +61,7 @@ class Scene(SceneSection):
     servo: ServoSection | None = None
     reference: ReferenceSection | None = None
     recovery: RecoverySection | None = None
+    sync: SyncSection | None = None
     ground: GroundSection = NoGround(kind="none")
     emulation: EmulationSection = EmulationSection()
     fault: tuple[FaultSection, ...] = Field(default=(), strict=False)

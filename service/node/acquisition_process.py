@@ -29,7 +29,7 @@ from devices.errors import (
     SpiSetupError,
     TileSetupError,
 )
-from devices.frames import ArrayInfo, FrameBatch
+from devices.frames import ArrayInfo, Edge, FrameBatch
 from devices.realtime import freeze_garbage_collector
 from service.rig.emulated_foot import RigOptions
 from service.rig.rig import Rig
@@ -132,7 +132,7 @@ class AcquisitionEnded:
 
 
 AcquisitionMessage = WaitingForArray | AcquisitionStarted | AcquiredBatch | AcquisitionEnded
-_Item = tuple[FrameBatch, int, tuple[str, ...], ArrayHealth]
+_Item = tuple[FrameBatch, tuple[Edge, ...], int, tuple[str, ...], ArrayHealth]
 
 
 class AcquisitionProcess:
@@ -285,13 +285,14 @@ def _acquire_stream(rig: Rig, connection: Connection, stop: threading.Event) -> 
     sender.start()
     try:
         for batch in rig.acquire_batches(stop.is_set):
+            edges = rig.take_edges()
             changes: tuple[str, ...] = ()
             if batch.t_mono_ns[-1] >= look_ns:
                 changes = notices.update(rig.get_warnings())
                 health = ArrayHealth(notices.debounced_texts, rig.get_fault_counts())
                 look_ns = int(batch.t_mono_ns[-1]) + _HEALTH_INTERVAL_NS
             with suppress(queue.Full):
-                waiting.put_nowait((batch, rig.acquisition.missed_slots, changes, health))
+                waiting.put_nowait((batch, edges, rig.acquisition.missed_slots, changes, health))
     finally:
         waiting.put(None)
         sender.join()
@@ -305,8 +306,9 @@ def _send_batches(
 ) -> None:
     schema = wire_schema(info)
     while (item := waiting.get()) is not None:
-        frames, missed_slots, notices, health = item
-        encoded = EncodedBatch.from_frames_and_payload(frames, encode_frames(frames, schema))
+        frames, edges, missed_slots, notices, health = item
+        payload = encode_frames(frames, schema, edges)
+        encoded = EncodedBatch.from_frames_and_payload(frames, payload)
         try:
             connection.send(AcquiredBatch(encoded, missed_slots, notices, health))
         except OSError:

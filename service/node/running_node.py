@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from devices.errors import FileFormatError, FootTileError, StorageError
+from devices.sync_lines import RecordingLine
 from service.estimation.calibration import Calibration
 from service.node.acquisition_process import (
     AcquiredBatch,
@@ -160,6 +161,10 @@ class RunningNode:
         """Time of the last message from acquisition; infinite before the first."""
         self._publisher: Publisher | None = None
         self._publishing: asyncio.Task[None] | None = None
+        sync = options.rig_options.scene.sync
+        self._recording_line: RecordingLine | None = None
+        if sync is not None and sync.output_line is not None:
+            self._recording_line = RecordingLine(sync)
         self._reported_warnings: tuple[str, ...] = ()
         self._is_closing = False
         loop = asyncio.get_running_loop()
@@ -189,6 +194,7 @@ class RunningNode:
                     await self._begin_stream(message)
                 elif isinstance(message, AcquiredBatch) and self._current_stream is not None:
                     self._store_batch(self._current_stream, message)
+            self._drive_recording_line(is_recording=False)
             if self._current_stream is not None:
                 self._current_stream.mark_ended_in_memory()
             await self._wait_for_delivery()
@@ -242,6 +248,8 @@ class RunningNode:
             self._publishing.cancel()
             await asyncio.gather(self._publishing, return_exceptions=True)
         await asyncio.to_thread(self._acquisition.close)
+        if self._recording_line is not None:
+            self._recording_line.close()
 
     async def _begin_stream(self, started: AcquisitionStarted) -> None:
         info = started.info
@@ -250,6 +258,8 @@ class RunningNode:
             self._report(remark)
         self._current_stream = self._journal.switch_to_new_stream(info)
         await asyncio.to_thread(self._recording.add_stream, self._current_stream)
+        if self._options.session_name is not None:
+            self._drive_recording_line(is_recording=True)
         if self._publisher is not None:
             self._publisher.reconnect_for_new_stream()
 
@@ -304,6 +314,7 @@ class RunningNode:
             warnings=(
                 *self._stall_warnings(),
                 *self._health.warnings,
+                *self._line_warnings,
                 *self._journal.disk_refusal_warnings,
                 *(problem[:_PROBLEM_LENGTH] for problem in self._journal.problems[:_PROBLEMS_MAX]),
             ),
@@ -316,6 +327,20 @@ class RunningNode:
         streams = {stream.stream_id: stream.numbers for stream in wanted.streams}
         wants = RetentionRequest(streams=streams, recording=wanted.recording, known=known)
         self._journal.update_retention_request(server_id, wants)
+        self._drive_recording_line(
+            is_recording=wanted.recording or self._options.session_name is not None
+        )
+
+    def _drive_recording_line(self, *, is_recording: bool) -> None:
+        """Drive the line; without a link it stays as it is, since the recording goes on."""
+        if self._recording_line is not None and self._current_stream is not None:
+            self._recording_line.drive(high=is_recording and not self._current_stream.has_ended)
+
+    @property
+    def _line_warnings(self) -> tuple[str, ...]:
+        """Warning about the recording line; empty if it is as it should be."""
+        line = self._recording_line
+        return (line.warning,) if line is not None and line.warning else ()
 
     def _stall_warnings(self) -> tuple[str, ...]:
         """Return a warning if acquisition is stalled; this process and its link go on."""
@@ -328,7 +353,11 @@ class RunningNode:
         """Report stalls of acquisition and problems of the disk, and their end."""
         while True:
             await asyncio.sleep(_WARNINGS_INTERVAL_S)
-            warnings = (*self._stall_warnings(), *self._journal.disk_refusal_warnings)
+            warnings = (
+                *self._stall_warnings(),
+                *self._line_warnings,
+                *self._journal.disk_refusal_warnings,
+            )
             kinds = tuple(warning.partition(";")[0] for warning in warnings)
             for kind in kinds:
                 if kind not in self._reported_warnings:

@@ -33,10 +33,11 @@ from devices.chips.mcp3208 import COUNTS_MAX, COUNTS_PER_VREF, Mcp3208
 from devices.clock import Clock, SpinningClock, SystemClock, UtcAnchor
 from devices.errors import FootTileError, I2cError, SpiError, TileSetupError, UsageError
 from devices.flags import FrameFlag, TileFlag
-from devices.frames import ArrayInfo, FrameBatch, ServoInfo, TileInfo
+from devices.frames import ArrayInfo, Edge, FrameBatch, ServoInfo, TileInfo
 from devices.realtime import is_clock_set, set_timer_slack, use_realtime_priority
 from devices.scene.hardware_sections import EMULATED, ReferenceSection, ScheduleName, ServoSection
 from devices.scene.scene_file import Scene
+from devices.sync_lines import SyncInput
 from service.rig.emulated_foot import RigOptions
 from service.version import SOFTWARE_VERSION
 from storage.journal.node.in_flight import InFlightWriter, try_create_in_flight_writer
@@ -310,6 +311,10 @@ class Rig:
         self._servo_source = (
             self._open_servo_source(scene.servo, world, stack) if scene.servo is not None else None
         )
+        self._sync: SyncInput | None = None
+        if scene.sync is not None and scene.sync.input_line is not None:
+            self._sync = SyncInput(scene.sync, self._line_clock)
+            stack.callback(self._sync.close)
         self._reidentify_at_ns = 0
         self._in_flight: InFlightWriter | None = None
         bus_hz = self._estimate_max_rate_hz(self._ready)
@@ -341,6 +346,8 @@ class Rig:
         streams = self._options.journals_folder
         folder = None if streams is None else streams / self.info.stream_id
         self._in_flight = try_create_in_flight_writer(folder, self.info)
+        if self._sync is not None:
+            self._sync.sink = self._in_flight
         if folder is not None and self._in_flight is None:
             self.startup_messages.append(
                 "no room for frames in flight: a crash may cost the last batches"
@@ -354,7 +361,7 @@ class Rig:
             expected_rate_hz=bus_hz,
             servo=self._servo_source,
             is_reidentified=is_reidentified,
-            frame_sink=self._in_flight,
+            frame_sink=self._in_flight if self._sync is None else self._sync,
             lead_end_ns=None if self._lead is None else self._lead.end_ns,
         )
         self._rate_monitor = FrameRateMonitor(self.info.nominal_rate_hz)
@@ -382,6 +389,10 @@ class Rig:
             if not should_stop() and self._reidentify():
                 return
 
+    def take_edges(self) -> tuple[Edge, ...]:
+        """Return the edges of the sync line up to the last frame, since the last call."""
+        return () if self._sync is None else self._sync.take_batch()
+
     def get_warnings(self) -> dict[str, str]:
         """Return the present warnings, by tile's serial or device."""
         found = self._ready.array.get_warnings()
@@ -389,12 +400,15 @@ class Rig:
             found["reference"] = self._reference.warning
         if self._servo_source is not None and self._servo_source.warning:
             found["servo"] = f"servo: {self._servo_source.warning}"
+        if self._sync is not None and self._sync.warning:
+            found["sync"] = self._sync.warning
         return found
 
     def get_fault_counts(self) -> dict[str, dict[str, int]]:
         """Return the fault counts of the stream, by serial and reason."""
         array = self._ready.array
-        return {
+        dropped = 0 if self._sync is None else self._sync.dropped_edges
+        return ({"sync": {"dropped_edges": dropped}} if dropped else {}) | {
             tile.serial: dict(health.fault_counts)
             for tile, health in zip(array.tiles, array.health, strict=True)
             if health.fault_counts

@@ -11,6 +11,7 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
@@ -21,6 +22,13 @@ from service.protocol.link import ClockSample, RetentionMessage, StreamNumbers
 from service.server.node import ServerNode
 from service.server.nodes import NodeRegistry
 from service.server.session_store import SessionStore, check_revision, user_fields_revision
+from service.server.streams import ServerStream
+from service.sessions.edges import (
+    EDGE_MARKERS_MAX,
+    collect_edge_markers,
+    make_edge_markers,
+    read_sync_section,
+)
 from service.sessions.inputs import SessionInputs, make_inputs
 from service.sessions.lifecycle import (
     Abandon,
@@ -38,6 +46,12 @@ from service.sessions.lifecycle import (
 )
 from service.sessions.parts import NodeFacts, find_first_seq
 from service.sessions.sealing import write_sealed_files
+from storage.clock.table import (
+    ClockTable,
+    StreamClockFacts,
+    group_rows_by_stream_in_given_order,
+)
+from storage.edges import read_edges
 from storage.intervals import NO_END, Intervals, to_open_pairs
 from storage.sessions.folder import IdempotencyRecord, Ledger, Part, Session
 from storage.sessions.ledger import group_numbers_by_stream
@@ -80,6 +94,8 @@ class Recorder:
         self._failures: dict[str, str] = {}
         for session in store.list_unsealed():
             store.cache(self._with_clock_offsets(session))
+            if read_sync_section(session) is not None:
+                store.cache(self._with_stored_edges(store.get_session(session.id)))
 
     def list_recording(self, node: str) -> list[Session]:
         """Return the sessions that are being recorded on a node."""
@@ -344,6 +360,36 @@ class Recorder:
         self.invalidate_and_request_resend(
             self._nodes.get(session.node), error, f"session {session.id}"
         )
+
+    def add_live_edges(self, node: ServerNode, stream: ServerStream, payload: bytes) -> None:
+        """Add the edges of a stored message to the sessions being recorded, in memory.
+
+        At sealing they are read from the journal; the clock may be known better then.
+        """
+        if stream.journal is None or not (edges := read_edges(payload, stream.decoder.schema)):
+            return
+        offset_ns = stream.info.utc_offset_ns
+        for session in self.list_recording(node.name):
+            section, part = read_sync_section(session), session.parts[-1]
+            begin_t_ns = stream.journal.find_batch_t_ns_near(part.seq_first, at_or_before=False)
+            if section is None or part.stream_id != stream.stream_id or begin_t_ns is None:
+                continue
+            rows = group_rows_by_stream_in_given_order(stream.clock_offsets)
+            clock = ClockTable(rows, [StreamClockFacts(part.stream_id)], [part.stream_id])
+            since = [edge for edge in edges if edge.t_mono_ns + offset_ns >= begin_t_ns]
+            known = {marker.id: marker for marker in session.markers if marker.stream_id}
+            new = {m.id: m for m in make_edge_markers(since, section, stream.info, clock, 0)}
+            if new.keys() - known.keys() and len(known) < EDGE_MARKERS_MAX:
+                changed = session.with_edge_markers((new | known).values())
+                self._store.cache(changed)
+                self._store.on_change(changed)
+
+    def _with_stored_edges(self, session: Session) -> Session:
+        """Return an unsealed session with the edges that its journals have."""
+        with suppress(FootTileError):  # its node is unknown, or a journal is damaged
+            inputs = self.collect_inputs_from_journals(session.id)
+            return session.with_edge_markers(collect_edge_markers(inputs).markers)
+        return session
 
     def cache_missing_clock_offsets(self, node: ServerNode) -> None:
         """Add missing clock measurements to a node's unsealed sessions, in memory.

@@ -393,6 +393,8 @@ class SessionStore:
             StorageError: it cannot be saved.
         """
         event = self._find_marker(session_id, marker_id, if_revision)
+        if "t_ns" in changes:  # no edge any more
+            changes |= {"stream_id": None, "t_mono_ns": None, "bound_ns": None}
         changed = event.model_copy(update=changes)
         events = self.get_session(session_id).markers
         self._edit(session_id, markers=tuple(changed if e.id == marker_id else e for e in events))
@@ -407,8 +409,15 @@ class SessionStore:
         self._edit(session_id, markers=tuple(event for event in events if event.id != marker_id))
 
     def _find_marker(self, session_id: str, marker_id: str, if_revision: str | None) -> Marker:
-        for event in self.get_session(session_id).markers:
+        session = self.get_session(session_id)
+        for event in session.markers:
             if event.id == marker_id:
+                if event.stream_id is not None and session.state != "sealed":
+                    raise StateError(
+                        f"marker {event.label!r} is an edge of the sync line, and session "
+                        f"{session_id} is not sealed yet",
+                        remedy="Change it once the session is sealed",
+                    )
                 check_revision(
                     if_revision,
                     marker_revision(event),

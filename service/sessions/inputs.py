@@ -78,11 +78,21 @@ class SessionInputs:
         Raises:
             FootTileError: a journal is damaged, or cannot be read.
         """
-        parts = self.session.parts
-        if len({part.stream_id for part in parts}) < 2:
+        if len({part.stream_id for part in self.session.parts}) < 2:
             return NODE_AXIS
+        period_ns = round(1e9 / self.info.nominal_rate_hz)
+        return compute_time_axis(
+            self.find_part_spans(), self.make_clock_table(), period_ns=period_ns
+        )
+
+    def find_part_spans(self) -> list[PartSpan]:
+        """Return the times of the first and last stored frame of each part that has frames.
+
+        Raises:
+            FootTileError: a journal is damaged, or cannot be read.
+        """
         spans = []
-        for number, part in enumerate(parts):
+        for number, part in enumerate(self.session.parts):
             journal = self.journals.get(part.stream_id)
             if journal is None:
                 continue
@@ -97,8 +107,7 @@ class SessionInputs:
             t_mono_ns = int(first.t_mono_ns[0]), int(last.t_mono_ns[-1])
             t_ns = int(first.t_ns[0]), int(last.t_ns[-1])
             spans.append(PartSpan(number, part.stream_id, t_mono_ns, t_ns))
-        period_ns = round(1e9 / self.info.nominal_rate_hz)
-        return compute_time_axis(spans, self.make_clock_table(), period_ns=period_ns)
+        return spans
 
 
 def make_inputs(

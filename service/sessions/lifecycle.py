@@ -194,7 +194,9 @@ def apply_event(session: Session, event: Event, node: NodeFacts = _NO_FACTS) -> 
         case "sealing", Sealed(sealed):
             # A person may have edited the session during sealing.
             user_fields = {name: getattr(session, name) for name in _EDITABLE}
-            has_other_markers = session.markers != sealed.markers
+            edges = (marker for marker in sealed.markers if marker.stream_id is not None)
+            user_fields["markers"] = session.with_edge_markers(edges).markers
+            has_other_markers = user_fields["markers"] != sealed.markers
             return Step(
                 sealed.model_copy(update=user_fields),
                 is_changed=True,

@@ -14,6 +14,7 @@ from typing import TypeVar
 from pydantic import ValidationError
 
 from devices.errors import DamagedFileError, FileFormatError, StorageError
+from service.sessions.edges import collect_edge_markers
 from service.sessions.inputs import SessionFrames, SessionInputs
 from service.sessions.overview import OverviewWriter
 from service.sessions.stances import StancesWriter
@@ -77,13 +78,15 @@ def write_sealed_files(inputs: SessionInputs, folder: Path, ledger: Ledger) -> S
         raise FileFormatError(
             f"{count} frames were sealed, the ledger has {ledger.recorded}", where=str(path)
         )
+    edges = collect_edge_markers(inputs)
+    session = session.with_edge_markers(edges.markers)
     write_markers(session, folder)
     write_clock_file(folder / CLOCK_NAME, session.clock, inputs.stream_facts)
     sha256 = compute_sha256(path)
     write_sha256_sums(folder, sha256)
     stances.try_write_or_delete_file(folder, sha256)
     overview.try_write_file(folder, sha256)
-    problems = session.problem, frames.problem, stances.problem, overview.problem
+    problems = session.problem, frames.problem, stances.problem, overview.problem, edges.problem
     return session.model_copy(
         update={
             "state": "sealed",

@@ -66,7 +66,8 @@ class ClockTable:
         where: str = "",
     ) -> None:
         self._streams = tuple(streams)
-        self._parts = tuple(parts)
+        self.parts = tuple(parts)
+        """Stream id of each part."""
         self._maps: dict[str, ClockOffsets] = {}
         for stream in streams:
             own = rows.get(stream.stream_id)
@@ -91,7 +92,7 @@ class ClockTable:
         t_server_ns = np.full(len(t_ns), UNKNOWN_T_NS, dtype=np.int64)
         uncertainty_ns = t_server_ns.copy()
         sane = _mask_within(t_mono_ns, T_MONO_NS_END) & _mask_within(t_ns, T_NS_END)
-        for number, stream_id in enumerate(self._parts):
+        for number, stream_id in enumerate(self.parts):
             clock = self._maps.get(stream_id)
             here = np.flatnonzero(sane if part is None else sane & (part == number))
             if clock is None or not len(here) or (part is None and number):
@@ -113,7 +114,7 @@ class ClockTable:
             ends_t_mono_ns: int64[n], `t_mono_ns` of each end, not before its begin.
             part: number of the part.
         """
-        clock = self._maps.get(self._parts[part]) if part < len(self._parts) else None
+        clock = self._maps.get(self.parts[part]) if part < len(self.parts) else None
         if clock is None:
             return None
         sane = _mask_within(begins_t_mono_ns, T_MONO_NS_END) & _mask_within(

@@ -3,6 +3,7 @@
 Markers may be set after a session was sealed, so no file of frames has them: they are placed when
 the session is read. A marker without a frame within a second has no frame, and so has a marker
 whose frames have no server's time, because their clock was never compared. The reason is stated.
+An edge of a sync line has its instant by the clock of the frames, and needs no server's time.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ class PlacedMarker:
         """Return the marker as JSON, for the notes of a file."""
         part, seq = self.frame or (None, None)
         return {
-            **self.marker.model_dump(mode="json"),
+            **self.marker.model_dump(mode="json", exclude_none=True),
             "part": part,
             "seq": seq,
             "apart_ns": self.distance_ns,
@@ -126,8 +127,7 @@ def place_markers(
             `frame_chunks`.
         axis: time axis of the session.
     """
-    ordered = sorted(markers, key=lambda event: event.t_ns)
-    nearest = _NearestFrames(np.array([event.t_ns for event in ordered], dtype=np.int64))
+    searches = _group_by_clock(markers)
     for piece in frame_chunks:
         if not len(piece["t_ns"]):
             continue
@@ -136,42 +136,68 @@ def place_markers(
             piece["t_mono_ns"], piece["t_ns"], piece.get("part")
         )
         at_ns = axis.shift_to_axis(piece["t_ns"], piece.get("part"))
-        nearest.add_frames(piece, times, selection.compute_row_mask(at_ns, begin_t_ns))
-    return PlacedMarkers([nearest.make_placed_marker(i, event) for i, event in enumerate(ordered)])
+        part = piece.get("part", np.zeros(len(at_ns), dtype=np.uint16))
+        values = {
+            "seq": piece["seq"],
+            "part": part,
+            "uncertainty_ns": times["t_server_uncertainty_ns"],
+            "inside": selection.compute_row_mask(at_ns, begin_t_ns),
+        }
+        for stream_id, search in searches.items():
+            if stream_id is None:
+                t_ns = times["t_server_ns"]
+                search.add_frames(t_ns, t_ns != UNKNOWN_T_NS, values)
+            else:
+                own_parts = [number for number, s in enumerate(clock.parts) if s == stream_id]
+                search.add_frames(piece["t_mono_ns"], np.isin(part, own_parts), values)
+    placed = [
+        search.make_placed_marker(i, event)
+        for search in searches.values()
+        for i, event in enumerate(search.markers)
+    ]
+    return PlacedMarkers(sorted(placed, key=lambda each: each.marker.t_ns))
+
+
+def _group_by_clock(markers: Iterable[Marker]) -> dict[str | None, _NearestFrames]:
+    """Return the searches for the markers of each stream, and of the server's clock (None)."""
+    groups: dict[str | None, list[Marker]] = {}
+    for event in markers:
+        groups.setdefault(event.stream_id, []).append(event)
+    return {stream_id: _NearestFrames(group) for stream_id, group in groups.items()}
 
 
 @dataclass
 class _NearestFrames:
-    """Running search for the nearest frame of each of n instants."""
+    """Running search for the nearest frame of each of n markers of one clock."""
 
-    t_ns: Array
+    markers: Sequence[Marker]
+    t_ns: Array = field(init=False)
     distance_ns: Array = field(init=False)
     frame_facts: dict[str, Array] = field(init=False)
 
     def __post_init__(self) -> None:
+        instants = [m.t_ns if m.t_mono_ns is None else m.t_mono_ns for m in self.markers]
+        self.t_ns = np.array(instants, dtype=np.int64)
         self.distance_ns = np.full(len(self.t_ns), _NO_DISTANCE, dtype=np.uint64)
         types = {"seq": np.uint64, "part": np.uint16, "uncertainty_ns": np.int64, "inside": bool}
         self.frame_facts = {name: np.zeros(len(self.t_ns), type_) for name, type_ in types.items()}
 
-    def add_frames(
-        self, piece: Mapping[str, Array], times: Mapping[str, Array], is_in_slice: Array
-    ) -> None:
-        """Update the nearest frames by further frames."""
-        t_server_ns = times["t_server_ns"]
-        known = np.flatnonzero(t_server_ns != UNKNOWN_T_NS)
-        if not len(known) or not len(self.t_ns):
+    def add_frames(self, t_ns: Array, is_known: Array, values: Mapping[str, Array]) -> None:
+        """Update the nearest frames by further frames.
+
+        Args:
+            t_ns: int64[n], instants of the frames by the markers' clock.
+            is_known: bool[n], frames that have such an instant.
+            values: facts of the frames, by the names of `frame_facts`.
+        """
+        known = np.flatnonzero(is_known)
+        if not len(known):
             return
-        rows = known[np.argsort(t_server_ns[known], kind="stable")]
-        rising_ns = t_server_ns[rows]
+        rows = known[np.argsort(t_ns[known], kind="stable")]
+        rising_ns = t_ns[rows]
         after = np.searchsorted(rising_ns, self.t_ns)
         # The first of several frames with one instant.
         before = np.searchsorted(rising_ns, rising_ns[np.maximum(after - 1, 0)])
-        values = {
-            "seq": piece["seq"],
-            "part": piece.get("part", np.zeros(len(t_server_ns), dtype=np.uint16)),
-            "uncertainty_ns": times["t_server_uncertainty_ns"],
-            "inside": is_in_slice,
-        }
         for at in (before, np.minimum(after, len(rows) - 1)):
             apart_ns = _distance_ns(self.t_ns, rising_ns[at])
             nearer = apart_ns < self.distance_ns
@@ -193,7 +219,7 @@ class _NearestFrames:
             marker,
             (facts["part"], facts["seq"]),
             int(self.distance_ns[i]),
-            facts["uncertainty_ns"],
+            None if facts["uncertainty_ns"] == UNKNOWN_T_NS else facts["uncertainty_ns"],
             "" if facts["inside"] else _NOT_IN_SLICE,
         )
 
@@ -250,9 +276,13 @@ def _row_groups_near_markers(
             near.add(group)
         else:
             by_part.setdefault(of_part[0], []).append((group, *t_mono_ns, *t_ns))
-    marks_ns = np.sort(np.array([event.t_ns for event in markers], dtype=np.float64))
+    marks_ns = np.sort([float(event.t_ns) for event in markers if event.stream_id is None])
     for number, rows in by_part.items():
         groups, begins, ends, earliest, latest = np.array(rows, dtype=np.int64).T
+        stream_id = clock.parts[number] if number < len(clock.parts) else ""
+        edges_ns = np.sort([m.t_mono_ns for m in markers if m.stream_id == stream_id])
+        first = np.searchsorted(edges_ns, begins - _SEARCH_DISTANCE_NS)
+        near.update(groups[first < np.searchsorted(edges_ns, ends + _SEARCH_DISTANCE_NS)].tolist())
         reach = clock.bound_offset_in_ranges(begins, ends, number)
         if reach is None:
             continue

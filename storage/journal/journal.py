@@ -18,8 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from devices.errors import DamagedFileError, FileFormatError, StorageError, escape_control_chars
-from devices.frames import ArrayInfo, FrameBatch
+from devices.frames import ArrayInfo, Edge, FrameBatch
 from storage.durable_files import make_synced_folder, translate_storage_errors
+from storage.edges import read_edges
 from storage.intervals import CORRUPT, NO_END, Intervals, Losses, union
 from storage.journal import time_index
 from storage.journal.segment import (
@@ -157,9 +158,9 @@ class Journal:
                 self._append_to_segment(EncodedBatch.from_frames_and_payload(batch, payload))
             else:
                 rows = batch.slice_rows(a - first, b - first + 1)
-                self._append_to_segment(
-                    EncodedBatch.from_frames_and_payload(rows, encode_frames(rows, self._schema))
-                )
+                edges = () if payload is None else read_edges(payload, self._schema)
+                content = encode_frames(rows, self._schema, edges)
+                self._append_to_segment(EncodedBatch.from_frames_and_payload(rows, content))
         return new
 
     def append_unstored_frames_of_message(self, message: EncodedBatch) -> None:
@@ -224,6 +225,15 @@ class Journal:
         with BatchReader(self._runs) as reader:
             for batches in self._find_batches(seq_first, seq_last):
                 yield from reader.read_messages(batches)
+
+    def read_edges(self, seq_first: int, seq_last: int) -> Iterator[Edge]:
+        """Yield the edges in messages with these frames, and in the one before; some twice.
+
+        Raises:
+            DamagedFramesError, StorageError: as for `read_overlapping_messages`.
+        """
+        for message in self.read_overlapping_messages(max(0, seq_first - 1), seq_last):
+            yield from read_edges(message.payload, self._schema)
 
     def find_first_batch_seq_since(self, t_ns: int) -> int | None:
         """Return the first stored number at `t_ns` (node's UTC) or later, to a batch.

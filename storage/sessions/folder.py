@@ -98,12 +98,18 @@ class Ledger(_Record):
 
 
 class Marker(_Record):
-    """Marker that a person set."""
+    """Marker that a person set, or an edge of a node's sync line."""
 
     id: str
     label: str
     t_ns: int
-    """Instant in the server's UTC."""
+    """Instant in the server's UTC; of an edge without clock measurements in its node's."""
+    stream_id: str | None = None
+    """Stream with the edge; None: a person set or moved it, and so for the next two."""
+    t_mono_ns: int | None = None
+    """Instant of the edge by the node's clock, as `t_mono_ns` of frames."""
+    bound_ns: int | None = None
+    """Bound of the error of `t_ns`."""
 
 
 class IdempotencyRecord(_Record):
@@ -163,6 +169,11 @@ class Session(_Record):
     sha256: str | None = None
     calibration_id: str | None = None
     absolute_scale: Literal["measured", "assumed"] | None = None
+
+    def with_edge_markers(self, edges: Iterable[Marker]) -> Session:
+        """Return the session with these markers as its edges; those of people stay."""
+        others = (marker for marker in self.markers if marker.stream_id is None)
+        return self.model_copy(update={"markers": (*others, *edges)})
 
     def with_newer_clock_rows(self, rows: Iterable[ClockOffset]) -> Session:
         """Return the session with rows that are newer than its own of the same stream."""

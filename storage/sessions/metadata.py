@@ -126,6 +126,12 @@ def write_markers(session: Session, folder: Path) -> None:
         "label": pa.array([event.label for event in events], pa.string()),
         "t_ns": pa.array([event.t_ns for event in events], pa.int64()),
     }
+    if any(event.stream_id is not None for event in events):
+        columns |= {
+            "stream_id": pa.array([event.stream_id for event in events], pa.string()),
+            "t_mono_ns": pa.array([event.t_mono_ns for event in events], pa.int64()),
+            "bound_ns": pa.array([event.bound_ns for event in events], pa.int64()),
+        }
     write_hashed_table(folder / MARKERS_NAME, pa.table(columns))
 
 

@@ -62,6 +62,11 @@ class MarkerView(View):
     id: str
     label: str
     t_ns: int = Field(description="Server's UTC.")
+    stream_id: str | None = Field(
+        description="Stream of an edge of a sync line; null: a person set the marker."
+    )
+    t_mono_ns: int | None = Field(description="Instant of an edge by its node's clock.")
+    bound_ns: int | None = Field(description="Bound of the error of an edge's `t_ns`.")
     revision: str = Field(description="Its revision, for `If-Match`.")
 
 

@@ -11,6 +11,7 @@ import mmap
 import os
 import struct
 import zlib
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -20,8 +21,9 @@ import numpy as np
 from devices.acquisition import AcquiredFrame, RangeDetector
 from devices.chips.pressure_chips import check_chips, get_raw_type
 from devices.errors import DamagedFileError, StorageError
-from devices.frames import ArrayInfo, FrameBatch, get_frame_columns
+from devices.frames import ArrayInfo, Edge, FrameBatch, get_frame_columns
 from storage.durable_files import make_synced_folder, read_small_file, translate_storage_errors
+from storage.edges import EdgesInFlightWriter, try_delete_edges_in_flight
 
 IN_FLIGHT_FILE = "in_flight"
 ROW_COUNT = 8192
@@ -49,6 +51,7 @@ class InFlightWriter:
 
     def __init__(self, folder: Path, info: ArrayInfo) -> None:
         path = folder / IN_FLIGHT_FILE
+        self._edges = EdgesInFlightWriter(folder)
         tiles = len(info.tiles)
         self._row = struct.Struct(_row_format(info))
         self._size = self._row.size + 4
@@ -79,9 +82,14 @@ class InFlightWriter:
         at = self._begin + (frame.seq % ROW_COUNT) * self._size
         self._map[at : at + self._size] = row + zlib.crc32(row).to_bytes(4, "little")
 
+    def write_edges(self, edges: Sequence[Edge]) -> None:
+        """Write edges of the sync line, to a file of their own."""
+        self._edges.write_edges(edges)
+
     def close(self) -> None:
-        """Close the file without deleting it."""
+        """Close the files without deleting them."""
         self._map.close()
+        self._edges.close()
 
 
 class InFlightFrames(NamedTuple):
@@ -161,7 +169,8 @@ def read_newest_in_flight_run(folder: Path, next_journal_seq: int) -> FrameBatch
 
 
 def try_delete_in_flight_file(folder: Path) -> None:
-    """Delete the file of frames in flight, if it is there and can be deleted."""
+    """Delete the files of frames and edges in flight, if they can be deleted."""
+    try_delete_edges_in_flight(folder)
     with suppress(OSError):
         (folder / IN_FLIGHT_FILE).unlink(missing_ok=True)
 

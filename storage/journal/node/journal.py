@@ -25,6 +25,7 @@ from storage.durable_files import (
     translate_storage_errors,
     try_set_aside_and_describe,
 )
+from storage.edges import read_edges_in_flight
 from storage.intervals import DISK_FULL, DISK_SLOW, READ_ONLY, Intervals
 from storage.journal.journal import Journal
 from storage.journal.node.in_flight import (
@@ -76,11 +77,12 @@ def _recover_ended_stream(folder: Path, problems: list[str]) -> NodeStream | Non
     frames = left.frames
     if frames is not None:
         held, first = stream.stored, int(frames.seq[0])
+        edges = read_edges_in_flight(folder)
         # Frames older than all stored ones were evicted, not lost in flight.
         for a, b in held.missing_in(max(first, held.first or 0), int(frames.seq[-1])):
             # A gap before them: more frames waited for the disk than the file has rows.
             for batch in encode_as_messages(
-                frames.slice_rows(a - first, b + 1 - first), stream.info
+                frames.slice_rows(a - first, b + 1 - first), stream.info, edges
             ):
                 stream.queue_batch_and_record_gap(batch, gap_reason=DISK_SLOW)
     stream.mark_ended_in_memory(max_lost_tail_frames=0)

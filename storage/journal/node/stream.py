@@ -18,6 +18,7 @@ from pathlib import Path
 
 from devices.errors import DamagedFileError, StorageError
 from storage.durable_files import try_set_aside_and_describe
+from storage.edges import read_edges_in_flight
 from storage.intervals import CORRUPT, EVICTED, NODE_BUSY, Intervals, Losses, union
 from storage.journal.journal import Journal
 from storage.journal.node.in_flight import (
@@ -428,7 +429,7 @@ class NodeStream:
             return False
         if new is None:
             return False
-        for batch in encode_as_messages(new, self.info):
+        for batch in encode_as_messages(new, self.info, read_edges_in_flight(self.folder)):
             self.queue_batch_and_record_gap(batch)
         return True
 

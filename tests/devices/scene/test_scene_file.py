@@ -28,6 +28,7 @@ from devices.scene.hardware_sections import (
     RecoverySection,
     ReferenceSection,
     ServoSection,
+    SyncSection,
     TileSection,
 )
 from devices.scene.scene_file import (
@@ -180,6 +181,7 @@ SECTIONS: dict[str, tuple[type[BaseModel], str]] = {
     "servo.": (ServoSection, "[servo]"),
     "reference.": (ReferenceSection, "[reference]"),
     "recovery.": (RecoverySection, "[recovery]"),
+    "sync.": (SyncSection, "[sync]"),
     "emulation.": (EmulationSection, "[emulation]"),
     "fault.0.": (FaultSection, "[[fault]]"),
     "tile.2.": (TileSection, "[[tile]]"),
@@ -275,6 +277,11 @@ def test_a_wrong_type_or_no_finite_number_is_refused_and_not_converted(section: 
         ("", "[recovery]\nreset_line = -1", "recovery.reset_line"),
         ("", "[recovery]\ni2c_function = 'op'", "recovery.i2c_function"),
         ("", "[recovery]\ni2c_function = 'a0 dl'", "recovery.i2c_function"),
+        ("", "[sync]\nedge = 'both'", "sync: names no line, or one line twice"),
+        ("", "[sync]\ninput_line = 4\noutput_line = 4", "sync: names no line, or one line twice"),
+        ("", "[sync]\ninput_line = 4\nedge = 'any'", "sync.edge"),
+        ("", "[sync]\ninput_line = 4\nlabel = ' '", "sync.label"),
+        ("", "[sync]\ninput_line = 4\ndebounce_us = -1", "sync.debounce_us"),
         ("", "[reference]\nn_per_v = 30", "key 'reference.zero_v' is missing"),
         ("", "[reference]\nzero_v = 1.65", "key 'reference.n_per_v' is missing"),
         ("", "[reference]\nzero_v = 1.65\nn_per_v = 0", "0 would make every voltage 0 N"),

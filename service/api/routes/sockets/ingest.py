@@ -221,6 +221,7 @@ async def _receive_messages(socket: WebSocket, server: Server, link: NodeLink) -
                 due = node.receive_frames(link.stream, strip_binary_crc(message), server_utc_ns())
             except LinkError as error:
                 raise CloseConnection(LinkCloseCode.REFUSED, str(error)) from error
+            server.recorder.add_live_edges(node, link.stream, strip_binary_crc(message))
             server.broadcaster.add_to_history_and_updates(node, due)
             server.live_feeds.add_to_existing_buffer(node, due)
             server.weighings.feed_frames(node, due)

@@ -1,0 +1,196 @@
+"""Sync lines of a Raspberry Pi: edges of other instruments, and a signal while recording.
+
+The kernel stamps each edge with CLOCK_MONOTONIC, the clock of the frames. Edges are read with each
+frame, without waiting, so that those before a frame are known when it is stored. They have not
+been run on a Raspberry Pi by this project: tests cover the calls of libgpiod with its own types.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from contextlib import suppress
+from datetime import timedelta
+from typing import TYPE_CHECKING, Protocol
+
+from devices.acquisition import AcquiredFrame, FrameSink
+from devices.array.bus_recovery import translate_gpio_errors
+from devices.clock import Clock
+from devices.errors import require_extra
+from devices.frames import Edge
+from devices.scene.hardware_sections import SyncSection
+
+if TYPE_CHECKING:
+    from gpiod import LineRequest, LineSettings
+
+EDGES_PER_BATCH_MAX = 64
+"""Most edges of a batch, 2560 a second: further ones are dropped and counted."""
+_KERNEL_EDGES_MAX = 1024
+"""Edges that wait in the kernel, its limit; it drops the oldest, as a gap in `line_seqno`."""
+_REOPEN_NS = 1_000_000_000
+_DROP_WARNING_NS = 1_000_000_000
+"""Time for which dropped edges are a warning."""
+
+
+def _request_line(scene: SyncSection, line: int, settings: LineSettings) -> LineRequest:
+    import gpiod
+
+    with translate_gpio_errors(scene.gpiochip, [line], "[sync]"):
+        return gpiod.request_lines(
+            scene.gpiochip,
+            consumer="foottile",
+            config={line: settings},
+            event_buffer_size=_KERNEL_EDGES_MAX,
+        )
+
+
+class EdgeSink(FrameSink, Protocol):
+    """Sink of frames that also receives the edges before them."""
+
+    def write_edges(self, edges: Sequence[Edge]) -> None:
+        """Store edges. It must be quick: the loop waits."""
+
+
+class SyncInput:
+    """Input line whose edges are read with each frame.
+
+    A line that fails later is a warning; it is requested again every second.
+
+    Args:
+        scene: its section; `input_line` is set.
+        clock: clock of the frames.
+
+    Raises:
+        MissingExtraError: gpiod is not installed.
+        BusSetupError: the line is not there, in use, or forbidden.
+    """
+
+    def __init__(self, scene: SyncSection, clock: Clock) -> None:
+        self.sink: EdgeSink | None = None
+        """Sink of the present stream; None: frames and edges in flight are not stored."""
+        self.dropped_edges = 0
+        """Number of edges that came faster than they can be stored."""
+        self._scene = scene
+        self._clock = clock
+        self._edges: list[Edge] = []
+        self._number = self._line_seqno = 0
+        self._problem = ""
+        self._reopen_at_ns = 0
+        self._dropped_at_ns: float = -math.inf
+        with require_extra("gpio", "the sync line"):
+            import gpiod
+        self._is_rising_type = gpiod.EdgeEvent.Type.RISING_EDGE
+        self._request: LineRequest | None = self._open()
+
+    def _open(self) -> LineRequest:
+        from gpiod import LineSettings
+        from gpiod.line import Bias, Direction, Edge
+
+        scene = self._scene
+        settings = LineSettings(
+            direction=Direction.INPUT,
+            edge_detection=Edge[scene.edge.upper()],
+            bias=Bias[scene.bias.upper()],
+            debounce_period=timedelta(microseconds=scene.debounce_us),
+        )
+        assert scene.input_line is not None  # noqa: S101  # the caller has checked
+        self._line_seqno = 0
+        return _request_line(scene, scene.input_line, settings)
+
+    @property
+    def warning(self) -> str:
+        """Warning about the line; empty if there is none."""
+        if self._problem:
+            return f"the sync line fails, and edges are lost; retry every second: {self._problem}"
+        if self._clock.now_ns() - self._dropped_at_ns < _DROP_WARNING_NS:
+            return (
+                f"the sync line has more than {EDGES_PER_BATCH_MAX} edges in 25 ms; further ones "
+                "are dropped. Check cable and ground, or set sync.debounce_us"
+            )
+        return ""
+
+    def write_frame(self, frame: AcquiredFrame) -> None:
+        """Read the edges up to now, and write them and then the frame to the sink."""
+        edges = self._read_edges()
+        if self.sink is not None:
+            if edges:
+                self.sink.write_edges(edges)
+            self.sink.write_frame(frame)
+
+    def take_batch(self) -> tuple[Edge, ...]:
+        """Return the edges since the last call."""
+        edges, self._edges = tuple(self._edges), []
+        return edges
+
+    def close(self) -> None:
+        """Release the line."""
+        if self._request is not None:
+            with suppress(OSError):
+                self._request.release()
+
+    def _read_edges(self) -> list[Edge]:
+        new: list[Edge] = []
+        try:
+            if self._request is None:
+                if self._clock.now_ns() < self._reopen_at_ns:
+                    return new
+                self._reopen_at_ns = self._clock.now_ns() + _REOPEN_NS
+                self._request, self._problem = self._open(), ""
+            if not self._request.wait_edge_events(0.0):
+                return new
+            events = self._request.read_edge_events()
+        except OSError as error:
+            self._problem = error.strerror or str(error)
+            self.close()
+            self._request = None
+            self._reopen_at_ns = self._clock.now_ns() + _REOPEN_NS
+            return new
+        for event in events:
+            step = (event.line_seqno - self._line_seqno) % 2**32
+            self._line_seqno = event.line_seqno
+            self._number += step
+            is_kept = len(self._edges) + len(new) < EDGES_PER_BATCH_MAX
+            if is_kept:
+                is_rising = event.event_type is self._is_rising_type
+                new.append(Edge(self._number, event.timestamp_ns, is_rising))
+            if dropped := step - is_kept:
+                self.dropped_edges += dropped
+                self._dropped_at_ns = self._clock.now_ns()
+        self._edges += new
+        return new
+
+
+class RecordingLine:
+    """Output line that is high while a session is recorded.
+
+    Raises:
+        MissingExtraError: gpiod is not installed.
+        BusSetupError: the line is not there, in use, or forbidden.
+    """
+
+    def __init__(self, scene: SyncSection) -> None:
+        self.warning = ""
+        """Reason why the line may have another level; empty if it has the right one."""
+        with require_extra("gpio", "the recording line"):
+            from gpiod import LineSettings
+            from gpiod.line import Direction
+        assert scene.output_line is not None  # noqa: S101  # the caller has checked
+        self._line = scene.output_line
+        settings = LineSettings(direction=Direction.OUTPUT)  # low
+        self._request = _request_line(scene, self._line, settings)
+
+    def drive(self, *, high: bool) -> None:
+        """Drive the line; a failure is a warning."""
+        from gpiod.line import Value
+
+        try:
+            self._request.set_value(self._line, Value.ACTIVE if high else Value.INACTIVE)
+            self.warning = ""
+        except OSError as error:
+            self.warning = f"the recording line cannot be driven: {error.strerror or error}"
+
+    def close(self) -> None:
+        """Drive the line low and release it."""
+        self.drive(high=False)
+        with suppress(OSError):
+            self._request.release()

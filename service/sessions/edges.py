@@ -1,0 +1,112 @@
+"""Edges of a node's sync line as markers of its sessions.
+
+A session has every edge from its first to its last frame. The frames' journal has the edges, so a
+sealed session has each once, whatever was sent twice or was down meanwhile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import ValidationError
+
+from devices.frames import ArrayInfo, Edge
+from devices.scene.hardware_sections import SyncSection
+from service.sessions.inputs import SessionInputs
+from storage.clock.table import ClockTable
+from storage.schema import UNKNOWN_T_NS
+from storage.sessions.folder import Marker, Session
+
+EDGE_MARKERS_MAX = 10_000
+"""Most edges of a session that become markers, the first ones: an edge a second for hours."""
+
+
+class EdgeMarkers(NamedTuple):
+    """Edges of a session."""
+
+    markers: tuple[Marker, ...] = ()
+    problem: str | None = None
+    """Description of missing edges; None: none is known to be missing."""
+
+
+def read_sync_section(session: Session) -> SyncSection | None:
+    """Return the section of the session's scene; None without a sync input."""
+    try:
+        section = SyncSection.model_validate(session.scene_content.get("sync"))
+    except ValidationError:
+        return None
+    return section if section.input_line is not None else None
+
+
+def collect_edge_markers(inputs: SessionInputs) -> EdgeMarkers:
+    """Collect the edges of a session from its journals.
+
+    Raises:
+        FootTileError: a journal is damaged, or cannot be read.
+    """
+    section = read_sync_section(inputs.session)
+    if section is None:
+        return EdgeMarkers()
+    found: list[Marker] = []
+    lost, clock = 0, inputs.make_clock_table()
+    for span in inputs.find_part_spans():
+        part, journal = inputs.session.parts[span.number], inputs.journals[span.stream_id]
+        seq_last = journal.stored.last if part.seq_last is None else part.seq_last
+        begin_ns, end_ns = span.t_mono_ns
+        edges = sorted(
+            edge
+            for edge in set(journal.read_edges(part.seq_first, seq_last or 0))
+            if begin_ns <= edge.t_mono_ns <= end_ns
+        )
+        if edges:
+            lost += edges[-1].number - edges[0].number + 1 - len(edges)
+        found += make_edge_markers(edges, section, journal.info, clock, span.number)
+    problems = []
+    if lost:
+        problems.append(f"{lost} edges of the sync line are lost: too many at once, or with frames")
+    if len(found) > EDGE_MARKERS_MAX:
+        further = len(found) - EDGE_MARKERS_MAX
+        problems.append(
+            f"{further} edges of the sync line are no markers, beyond {EDGE_MARKERS_MAX}"
+        )
+    return EdgeMarkers(tuple(found[:EDGE_MARKERS_MAX]), "; ".join(problems) or None)
+
+
+def make_edge_markers(
+    edges: Sequence[Edge], section: SyncSection, info: ArrayInfo, clock: ClockTable, part: int
+) -> list[Marker]:
+    """Return edges of one stream as markers, in the server's time as far as that is known.
+
+    Args:
+        edges: edges of the stream.
+        section: section of the scene.
+        info: description of the stream's array.
+        clock: clock table.
+        part: a part of the stream in that table.
+    """
+    t_mono_ns = np.array([edge.t_mono_ns for edge in edges], dtype=np.int64)
+    t_ns = t_mono_ns + info.utc_offset_ns
+    parts = np.full(len(edges), part, dtype=np.uint16)
+    times = clock.compute_server_time_columns_or_unknown(t_mono_ns, t_ns, parts)
+    is_known = times["t_server_ns"] != UNKNOWN_T_NS
+    at_ns = np.where(is_known, times["t_server_ns"], t_ns).tolist()
+    clock_bound_ns = np.where(is_known, times["t_server_uncertainty_ns"], 0).tolist()
+    return [
+        Marker(
+            id=f"{info.stream_id}-{edge.number}",
+            label=_label_edge(edge, section),
+            t_ns=at_ns[row],
+            stream_id=info.stream_id,
+            t_mono_ns=edge.t_mono_ns,
+            bound_ns=section.bound_ns + clock_bound_ns[row],
+        )
+        for row, edge in enumerate(edges)
+    ]
+
+
+def _label_edge(edge: Edge, section: SyncSection) -> str:
+    if section.edge != "both":
+        return section.label
+    return f"{section.label} {'rising' if edge.is_rising else 'falling'}"

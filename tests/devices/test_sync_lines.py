@@ -1,0 +1,178 @@
+"""Sync lines on a chip of files, with the library's own types. No test has touched a pin."""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from devices.clock import VirtualClock
+from devices.errors import BusSetupError, MissingExtraError
+from devices.frames import Edge
+from devices.scene.hardware_sections import SyncSection
+from devices.sync_lines import EDGES_PER_BATCH_MAX, RecordingLine, SyncInput
+from tests.devices.array.gpio_chip import EMULATED_GPIOD, FileChip
+
+pytest.importorskip("gpiod", reason="sync lines need the extra `gpio`")
+
+
+@pytest.fixture
+def chip(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FileChip:
+    monkeypatch.delitem(sys.modules, "gpiod", raising=False)
+    monkeypatch.syspath_prepend(EMULATED_GPIOD)
+    return FileChip(tmp_path)
+
+
+class Kept:
+    """A sink that keeps what it is given, in order."""
+
+    def __init__(self) -> None:
+        self.given: list[Any] = []
+
+    def write_edges(self, edges: Any) -> None:
+        self.given += edges
+
+    def write_frame(self, frame: Any) -> None:
+        self.given.append(frame)
+
+
+class Line:
+    """An input line and its clock."""
+
+    def __init__(self, chip: FileChip, **keys: Any) -> None:
+        self.clock = VirtualClock()
+        self.input = SyncInput(
+            SyncSection(gpiochip=str(chip.path), input_line=17, **keys), self.clock
+        )
+        self.input.sink = self.kept = Kept()
+
+    def take(self, frame: str = "frame") -> tuple[Edge, ...]:
+        self.input.write_frame(frame)  # type: ignore[arg-type]
+        return self.input.take_batch()
+
+
+@pytest.fixture
+def line(chip: FileChip) -> Iterator[Line]:
+    found = Line(chip, edge="both")
+    yield found
+    found.input.close()
+
+
+def test_edges_come_with_their_stamps_before_the_frame_after_them(
+    chip: FileChip, line: Line
+) -> None:
+    chip.send_edge(100)
+    chip.send_edge(250, is_rising=False)
+    assert line.take() == (Edge(1, 100, True), Edge(2, 250, False))
+    assert line.take("another") == ()
+    chip.send_edge(300)
+    assert line.take() == (Edge(3, 300, True),)
+    assert line.kept.given == [
+        *(Edge(1, 100, True), Edge(2, 250, False), "frame", "another"),
+        *(Edge(3, 300, True), "frame"),
+    ]
+
+
+def test_only_the_edges_that_the_scene_names_count(chip: FileChip) -> None:
+    line = Line(chip, edge="falling")
+    for t_ns in (1, 2, 3):
+        chip.send_edge(t_ns, is_rising=t_ns != 2)
+    assert line.take() == (Edge(1, 2, False),)
+    line.input.close()
+
+
+def test_a_storm_is_bounded_counted_and_said_until_it_is_over(chip: FileChip, line: Line) -> None:
+    for t_ns in range(1000):
+        chip.send_edge(t_ns)
+    taken = line.take()
+    assert len(taken) == EDGES_PER_BATCH_MAX == len(line.kept.given) - 1
+    assert line.input.dropped_edges == 1000 - EDGES_PER_BATCH_MAX
+    assert "more than 64 edges in 25 ms" in line.input.warning
+    chip.send_edge(2000)
+    assert line.take() == (Edge(1001, 2000, True),), "the dropped ones are counted"
+    line.clock.sleep_until_ns(2_000_000_000)
+    assert line.input.warning == ""
+
+
+def test_edges_that_the_kernel_dropped_are_counted(chip: FileChip, line: Line) -> None:
+    chip.send_edge(1)
+    chip.send_edge(2, lost_before=7)
+    assert line.take() == (Edge(1, 1, True), Edge(9, 2, True))
+    assert line.input.dropped_edges == 7
+
+
+def test_a_line_that_goes_away_is_a_warning_and_is_requested_again(
+    chip: FileChip, line: Line
+) -> None:
+    chip.send_edge(1)
+    (chip.path / "line17").unlink()
+    assert line.take() == ()
+    assert "the sync line fails, and edges are lost" in line.input.warning
+    os.mkfifo(chip.path / "line17")
+    chip.send_edge(2)
+    assert line.take() == ()
+    line.clock.sleep_until_ns(1_500_000_000)
+    assert line.take() == ()
+    assert line.input.warning == ""
+    chip.send_edge(3)
+    assert line.take() == (Edge(1, 3, True),)
+    assert line.kept.given[-2:] == [Edge(1, 3, True), "frame"], "frames went on"
+
+
+@pytest.mark.parametrize("failure", [errno.ENOENT, errno.EACCES, errno.EBUSY])
+def test_a_line_that_cannot_be_had_is_said_at_the_start(
+    chip: FileChip, monkeypatch: pytest.MonkeyPatch, failure: int
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(failure, os.strerror(failure))
+
+    monkeypatch.setattr("gpiod.request_lines", refuse)
+    scene = SyncSection(gpiochip="/dev/gpiochip0", input_line=17, output_line=27)
+    for begin in (lambda: SyncInput(scene, VirtualClock()), lambda: RecordingLine(scene)):
+        with pytest.raises(BusSetupError, match=os.strerror(failure)) as caught:
+            begin()
+        assert caught.value.errno == failure
+        assert "Check [sync]" in caught.value.remedy
+
+
+def test_the_extra_is_named_without_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gpiod", None)
+    with pytest.raises(MissingExtraError, match=r"'foottile\[gpio\]'"):
+        SyncInput(SyncSection(input_line=17), VirtualClock())
+    with pytest.raises(MissingExtraError, match=r"'foottile\[gpio\]'"):
+        RecordingLine(SyncSection(output_line=17))
+
+
+def test_the_recording_line_is_low_at_first_and_in_the_end(chip: FileChip) -> None:
+    line = RecordingLine(SyncSection(gpiochip=str(chip.path), output_line=27))
+    assert (chip.path / "line27").read_text() == "0"
+    line.drive(high=True)
+    assert chip.is_high(27)
+    line.close()
+    assert not chip.is_high(27)
+
+
+def test_a_recording_line_that_fails_is_a_warning(
+    chip: FileChip, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = RecordingLine(SyncSection(gpiochip=str(chip.path), output_line=27))
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(line._request, "set_value", refuse)
+    line.drive(high=True)
+    assert "cannot be driven: Input/output error" in line.warning
+    monkeypatch.undo()
+    line.drive(high=True)
+    assert line.warning == ""
+
+
+def test_the_bound_contains_what_debouncing_delays() -> None:
+    assert SyncSection(input_line=1).bound_ns == 200_000
+    assert SyncSection(input_line=1, debounce_us=500).bound_ns == 10_700_000
