@@ -16,9 +16,12 @@ import pytest
 
 import foottile
 from devices.errors import StorageError
+from devices.frames import Edge
 from service.pull import pull_session
+from storage.schema import wire_schema
 from storage.sessions.metadata import read_existing_markers, write_markers
 from storage.verify.session import verify_session
+from storage.wire import encode_frames
 from tests.service.command import command
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
@@ -292,3 +295,35 @@ def test_an_export_names_missing_and_damaged_tables(
     assert (code, "markers.parquet" in text) == (1, True)
     assert not (tmp_path / "out.csv").exists()
     assert export(pulled, "--no-markers")[0] == 0
+
+
+def test_an_edge_is_shown_at_once_and_changed_only_once_it_is_sealed(shared: Running) -> None:
+    node = FakeNode(shared, name="edges")
+    node.utc_offset_ns -= HOUR_NS
+    node.greet(scene={"sync": {"input_line": 17, "label": "TTL"}})
+    node.say_clock(HOUR_NS, uncertainty_ns=1000)
+    node.deliver(50, alive=True)
+    session = node.record()
+    batch = node.frames(20, alive=True)
+    t_mono_ns = int(batch.t_mono_ns[7])
+    stamps = [Edge(2, t_mono_ns, True), Edge(1, int(batch.t_mono_ns[0]) - 1, True)]
+    payload = encode_frames(batch, wire_schema(node.info), stamps)
+    for _ in range(2):
+        node.socket.send(payload)
+    until(lambda: list_markers(session))
+    node.send(20, alive=True)
+    (edge,) = list_markers(session)
+    truth = t_mono_ns + node.info.utc_offset_ns + HOUR_NS
+    assert abs(edge["t_ns"] - truth) <= edge["bound_ns"] < 10_000_000
+    assert (edge["label"], edge["t_mono_ns"]) == ("TTL", t_mono_ns)
+    url = f"{session.url}/markers/{edge['id']}"
+    assert_refused(shared.http.patch(url, json={"t_ns": 5}), 409, "not sealed yet")
+    assert_refused(shared.http.delete(url), 409, "not sealed yet")
+    node.taken_in()
+    node.finish(session)
+    assert [marker["id"] for marker in list_markers(session)] == [edge["id"]]
+    assert verify_session(session.folder).problems == []
+    moved = content_of(shared.http.patch(url, json={"t_ns": edge["t_ns"] + 5}))
+    assert (moved["stream_id"], moved["t_mono_ns"], moved["bound_ns"]) == (None, None, None)
+    assert verify_session(session.folder).problems == []
+    node.close()

@@ -194,3 +194,30 @@ def test_notes_have_the_frame_of_each_mark_or_the_reason() -> None:
     assert (stone["label"], stone["part"], stone["seq"], stone["left_out"]) == ("stone", 0, 3, None)
     assert (early["label"], early["seq"]) == ("early", None)
     assert early["left_out"] == "no frame within a second of it"
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_an_edge_is_placed_by_its_nodes_clock(measured: bool) -> None:
+    person = at(3 * PERIOD_NS)
+    edges = [
+        Marker(
+            id=f"a-{n}", label="sync", t_ns=t_ns, stream_id=stream_id, t_mono_ns=t_ns, bound_ns=1
+        )
+        for n, (t_ns, stream_id) in enumerate(
+            [
+                (7 * PERIOD_NS + 1, "a"),
+                (GAP_NS + 31 * PERIOD_NS, "a"),
+                (GAP_NS + 60 * PERIOD_NS, "a"),
+                (5 * PERIOD_NS, "b"),
+            ]
+        )
+    ]
+    table = clock(measured=measured)
+    found = place_markers([*edges, *person], times(), table, Slice())
+    places = {m.marker.id: (m.frame, m.distance_ns) for m in found.markers}
+    assert places["a-0"] == ((0, 7), 1)
+    assert places["a-1"] == ((1, 1), 0)
+    assert places["a-2"] == ((1, 19), 11 * PERIOD_NS)
+    assert places["a-3"] == (None, None), "of a stream without frames here"
+    assert places[person[0].id] == (((0, 3), 0) if measured else (None, None))
+    assert {m.uncertainty_ns is not None for m in found.markers if m.frame} == {measured}
