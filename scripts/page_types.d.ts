@@ -69,6 +69,14 @@ type ChangeSession = {
   tags?: Array<string> | null;
 };
 
+type ChangeTrials = {
+  next_index?: number;
+  node?: string | null;
+  start_at_contact?: boolean;
+  stop_after_s?: number | null;
+  is_armed?: false;
+};
+
 type ClockSummary = {
   streams: Array<StreamSummary>;
 };
@@ -333,9 +341,10 @@ type PageHello = {
   problems: Array<string>;
   nodes: Array<NodeView>;
   recording: Array<SessionView>;
+  trials: TrialsView;
 };
 
-type PageMessage = PageHello | NodeChanged | SessionChanged | SessionDeleted | SessionsProgress | Heartbeat | FramesDropped | FrameMessage | Pong;
+type PageMessage = PageHello | NodeChanged | SessionChanged | SessionDeleted | SessionsProgress | TrialsChanged | Heartbeat | FramesDropped | FrameMessage | Pong;
 
 type Page_CalibrationSummaryView_ = {
   items: Array<CalibrationSummaryView>;
@@ -418,6 +427,9 @@ type RecentView = {
   grf_max_n: Array<number | null>;
   grf_lower_bound_max_n: Array<number | null>;
   tiles: RecentTilesView | null;
+};
+
+type RecordTrial = {
 };
 
 type RepeatabilityView = {
@@ -671,6 +683,47 @@ type TileView = {
   reference: boolean;
   range_kpa: [number, number] | null;
   full_scale_n: number | null;
+};
+
+type Trial = {
+  name: string;
+  tags?: Array<string>;
+  subject?: string;
+  notes?: string;
+};
+
+type TrialList = {
+  trials: Array<Trial>;
+};
+
+type TrialView = {
+  name: string;
+  tags: Array<string>;
+  subject: string;
+  notes: string;
+  state: "open" | "skipped" | "recording" | "pending" | "complete" | "lossy";
+  recordings: number;
+  sessions: Array<string>;
+};
+
+type TrialsChanged = {
+  type: "trials";
+  trials: TrialsView;
+};
+
+type TrialsView = {
+  trials: Array<TrialView>;
+  text: string;
+  next_index: number;
+  next_name: string | null;
+  last_index: number | null;
+  node: string | null;
+  start_at_contact: boolean;
+  stop_after_s: number | null;
+  is_armed: boolean;
+  take: string | null;
+  stop_at_t_ns: number | null;
+  problem: string | null;
 };
 
 type VerificationView = {

@@ -36,6 +36,7 @@ from service.api.routes import (
     login,
     metrics,
     nodes,
+    trials,
     weighings,
 )
 from service.api.routes.recordings import comparisons, integrity, overview, sessions, stances, takes
@@ -182,6 +183,7 @@ def _make_api_routes() -> tuple[BaseRoute, ...]:
         downloads.zip_router,  # before the route with a session's id
         sessions.router,
         takes.router,
+        trials.router,
         sessions.trash_router,
         downloads.router,
         takes.data_router,

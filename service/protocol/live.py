@@ -20,6 +20,7 @@ from storage.sessions.folder import Part
 LIVE_PATH = "/api/v1/live"
 CalibrationSource = Literal["node", "server"]
 AutoTareState = Literal["on", "paused", "off"]
+TrialState = Literal["open", "skipped", "recording", "pending", "complete", "lossy"]
 Policy = Literal["lossless", "drop_oldest", "latest"]
 
 
@@ -243,6 +244,42 @@ class SessionView(SessionProgress):
     )
 
 
+class TrialView(View):
+    """Row of the list of trials."""
+
+    name: str
+    tags: list[str]
+    subject: str
+    notes: str
+    state: TrialState = Field(
+        description="State of its latest recording; skipped: passed without one."
+    )
+    recordings: int = Field(description="Number of its recordings.")
+    sessions: list[str] = Field(description="Ids of the sessions of its latest recording.")
+
+
+class TrialsView(View):
+    """List of trials."""
+
+    trials: list[TrialView]
+    text: str = Field(description="The list as text.")
+    next_index: int = Field(description="Next row, from 0; the number of rows: none is left.")
+    next_name: str | None = Field(
+        description="Name of the next recording; a repeated trial has its number behind.",
+        examples=["mud 1 (2)"],
+    )
+    last_index: int | None = Field(description="Row that was recorded last.")
+    node: str | None = Field(description="Node to record; null: all connected ones.")
+    start_at_contact: bool
+    stop_after_s: float | None
+    is_armed: bool = Field(description="True: the next trial begins when a contact begins.")
+    take: str | None = Field(description="Id of the take of the running trial.")
+    stop_at_t_ns: int | None = Field(description="Time at which that is stopped, server's UTC.")
+    problem: PublicText | None = Field(
+        description="Reason why a trial was not started, or not on every node."
+    )
+
+
 class PageQuery(StrictModel):
     """Query of a page. Descriptions say what a refused value should have been."""
 
@@ -283,6 +320,7 @@ class PageHello(View):
     """Damaged files of the server."""
     nodes: list[NodeView]
     recording: list[SessionView]
+    trials: TrialsView
 
 
 class NodeChanged(View):
@@ -304,6 +342,13 @@ class SessionDeleted(View):
 
     type: Literal["deleted"] = "deleted"
     session_id: str
+
+
+class TrialsChanged(View):
+    """Present list of trials."""
+
+    type: Literal["trials"] = "trials"
+    trials: TrialsView
 
 
 class SessionsProgress(View):
@@ -420,6 +465,7 @@ PageMessage = Annotated[
     | SessionChanged
     | SessionDeleted
     | SessionsProgress
+    | TrialsChanged
     | Heartbeat
     | FramesDropped
     | FrameMessage

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -14,7 +14,15 @@ from devices.clock import server_utc_ns
 from devices.errors import FootTileError, StorageError
 from service.protocol.codec import LinkCloseCode
 from service.protocol.link import RetentionMessage
-from service.protocol.live import Heartbeat, NodeChanged, NodeView, SessionChanged, SessionProgress
+from service.protocol.live import (
+    Heartbeat,
+    NodeChanged,
+    NodeView,
+    SessionChanged,
+    SessionProgress,
+    TrialsChanged,
+    TrialsView,
+)
 from service.server.broadcast.broadcaster import Broadcaster
 from service.server.broadcast.views import (
     make_node_counts,
@@ -31,6 +39,7 @@ from service.server.recorder import Recorder
 from service.server.session_store import SessionStore, Trash, delete_and_count_bytes
 from service.server.streams import ServerStream
 from service.server.takes import TakeRecorder
+from service.server.trials import TrialRecorder
 from service.server.weighings import Weighings
 from service.sessions.overview import ComparisonSeriesCache
 from service.sessions.preview import SessionPreviews
@@ -124,6 +133,14 @@ class Server:
                 self.sessions, self.nodes, self._request_resend, unquantized=unquantized
             )
             self.takes = TakeRecorder(self.recorder, self.sessions, self.nodes)
+            self.trials = TrialRecorder(
+                data / "trials.json",
+                self.takes,
+                self.recorder,
+                self.sessions,
+                self.nodes,
+                self._notify_trials_changed,
+            )
             self.calibration_jobs = CalibrationJobs(self.sessions, self.calibrations)
             self.weighings = Weighings(
                 self.sessions, self.recorder, self.calibration_jobs, self.calibrations
@@ -138,6 +155,8 @@ class Server:
         self.links: dict[str, NodeLink] = {}
         self.sync_count, self.sync_total_s = 0, 0.0
         """Number and total time of successful syncs of journals since the start."""
+        self._last_trials: TrialsView | None = None
+        """List of trials that subscribers were sent last."""
         self._last_progress: dict[str, SessionProgress] = {}
         """Progress that subscribers were sent last, by session."""
         self._failures: dict[str, tuple[str, float]] = {}
@@ -161,6 +180,8 @@ class Server:
                     self.weighings.fail_if_stalled_or_interrupted(node, now_s)
             with self._isolate_errors("sessions"):
                 self.recorder.advance_unsealed_sessions()
+            with self._isolate_errors("trials"):
+                self.trials.advance()
             for link in list(self.links.values()):
                 self._update_retention(link)
             with self._isolate_errors("counts"):
@@ -243,6 +264,7 @@ class Server:
             *self.identities.problems,
             *self.sessions.problems,
             *self.calibrations.problems,
+            *self.trials.file_problems,
         ]
 
     def accept_replacement(self, node: str, fingerprint: str) -> None:
@@ -342,6 +364,21 @@ class Server:
             with self._isolate_errors(f"session {session.id}, its view"):
                 view = make_session_view(session, self.recorder)
                 self.broadcaster.queue_notice(SessionChanged(session=view))
+                if self.trials.is_in_list(session):
+                    self._notify_trials_changed()
+
+    def _notify_trials_changed(self, sessions: Sequence[Session] = ()) -> None:
+        """Send the list of trials, and the nodes of started or stopped sessions, to subscribers."""
+        for session in sessions:
+            node = self.nodes.find(session.node)
+            if node is not None:
+                self.notify_node_changed(node)
+        if self.broadcaster.subscriber_count:
+            with self._isolate_errors("list of trials, its view"):
+                view = self.trials.make_view()
+                if view != self._last_trials:
+                    self._last_trials = view
+                    self.broadcaster.queue_notice(TrialsChanged(trials=view))
 
     def _send_heartbeat(self) -> None:
         if not self.broadcaster.subscriber_count:

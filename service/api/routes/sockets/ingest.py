@@ -225,6 +225,7 @@ async def _receive_messages(socket: WebSocket, server: Server, link: NodeLink) -
             server.broadcaster.add_to_history_and_updates(node, due)
             server.live_feeds.add_to_existing_buffer(node, due)
             server.weighings.feed_frames(node, due)
+            server.trials.start_at_contact(node, due)
             if node.estimator.live.tare_in_use_unless_lost is not tare_before:
                 server.notify_node_changed(node)
             continue

@@ -242,6 +242,7 @@ def _make_hello(server: Server, node: str | None) -> PageHello:
             for session in sorted(server.sessions.list_unsealed(node), key=start_key, reverse=True)
             if session.state == "recording"
         ],
+        trials=server.trials.make_view(),
     )
 
 

@@ -1,0 +1,381 @@
+"""List of trials: rows that are recorded one after the other, by a press or by the foot's contact.
+
+List, place and the end of the running trial are one file of the data folder, so that they survive
+a restart; that the server waits for a contact does not.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import AfterValidator, Field, StringConstraints, ValidationError
+
+from devices.clock import server_utc_ns
+from devices.errors import FileFormatError, FootTileError, StateError, StorageError, UsageError
+from devices.types import StrictModel, check_user_name, check_user_text
+from service.estimation import CONTACT_UNKNOWN
+from service.protocol.live import TrialState, TrialsView, TrialView
+from service.server.estimates.node_estimator import EstimatedBatch
+from service.server.node import ServerNode
+from service.server.nodes import NodeRegistry
+from service.server.recorder import Recorder
+from service.server.session_store import SessionStore
+from service.server.takes import Take, TakeRecorder
+from storage.documents import read_document, write_document
+from storage.durable_files import try_set_aside_and_describe
+from storage.sessions.folder import IdempotencyRecord, Session
+
+log = logging.getLogger("foottile.trials")
+
+TRIALS_MAX = 1000
+STOP_AFTER_S_MAX = 3600
+PRE_ROLL_S = 1.0
+"""Pre-roll of a trial that a contact starts."""
+_NAME_LENGTH_MAX = 200
+_RULE = "`name; tag, tag`, or names with commas between"
+
+
+def _check_trial_name(name: str) -> str:
+    if ";" in name or name.startswith("#"):
+        raise ValueError("has a `;`, or begins with `#`")
+    return check_user_name(name)
+
+
+def _check_trial_tag(tag: str) -> str:
+    if "," in tag:
+        raise ValueError("has a comma")
+    return check_user_name(tag)
+
+
+_TrialName = Annotated[
+    str,
+    StringConstraints(strip_whitespace=True, min_length=1, max_length=_NAME_LENGTH_MAX),
+    AfterValidator(_check_trial_name),
+]
+_TrialTag = Annotated[
+    str,
+    StringConstraints(strip_whitespace=True, min_length=1, max_length=100),
+    AfterValidator(_check_trial_tag),
+]
+
+
+class Trial(StrictModel):
+    """Row of the list: description of the sessions to record."""
+
+    name: _TrialName = Field(examples=["mud 1"])
+    tags: Annotated[tuple[_TrialTag, ...], Field(max_length=50)] = ()
+    subject: Annotated[str, Field(max_length=200), AfterValidator(check_user_name)] = ""
+    notes: Annotated[str, Field(max_length=10_000), AfterValidator(check_user_text)] = ""
+
+
+class _StoredTrial(Trial):
+    takes: tuple[str, ...] = ()
+    """Takes in which it was recorded, the latest last."""
+
+
+class _StoredTrials(StrictModel):
+    trials: tuple[_StoredTrial, ...] = ()
+    next_index: int = 0
+    node: str | None = None
+    start_at_contact: bool = False
+    stop_after_s: float | None = None
+    take: str | None = None
+    """Latest take."""
+    stop_at_t_ns: int | None = None
+    """Time at which that take is stopped, server's UTC."""
+
+
+def parse_trials(text: str) -> tuple[Trial, ...]:
+    """Parse a text: a trial a line, `name; tag, tag`; a line without `;` may name several trials.
+
+    Empty lines, and lines that begin with `#`, are ignored.
+
+    Raises:
+        UsageError: a line is no trial.
+    """
+    trials: list[Trial] = []
+    for number, line in enumerate(text.removeprefix("\ufeff").replace("\r\n", "\n").split("\n"), 1):
+        if not line.strip() or line.strip().startswith("#"):
+            continue
+        names, has_tags, tags = line.partition(";")
+        try:
+            trials += [
+                Trial(name=name, tags=tuple(tag for tag in tags.split(",") if tag.strip()))
+                for name in ([names] if has_tags else names.split(","))
+            ]
+        except ValidationError as error:
+            first = error.errors()[0]
+            raise UsageError(
+                f"{line.strip()[:80]!r} is no trial: {first['loc'][0]}: {first['msg']}",
+                where=f"line {number}",
+                expected=_RULE,
+            ) from error
+    return tuple(trials)
+
+
+def format_trials(trials: Sequence[Trial]) -> str:
+    """Return the text that `parse_trials` reads; subjects and notes are not in it."""
+    return "".join(
+        f"{one.name}; {', '.join(one.tags)}".rstrip() + "\n"
+        if one.tags or "," in one.name
+        else f"{one.name}\n"
+        for one in trials
+    )
+
+
+class TrialRecorder:
+    """List of trials, and the recording of its rows.
+
+    Args:
+        path: file of the list.
+        takes: starts and stops the takes.
+        recorder: knows the sessions' ledgers.
+        store: all sessions.
+        nodes: all nodes.
+        on_change: called after a change, with the sessions that were started or stopped.
+
+    Raises:
+        StorageError: the file cannot be read now.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        takes: TakeRecorder,
+        recorder: Recorder,
+        store: SessionStore,
+        nodes: NodeRegistry,
+        on_change: Callable[[Sequence[Session]], None],
+    ) -> None:
+        self._path, self._takes, self._recorder = path, takes, recorder
+        self._store, self._nodes, self._on_change = store, nodes, on_change
+        self._list = _StoredTrials()
+        self._is_armed = False
+        self._armed_by: IdempotencyRecord | None = None
+        self._contacts: dict[str, int] = {}
+        """Last known contact since it was armed, by node."""
+        self._problem: str | None = None
+        self.file_problems: list[str] = []
+        """Damage found, and the consequence, as text."""
+        try:
+            self._list = read_document(path, _StoredTrials)
+        except FileNotFoundError:
+            pass
+        except FileFormatError as error:
+            self.file_problems = [f"list of trials: {try_set_aside_and_describe(path, error)}"]
+
+    def set_trials(self, trials: Sequence[Trial]) -> None:
+        """Replace the list; equal rows at its beginning keep their recordings and the place.
+
+        Raises:
+            UsageError: it is too long.
+            StorageError: it cannot be saved; the former one stays.
+        """
+        if len(trials) > TRIALS_MAX:
+            raise UsageError(f"the list has {len(trials)} trials", expected=f"at most {TRIALS_MAX}")
+        rows = [_StoredTrial(**one.model_dump()) for one in trials]
+        kept = 0
+        for i, (old, new) in enumerate(zip(self._list.trials, rows, strict=False)):
+            if old.model_copy(update={"takes": ()}) != new:
+                break
+            rows[i], kept = old, i + 1
+        self._save(trials=tuple(rows), next_index=min(kept, self._list.next_index))
+        self._on_change(())
+
+    def change(self, changes: dict[str, object], *, disarm: bool = False) -> None:
+        """Change settings or the place, and stop waiting for a contact.
+
+        Args:
+            changes: values by field of the stored list.
+            disarm: True: do not wait for a contact any longer.
+
+        Raises:
+            UnknownError: the node does not exist.
+            UsageError: the place is not in the list.
+            StorageError: it cannot be saved; nothing has changed then.
+        """
+        if isinstance(node := changes.get("node"), str):
+            self._nodes.get(node)
+        if int(str(changes.get("next_index", 0))) > len(self._list.trials):
+            raise UsageError(
+                f"there is no row {changes['next_index']}",
+                expected=f"0 to {len(self._list.trials)}",
+            )
+        self._save(**changes)
+        self._is_armed &= not (disarm or changes.get("start_at_contact") is False)
+        self._on_change(())
+
+    def record_next(self, request: IdempotencyRecord | None = None) -> None:
+        """Record the next row, or wait for a contact to do so; a repeated request does nothing.
+
+        Raises:
+            StateError: no row is left, a trial is being recorded, or no node can be recorded.
+            UsageError: the key came with another request before.
+        """
+        if self._store.find_by_idempotency_key(request):
+            return
+        self._check_can_record()
+        self._problem = None
+        if not self._list.start_at_contact:
+            self._start(0.0, request)
+            return
+        self._is_armed, self._armed_by = True, request
+        self._contacts.clear()
+        self._on_change(())
+
+    def start_at_contact(self, node: ServerNode, batches: Sequence[EstimatedBatch]) -> None:
+        """Start the next row if it waits for a contact and one begins in these frames."""
+        if not self._is_armed or self._list.node not in (None, node.name):
+            return
+        for frames, columns in batches:
+            contacts = columns.get("contact", np.empty(0))
+            known = contacts[contacts != CONTACT_UNKNOWN]
+            if not len(known):
+                continue
+            before = self._contacts.get(node.name, int(known[0]))
+            self._contacts[node.name] = int(known[-1])
+            if np.any(np.diff(np.concatenate([[before], known]).astype(int)) > 0):
+                age_s = ((node.last_t_ns or 0) - int(frames.t_ns[0])) * 1e-9
+                try:
+                    self._check_can_record()
+                    self._start(PRE_ROLL_S + age_s, self._armed_by)
+                except FootTileError as error:
+                    self._disarm(str(error))
+                return
+
+    def advance(self) -> None:
+        """Stop the running trial when its time is over; stop waiting while no node is connected."""
+        stored = self._list
+        if stored.stop_at_t_ns is not None and server_utc_ns() >= stored.stop_at_t_ns:
+            running = self._list_running()
+            if running:
+                self._takes.stop_take(str(stored.take))
+            self._save(stop_at_t_ns=None)
+            self._on_change(running)
+        if self._is_armed and not any(
+            node.is_connected for node in self._nodes if stored.node in (None, node.name)
+        ):
+            self._disarm("no node is connected")
+
+    def make_view(self) -> TrialsView:
+        """Return the present list, for answers and subscribers."""
+        stored = self._list
+        wanted = {row.takes[-1]: i for i, row in enumerate(stored.trials) if row.takes}
+        sessions: dict[int, list[Session]] = {}
+        for session in self._store.iterate_newest_first() if wanted else ():
+            if (i := wanted.get(session.take or "")) is not None:
+                sessions.setdefault(i, []).append(session)
+        is_running = bool(self._list_running())
+        return TrialsView(
+            trials=[
+                self._make_trial_view(i, row, sessions.get(i, []))
+                for i, row in enumerate(stored.trials)
+            ],
+            text=format_trials(stored.trials),
+            next_index=stored.next_index,
+            next_name=self._next_name,
+            last_index=wanted.get(stored.take or ""),
+            node=stored.node,
+            start_at_contact=stored.start_at_contact,
+            stop_after_s=stored.stop_after_s,
+            is_armed=self._is_armed,
+            take=stored.take if is_running else None,
+            stop_at_t_ns=stored.stop_at_t_ns if is_running else None,
+            problem=self._problem,
+        )
+
+    def is_in_list(self, session: Session) -> bool:
+        """Return whether a session is a trial of the list."""
+        return session.take is not None and any(
+            session.take in row.takes for row in self._list.trials
+        )
+
+    def _make_trial_view(self, i: int, row: _StoredTrial, sessions: list[Session]) -> TrialView:
+        states = {session.state for session in sessions}
+        state: TrialState
+        if not sessions:
+            state = "skipped" if i < self._list.next_index else "open"
+        elif "recording" in states:
+            state = "recording"
+        elif states != {"sealed"}:
+            state = "pending"
+        else:
+            whole = all(self._recorder.compute_ledger(s).completeness is True for s in sessions)
+            state = "complete" if whole else "lossy"
+        return TrialView(
+            **row.model_dump(exclude={"takes"}),
+            state=state,
+            recordings=len(row.takes),
+            sessions=[session.id for session in sessions],
+        )
+
+    @property
+    def _next_name(self) -> str | None:
+        if self._list.next_index >= len(self._list.trials):
+            return None
+        row = self._list.trials[self._list.next_index]
+        suffix = f" ({len(row.takes) + 1})" if row.takes else ""
+        return row.name[: _NAME_LENGTH_MAX - len(suffix)] + suffix
+
+    def _list_running(self) -> list[Session]:
+        take = self._list.take
+        return [
+            one
+            for one in self._store.list_unsealed()
+            if take is not None and one.take == take and one.state == "recording"
+        ]
+
+    def _check_can_record(self) -> None:
+        if running := self._list_running():
+            raise StateError(f"“{running[0].name}” is being recorded", remedy="Stop it first")
+        if self._next_name is None:
+            raise StateError(
+                "no trial is left in the list", remedy="Repeat one, or set another list"
+            )
+
+    def _start(self, pre_roll_s: float, request: IdempotencyRecord | None) -> None:
+        stored, place = self._list, self._list.next_index
+        row = stored.trials[place]
+        take: Take = self._takes.start_take_where_possible(
+            str(self._next_name),
+            None if stored.node is None else [stored.node],
+            pre_roll_s=pre_roll_s,
+            subject=row.subject,
+            notes=row.notes,
+            tags=row.tags,
+            request=request,
+        )
+        self._is_armed = False
+        failed = [f"{node} is not recorded: {why}" for node, why in take.errors_by_node.items()]
+        self._problem = ". ".join(failed) or None
+        rows = list(stored.trials)
+        rows[place] = row.model_copy(update={"takes": (*row.takes, take.id)})
+        left = (i for i in range(place + 1, len(rows)) if not rows[i].takes)
+        stop_ns = None if stored.stop_after_s is None else round(stored.stop_after_s * 1e9)
+        changes = {
+            "trials": tuple(rows),
+            "next_index": next(left, len(rows)),
+            "take": take.id,
+            "stop_at_t_ns": None if stop_ns is None else server_utc_ns() + stop_ns,
+        }
+        try:
+            self._save(**changes)
+        except StorageError as error:  # the trial is being recorded, whatever the file says
+            self._list = stored.model_copy(update=changes)
+            self._problem = f"the list of trials is not saved: {error}"
+        self._on_change(take.sessions)
+
+    def _disarm(self, why: str) -> None:
+        self._is_armed = False
+        self._problem = f"Does not wait for contact any longer: {why}"
+        log.warning("%s", self._problem)
+        self._on_change(())
+
+    def _save(self, **changes: object) -> None:
+        changed = self._list.model_copy(update=changes)
+        write_document(self._path, changed)
+        self._list = changed

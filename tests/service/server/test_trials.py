@@ -1,0 +1,170 @@
+"""Laws of the list of trials: its text, its order, and its place."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from devices.errors import FootTileError, StateError, UsageError
+from service.server.takes import Take
+from service.server.trials import Trial, TrialRecorder, format_trials, parse_trials
+
+_TEXT = st.text(
+    st.characters(codec="utf-8", exclude_categories=("Cc", "Cs")), min_size=1, max_size=12
+)
+
+
+def _make_trial_or_none(name: str, tags: list[str]) -> Trial | None:
+    try:
+        return Trial(name=name, tags=tuple(tags))
+    except ValidationError:
+        return None
+
+
+TRIALS = st.builds(_make_trial_or_none, _TEXT, st.lists(_TEXT, max_size=3)).filter(bool)
+
+
+class Stub:
+    """What a list of trials needs of a server."""
+
+    def __init__(self) -> None:
+        self.numbers = itertools.count()
+        self.sessions: list[Any] = []
+        self.refuses = False
+
+    def start_take_where_possible(self, name: str, nodes: object, **how: Any) -> Take:
+        if self.refuses:
+            raise StateError("no node is connected")
+        take = Take(f"{next(self.numbers):012x}")
+        session = SimpleNamespace(id=take.id, name=name, node="bench", take=take.id)
+        session.state = "recording"
+        self.sessions.append(session)
+        return Take(take.id, cast("Any", [session]))
+
+    def stop(self) -> None:
+        for session in self.sessions:
+            session.state = "sealed"
+
+    def make(self, path: Path) -> TrialRecorder:
+        store = SimpleNamespace(
+            list_unsealed=lambda: [s for s in self.sessions if s.state != "sealed"],
+            iterate_newest_first=lambda: iter(self.sessions[::-1]),
+            find_by_idempotency_key=lambda _: [],
+        )
+        ledger = SimpleNamespace(completeness=True)
+        recorder = SimpleNamespace(compute_ledger=lambda _: ledger)
+        make: Any = TrialRecorder
+        made: TrialRecorder = make(path, self, recorder, store, None, lambda _: None)
+        return made
+
+
+@given(st.lists(TRIALS, max_size=20))
+def test_the_text_of_a_list_is_parsed_to_the_list(trials: list[Trial]) -> None:
+    assert parse_trials(format_trials(trials)) == tuple(trials)
+
+
+def test_a_line_is_a_name_with_tags_or_names_with_commas_between() -> None:
+    text = "# day 3\r\n\nmud 1; wet, deep\n mud 1, mud 2, plate 1\nleft, slow;\n"
+    assert [(one.name, one.tags) for one in parse_trials(text)] == [
+        ("mud 1", ("wet", "deep")),
+        ("mud 1", ()),
+        ("mud 2", ()),
+        ("plate 1", ()),
+        ("left, slow", ()),
+    ]
+
+
+@pytest.mark.parametrize(
+    "line", ["; wet", "a,, b", "a\tb", "a; b; c\x07", "x" * 201, "a; " + "t" * 101, "\u202ea"]
+)
+def test_a_bad_line_is_refused_with_its_number(line: str) -> None:
+    with pytest.raises(UsageError, match="line 3") as found:
+        parse_trials(f"good\n\n{line}\n")
+    assert "name; tag, tag" in str(found.value)
+
+
+@given(
+    count=st.integers(1, 6),
+    steps=st.lists(
+        st.one_of(
+            st.sampled_from(["record", "fail", "skip", "repeat", "reopen"]), st.integers(0, 6)
+        )
+    ),
+)
+def test_no_order_of_steps_loses_a_row_and_only_a_success_advances(
+    tmp_path_factory: pytest.TempPathFactory, count: int, steps: list[str | int]
+) -> None:
+    path = tmp_path_factory.mktemp("trials") / "trials.json"
+    stub = Stub()
+    trials = stub.make(path)
+    names = [f"trial {i}" for i in range(count)]
+    trials.set_trials([Trial(name=name) for name in names])
+    recorded = [0] * count
+    for step in steps:
+        before = trials.make_view()
+        place = before.next_index
+        stub.refuses = step == "fail"
+        if step in ("record", "fail"):
+            if place == count or step == "fail":
+                with pytest.raises(StateError):
+                    trials.record_next()
+                assert trials.make_view() == before
+                continue
+            trials.record_next()
+            recorded[place] += 1
+            number = f" ({recorded[place]})" if recorded[place] > 1 else ""
+            assert stub.sessions[-1].name == names[place] + number
+            after = trials.make_view()
+            assert (after.last_index, after.trials[place].state) == (place, "recording")
+            assert place < after.next_index <= count
+            with pytest.raises(StateError, match="is being recorded"):
+                trials.record_next()
+            stub.stop()
+        elif step == "reopen":
+            trials = stub.make(path)
+            assert trials.make_view() == before
+        else:
+            wanted = {"skip": place + 1, "repeat": before.last_index or 0}.get(str(step), step)
+            try:
+                trials.change({"next_index": wanted})
+            except FootTileError:
+                assert int(str(wanted)) > count
+            else:
+                assert trials.make_view().next_index == wanted
+        view = trials.make_view()
+        assert [row.name for row in view.trials] == names
+        assert [row.recordings for row in view.trials] == recorded
+        for i, row in enumerate(view.trials):
+            assert (row.state == "complete") == (recorded[i] > 0)
+            assert row.state != "skipped" or i < view.next_index
+
+
+def test_a_longer_list_keeps_what_was_recorded(tmp_path: Path) -> None:
+    stub = Stub()
+    trials = stub.make(tmp_path / "trials.json")
+    trials.set_trials(parse_trials("a, b"))
+    trials.record_next()
+    stub.stop()
+    trials.set_trials(parse_trials("a, b, c"))
+    view = trials.make_view()
+    assert (view.next_name, [row.recordings for row in view.trials]) == ("b", [1, 0, 0])
+    trials.set_trials(parse_trials("b, a"))
+    assert (trials.make_view().next_name, trials.make_view().last_index) == ("b", None)
+    with pytest.raises(UsageError, match="at most 1000"):
+        trials.set_trials([Trial(name="x")] * 1001)
+
+
+def test_a_damaged_file_is_set_aside_and_named(tmp_path: Path) -> None:
+    path = tmp_path / "trials.json"
+    Stub().make(path).set_trials(parse_trials("a"))
+    path.write_text(path.read_text().replace('"a"', '"b"'))
+    trials = Stub().make(path)
+    assert trials.make_view().trials == []
+    assert "list of trials" in trials.file_problems[0]
