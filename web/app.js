@@ -9,6 +9,8 @@
 // A panel is a class that owns one element of index.html. This module creates it and passes server
 // messages to it. Panels do not import each other. No build step, no file from another host.
 
+import { Absence } from "./common/absence.js";
+import { addDeviceMenu } from "./common/device.js";
 import { Link } from "./common/link.js";
 import { LOSSES_HELP } from "./common/losses.js";
 import { look } from "./common/login.js";
@@ -50,6 +52,8 @@ const state = {
 };
 
 inSunlight();
+const absence = new Absence();
+const alerts = addDeviceMenu();
 const framePace = new FramePace();
 const pace = new Pace(draw);
 const redraw = () => {
@@ -114,7 +118,8 @@ const handlers = {
   },
 };
 
-const link = new Link({ handlers });
+const watchers = [absence, alerts].map((one) => (message) => one.watch(message));
+const link = new Link({ handlers, watchers });
 const status = new Status(link);
 
 function receiveFrame(frame) {

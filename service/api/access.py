@@ -84,7 +84,8 @@ clients send it, and the client has used it before the request arrives here.
 """
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
 _DEFAULT_HEADERS = {
-    "content-security-policy": "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'",
+    "content-security-policy": "default-src 'self'; img-src 'self' data:; "
+    "media-src data:; frame-ancestors 'none'",
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
     "cache-control": "no-cache",  # revalidate: after an update the page must be new

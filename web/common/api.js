@@ -60,8 +60,14 @@ export const endWeighing = (node, said) => call("DELETE", `/nodes/${id(node)}/we
 export const undoTare = (node, tare) => call("DELETE", `/nodes/${id(node)}/tares/${id(tare)}`);
 /** @type {(node: string, name: string) => Promise<SessionView>} */
 export const startSession = (node, name) => call("POST", "/sessions", { body: { node, name } });
+/** Ids of sessions and takes that this page has stopped. @type {Set<string>} */
+export const ownStops = new Set();
+function stop(kind, one) {
+  ownStops.add(one);
+  return call("POST", `/${kind}/${id(one)}/stop`);
+}
 /** @type {(session: string) => Promise<SessionView>} */
-export const stopSession = (session) => call("POST", `/sessions/${id(session)}/stop`);
+export const stopSession = (session) => stop("sessions", session);
 /** @type {(session: string, marker: object) => Promise<MarkerView>} */
 export const addMarker = (session, marker) => call("POST", `/sessions/${id(session)}/markers`, { body: marker });
 /** @type {(name: string) => Promise<TakeView>} */
@@ -69,7 +75,7 @@ export const startTake = (name) => call("POST", "/takes", { body: { name } });
 /** @type {(take: string) => Promise<TakeView>} */
 export const getTake = (take) => call("GET", `/takes/${id(take)}`);
 /** @type {(take: string) => Promise<TakeView>} */
-export const stopTake = (take) => call("POST", `/takes/${id(take)}/stop`);
+export const stopTake = (take) => stop("takes", take);
 /** @type {(take: string, marker: object) => Promise<TakeView>} */
 export const addTakeMarker = (take, marker) => call("POST", `/takes/${id(take)}/markers`, { body: marker });
 /** @type {(session: string) => Promise<SessionView>} */
@@ -112,7 +118,7 @@ export const listTrash = () => call("GET", "/trash");
 /** @type {(session: string) => Promise<SessionView>} */
 export const restoreSession = (session) => call("POST", `/trash/${id(session)}/restore`);
 export const emptyTrash = () => call("DELETE", "/trash");
-/** @type {(query: {limit: number, cursor?: string, q?: string, complete?: string, node?: string}) => Promise<SessionPage>} */
+/** @type {(query: {limit: number, cursor?: string, q?: string, complete?: string, node?: string, from?: string}) => Promise<SessionPage>} */
 export const listSessions = (query) => call("GET", `/sessions?${encoded(query)}`);
 export const zipAddress = (ids) => `${PREFIX}/sessions/zip?ids=${ids.map(id).join(",")}`;
 export const listFormats = () => call("GET", "/formats");

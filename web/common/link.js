@@ -10,17 +10,20 @@ const PING_EVERY_MS = 1000;
 const BLOCKED_AFTER = 3; // failed attempts while HTTP works
 const BLOCKED = "the server responds, but a proxy or filter may block WebSockets";
 const SILENT_AFTER_MS = 5000; // a heartbeat is due each second
+const STALE_AFTER_MS = 2000; // after sleep: the socket may be dead, and a new one costs little
 
 /** @typedef {{[T in PageMessage["type"]]?: (message: Extract<PageMessage, {type: T}>) => void}} Handlers */
 
 /** Live connection to the server. */
 export class Link {
   /**
-   * `handlers`: by type of message; others are ignored. `onChange()` at open and close; `rateHz`: of frames.
-   * @param {{handlers: Handlers, onChange?: () => void, rateHz?: number}} how
+   * `handlers`: by type of message; others are ignored. `watchers` get every message before them. `onChange()` at open
+   * and close; `rateHz`: of frames.
+   * @param {{handlers: Handlers, watchers?: ((message: PageMessage) => void)[], onChange?: () => void, rateHz?: number}} how
    */
-  constructor({ handlers, onChange = () => {}, rateHz = 30 }) {
+  constructor({ handlers, watchers = [], onChange = () => {}, rateHz = 30 }) {
     this.rateHz = rateHz;
+    this.watchers = watchers;
     this.handlers = handlers;
     this.onChange = onChange;
     this.serverAheadMs = 0;
@@ -35,12 +38,16 @@ export class Link {
     this.failures = 0; // consecutive failed attempts
     this.software = null; // version at the first connection
     logInFromUrl().finally(() => this.connect());
-    setInterval(() => this.ping(), PING_EVERY_MS);
+    let tickMs = Date.now();
+    setInterval(() => {
+      if (Date.now() - tickMs > STALE_AFTER_MS + PING_EVERY_MS) this.wake(); // the timer slept
+      tickMs = Date.now();
+      this.ping();
+    }, PING_EVERY_MS);
     // After sleep or loss of the network reconnect at once.
-    addEventListener("online", () => this.reconnectNow());
-    document.addEventListener("visibilitychange", () => document.hidden || this.reconnectNow());
-    // A page restored from the browser's cache may have a dead socket.
-    addEventListener("pageshow", (event) => event.persisted && this.lost("page restored"));
+    addEventListener("online", () => this.wake());
+    document.addEventListener("visibilitychange", () => document.hidden || this.wake());
+    addEventListener("pageshow", () => this.wake());
   }
 
   async connect() {
@@ -51,12 +58,12 @@ export class Link {
     const socket = new WebSocket(`${scheme}://${location.host}/api/v1/live?rate_hz=${this.rateHz}`, "foottile.v1");
     this.socket = socket;
     this.startedMs = performance.now();
-    this.receivedMs = this.startedMs;
+    this.note();
     socket.onopen = () => {
       if (socket !== this.socket) return;
       this.open = true;
       this.failures = 0;
-      this.receivedMs = performance.now();
+      this.note();
       this.unansweredSinceMs = null;
       this.onChange();
       this.ping();
@@ -69,8 +76,15 @@ export class Link {
     };
   }
 
-  receive(data) {
+  /** Store the time of a sign of life. */
+  note() {
     this.receivedMs = performance.now();
+    this.receivedDateMs = Date.now();
+  }
+
+  receive(data) {
+    if (Date.now() - this.receivedDateMs > SILENT_AFTER_MS) return this.wake(); // messages from before a sleep
+    this.note();
     let message;
     try {
       message = JSON.parse(data);
@@ -95,6 +109,7 @@ export class Link {
       // Sent half a round trip ago.
       this.serverAheadMs = message.t_ns / 1e6 + (this.roundTripMs ?? 0) / 2 - Date.now();
     }
+    for (const watch of this.watchers) watch(message);
     // Types of a newer server are ignored.
     if (Object.hasOwn(this.handlers, message.type)) this.handlers[message.type](message);
   }
@@ -149,8 +164,13 @@ export class Link {
     this.onChange();
   }
 
-  reconnectNow() {
-    if (this.retry !== null && !this.socket) this.connect();
+  /** Reconnect at once if the socket is missing or stale; some clocks stand still during sleep, the date does not. */
+  wake() {
+    const silentMs = Math.max(performance.now() - this.receivedMs, Date.now() - this.receivedDateMs);
+    if (this.socket && silentMs > STALE_AFTER_MS) this.lost("no messages");
+    if (this.retry === null || this.socket) return;
+    this.waitS = FIRST_WAIT_S;
+    this.connect();
   }
 
   /** True if a ping is unanswered for more than a second. */

@@ -35,8 +35,9 @@ export function closeMenu({ refocus = false } = {}) {
 function openMenu(button, label, items) {
   const menu = el("div", { cls: "menu", role: "menu", "aria-label": label }, ...items);
   for (const item of items) {
-    item.setAttribute("role", "menuitem");
     item.tabIndex = -1;
+    if (item.getAttribute("role") === "menuitemcheckbox") continue; // its state is read before the menu is closed
+    item.setAttribute("role", "menuitem");
     item.addEventListener("click", () => closeMenu({ refocus: true }));
   }
   menu.addEventListener("keydown", (event) => pressKey(event, items));

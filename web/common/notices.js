@@ -15,7 +15,7 @@ const NOTICES_MAX = 2;
 export function notice(text, { bad = false, press = null, stays = bad, about = [] } = {}) {
   const box = byId("notices");
   const close = el("button", { type: "button", cls: "close", text: "×", "aria-label": "Dismiss" });
-  const item = el("p", { cls: bad ? "notice bad" : "notice", "data-about": about.join(" ") }, el("span", { text: bad ? `Not done: ${text}` : text }));
+  const item = el("p", { cls: bad ? "notice bad" : "notice", "data-about": about.join(" "), "data-stays": stays }, el("span", { text: bad ? `Not done: ${text}` : text }));
   if (press) {
     const button = el("button", { type: "button", cls: "small", text: press[0] });
     button.addEventListener("click", () => { item.remove(); press[1](); });
@@ -26,14 +26,17 @@ export function notice(text, { bad = false, press = null, stays = bad, about = [
   // A refusal stays until it is dismissed or replaced.
   for (const old of box.querySelectorAll(".bad")) old.remove();
   box.append(item);
-  while (box.children.length > NOTICES_MAX) box.firstElementChild.remove();
+  while (box.children.length > NOTICES_MAX) (box.querySelector('[data-stays="false"]:not(:last-child)') ?? box.firstElementChild).remove();
   if (!stays) setTimeout(() => item.remove(), press ? WITH_BUTTON_MS : SHOWN_MS);
 }
 
-/** Remove notices about an id that no longer hold. @param {string} id */
-export function withdraw(id) {
-  byId("notices").querySelector(`[data-about~="${CSS.escape(id)}"]`)?.remove();
-}
+const find = (id) => byId("notices").querySelector(`[data-about~="${CSS.escape(id)}"]`);
+
+/** Return true while a notice about an id is shown. @param {string} id */
+export const isShown = (id) => find(id) !== null;
+
+/** Remove a notice about an id that no longer holds. @param {string} id */
+export const withdraw = (id) => find(id)?.remove();
 
 /** Show a refusal; rethrow any other error, for guard.js. @param {unknown} error */
 export function showRefusal(error) {

@@ -1,5 +1,6 @@
 // Sunlight mode: highest contrast, stored per device, for all pages.
 
+import { isChosen, storeChoice } from "./choice.js";
 import { byId } from "./text.js";
 
 const KEY = "foottile.sunlight";
@@ -7,8 +8,7 @@ const KEY = "foottile.sunlight";
 /** Apply the stored mode and bind its button. */
 export function inSunlight() {
   const button = byId("sun");
-  let chosen = false;
-  try { chosen = localStorage.getItem(KEY) === "true"; } catch { /* private window */ }
+  let chosen = isChosen(KEY);
   const show = () => {
     document.documentElement.dataset.sunlight = String(chosen);
     button.setAttribute("aria-pressed", String(chosen));
@@ -16,7 +16,7 @@ export function inSunlight() {
   };
   button.addEventListener("click", () => {
     chosen = !chosen;
-    try { localStorage.setItem(KEY, String(chosen)); } catch { /* private window */ }
+    storeChoice(KEY, chosen);
     show();
   });
   show();

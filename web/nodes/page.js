@@ -1,5 +1,7 @@
 // Page of all nodes: one card each, and recordings on all of them.
 
+import { Absence } from "../common/absence.js";
+import { addDeviceMenu } from "../common/device.js";
 import { helpWithKeys } from "../common/help.js";
 import { Link } from "../common/link.js";
 import { LOSSES_HELP } from "../common/losses.js";
@@ -54,7 +56,10 @@ const handlers = {
   frame: (frame) => cards.get(frame.node)?.addFrame(frame),
 };
 
-const link = new Link({ handlers, rateHz: RATE_HZ });
+const absence = new Absence();
+const alerts = addDeviceMenu();
+const watchers = [absence, alerts].map((one) => (message) => one.watch(message));
+const link = new Link({ handlers, watchers, rateHz: RATE_HZ });
 
 function updateNode(node) {
   if (!cards.has(node.node)) cards.set(node.node, new Card(node.node));

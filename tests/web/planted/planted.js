@@ -19,7 +19,7 @@ new Set([1]).union(new Set()); // newer
 "\ud800".isWellFormed(); // newer
 crypto.randomUUID(); // newer
 navigator.clipboard.writeText("x"); // newer
-navigator.wakeLock.request("screen"); // newer
+navigator.setAppBadge(1); // newer
 requestIdleCallback(() => {}); // newer
 URL.canParse("x"); // newer
 new URLSearchParams("a=1").size; // newer
