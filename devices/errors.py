@@ -78,7 +78,18 @@ def escape_control_chars(text: str, *, keep_line_breaks: bool = False) -> str:
 
 
 Extra = Literal[
-    "server", "client", "emulation", "discovery", "plot", "gpio", "rig", "archive", "mocap", "mcap"
+    "server",
+    "client",
+    "emulation",
+    "discovery",
+    "plot",
+    "gpio",
+    "rig",
+    "archive",
+    "mocap",
+    "mcap",
+    "bridges",
+    "tls",
 ]
 
 OUR_PACKAGES = ("devices", "storage", "service", "studies", "foottile")

@@ -82,6 +82,7 @@ type ClockSummary = {
 };
 
 type ClockView = {
+  t_mono_ns: number;
   server_minus_node_ns: number;
   uncertainty_ns: number;
 };

@@ -52,6 +52,7 @@ SUMMARIES = {
     "sessions": "List recorded sessions, newest first.",
     "pull": "Download a sealed session: data, description, markers.",
     "stream": "Print live frames of a node with their estimates, one line each, until Ctrl-C.",
+    "bridge": "Republish live frames and markers for another program, until Ctrl-C.",
     "export": "Write a sealed session, or a slice of it, in another format.",
     "query": "Run SQL over all sealed sessions.",
     "simulate": "Run a scene on emulated hardware in virtual time and write the session.",

@@ -103,6 +103,7 @@ class DriftView(View):
 class ClockView(View):
     """Offset of the clocks, from the best of eight probes."""
 
+    t_mono_ns: int = Field(description="Instant of that probe, by the clock of `t_mono_ns`.")
     server_minus_node_ns: int
     uncertainty_ns: int = Field(description="Half the round trip of that probe.")
 

@@ -110,14 +110,25 @@ def _read_frame_chunks(export: Export, columns: list[str]) -> Iterator[FrameChun
     last_shown = -1
     for piece in export.read_chunks(requested):
         t_ns = get_instants_on_export_clock_ns(export, piece)
-        turns = t_ns // DRAWING_INTERVAL_NS
-        shown = np.flatnonzero(np.diff(turns, prepend=last_shown))
-        last_shown = int(turns[-1]) if len(turns) else last_shown
+        shown, last_shown = find_drawn_rows(t_ns, last_shown)
         events = piece.get("marker", ())
         markers = [(row, text) for row, text in enumerate(events) if text is not None]
         bound_ns = piece.get(SERVER_TIME_COLUMNS[1].name)
         worst_ns = None if bound_ns is None else int(bound_ns.max(initial=0))
         yield FrameChunk(t_ns, piece, shown.tolist(), markers, worst_ns)
+
+
+def find_drawn_rows(t_ns: Array, last_turn: int) -> tuple[Array, int]:
+    """Return the rows for which the foot is drawn, and the turn of the last one.
+
+    Args:
+        t_ns: int64[n], instants of the frames.
+        last_turn: turn of the last frame before them.
+    """
+    turns = t_ns // DRAWING_INTERVAL_NS
+    return np.flatnonzero(np.diff(turns, prepend=last_turn)), int(turns[-1]) if len(
+        turns
+    ) else last_turn
 
 
 _CHUNK_BYTES = 1 << 20

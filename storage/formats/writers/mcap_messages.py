@@ -109,8 +109,7 @@ class MessageEncoder(ABC):
         topics = list(self._encode_frames(frames, placed))
         beside: dict[int, list[Message]] = {}
         for row, text in frames.markers:
-            content = self._encode_marker(t_ns[row], text)
-            beside.setdefault(row, []).append((t_ns[row], self._marker_channel, content))
+            beside.setdefault(row, []).append(self.encode_marker(t_ns[row], text))
         forces_n = np.full((len(t_ns), len(self._info.tiles)), np.nan)
         if self._has_forces:
             forces_n = frames.stack_tile_columns("force_n", len(self._info.tiles))
@@ -123,6 +122,10 @@ class MessageEncoder(ABC):
                 yield at_ns, channel, contents[row]
             if row in beside:
                 yield from beside[row]
+
+    def encode_marker(self, at_ns: int, text: str) -> Message:
+        """Return the encoded message of a marker."""
+        return at_ns, self._marker_channel, self._encode_marker(at_ns, text)
 
     @abstractmethod
     def _encode_frames(
@@ -166,6 +169,11 @@ class FoxgloveEncoder(MessageEncoder):
         self._columns = {
             name: COLUMNS_BY_NAME[chosen[name]] for name in _list_foxglove_columns(export)
         }
+        self._real_columns = {
+            name
+            for name, column in self._columns.items()
+            if np.dtype(_field_type(column)[2]).kind == "f"
+        }
         self._frame_template = _make_frame_template(self._columns)
         descriptors = _frame_descriptors(self._columns)
         self._frames = self._register_topic("frames", "foottile.Frame", descriptors)
@@ -185,7 +193,10 @@ class FoxgloveEncoder(MessageEncoder):
         self, frames: FrameChunk, placed: FrameChunk
     ) -> Iterator[tuple[int, list[bytes]]]:
         columns = {
-            name: _to_field_values(of, frames.columns[name]) for name, of in self._columns.items()
+            name: to_floats_with_nan(of.name, frames.columns[name])
+            if name in self._real_columns
+            else frames.columns[name]
+            for name, of in self._columns.items()
         }
         yield self._frames, self._frame_template.encode_messages(columns)
 
@@ -251,11 +262,6 @@ def _field_type(column: Column) -> tuple[int, int, str]:
     if pa.types.is_signed_integer(kind):
         return _SFIXED64 if kind.bit_width == 64 else _SFIXED32
     return _FIXED64 if kind.bit_width == 64 else _FIXED32
-
-
-def _to_field_values(column: Column, values: Array) -> Array:
-    is_real = np.dtype(_field_type(column)[2]).kind == "f"
-    return to_floats_with_nan(column.name, values) if is_real else values
 
 
 def _frame_descriptors(columns: dict[str, Column]) -> FileDescriptorSet:

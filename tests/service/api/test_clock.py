@@ -38,7 +38,11 @@ HALF_NS = 400_000
 def send_sample(node: FakeNode, offset_ns: int) -> None:
     """Send a clock sample of the newest frame."""
     node.say_clock(offset_ns, uncertainty_ns=HALF_NS)
-    shown = {"server_minus_node_ns": offset_ns, "uncertainty_ns": HALF_NS}
+    shown = {
+        "t_mono_ns": node.next_t_mono_ns,
+        "server_minus_node_ns": offset_ns,
+        "uncertainty_ns": HALF_NS,
+    }
     until(lambda: node.running.node(node.name)["clock"] == shown)
 
 

@@ -1,0 +1,83 @@
+"""The other sides of bridges: a viewer of Foxglove's protocol, and what tests share."""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any, NamedTuple
+
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+
+class Seen(NamedTuple):
+    """A message as a viewer sees it."""
+
+    topic: str
+    log_time_ns: int
+    content: Any
+
+
+class Viewer:
+    """A viewer that subscribes to all topics, as Foxglove's protocol says.
+
+    Text messages advertise channels with their schemas; a binary one has the byte 1, the number of
+    the subscription, the log time in ns and the content (github.com/foxglove/ws-protocol).
+    """
+
+    def __init__(self, url: str) -> None:
+        self.topics: dict[int, str] = {}
+        self.schemas: dict[str, str] = {}
+        self._decoders: dict[int, Callable[[bytes], Any]] = {}
+        self._stack = ExitStack()
+        self._socket = self._stack.enter_context(
+            connect(
+                url,
+                subprotocols=[Subprotocol("foxglove.sdk.v1")],
+                max_size=None,
+                proxy=None,
+                close_timeout=0.2,
+            )
+        )
+
+    def close(self) -> None:
+        self._stack.close()
+
+    def receive(self, timeout_s: float = 60.0) -> Seen:
+        """The next message of any topic."""
+        while True:
+            message = self._socket.recv(timeout=timeout_s)
+            if isinstance(message, bytes):
+                kind, channel, log_time_ns = struct.unpack_from("<BIQ", message)
+                assert kind == 1
+                content = self._decoders[channel](message[13:])
+                return Seen(self.topics[channel], log_time_ns, content)
+            content = json.loads(message)
+            if content["op"] == "advertise":
+                self._subscribe(content["channels"])
+
+    def receive_of(self, topic: str, is_wanted: Callable[[Any], bool] = bool) -> Seen:
+        """The next message of a topic that is wanted."""
+        while True:
+            seen = self.receive()
+            if seen.topic == topic and is_wanted(seen.content):
+                return seen
+
+    def _subscribe(self, channels: list[dict[str, Any]]) -> None:
+        for channel in channels:
+            assert channel["encoding"] == channel["schemaEncoding"] == "protobuf"
+            number, name = channel["id"], channel["schemaName"]
+            pool = DescriptorPool()
+            for file in FileDescriptorSet.FromString(base64.b64decode(channel["schema"])).file:
+                pool.Add(file)
+            decoder = GetMessageClass(pool.FindMessageTypeByName(name))
+            self.topics[number], self.schemas[channel["topic"]] = channel["topic"], name
+            self._decoders[number] = decoder.FromString
+        asked = [{"id": channel["id"], "channelId": channel["id"]} for channel in channels]
+        self._socket.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
