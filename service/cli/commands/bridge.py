@@ -12,9 +12,9 @@ from service.cli.commands.sessions import SERVER, ServerOption
 from service.cli.options import CaOption, create_stop_event, remark
 
 if TYPE_CHECKING:
-    from service.bridges.follower import Outlet
+    from service.bridges.follower import Outlet, Reporter
 
-KINDS = ("foxglove",)
+KINDS = ("foxglove", "lsl")
 LOOPBACK = "127.0.0.1"
 FOXGLOVE_PORT = 8765
 
@@ -36,7 +36,7 @@ def bridge_command(
 ) -> None:
     """Republish live frames and markers for another program, until Ctrl-C.
 
-    foxglove: a websocket for Foxglove.
+    foxglove: a websocket for Foxglove. lsl: outlets of the Lab Streaming Layer.
     """
     from foottile import connect
     from service.bridges.follower import Reporter, ServerFollower
@@ -47,7 +47,7 @@ def bridge_command(
 
     async def run() -> None:
         stop, reporter = create_stop_event(), Reporter(remark)
-        outlet = open_outlet(kind, host, port)
+        outlet = open_outlet(kind, host, port, reporter)
         try:
             follower = ServerFollower(source, outlet, reporter, node or (), is_public=public)
             await run_until_first_ends(follower.run(), outlet.run(), stop.wait())
@@ -61,8 +61,20 @@ def bridge_command(
         asyncio.run(run())
 
 
-def open_outlet(kind: str, host: str, port: int) -> Outlet:
-    """Open the outlet of a kind, and print where it is."""
+def open_outlet(kind: str, host: str, port: int, reporter: Reporter) -> Outlet:
+    """Open the outlet of a kind, and print where it is.
+
+    Raises:
+        UsageError: the address cannot be listened on.
+    """
+    if kind == "lsl":
+        from service.bridges.lsl import LslOutlet, limit_to_this_machine
+
+        if host == LOOPBACK:
+            limit_to_this_machine()
+        remark(f"LSL: found {'on this machine' if host == LOOPBACK else 'in the network'}")
+        return LslOutlet(reporter)
+
     from service.bridges.foxglove import FoxgloveOutlet
 
     try:
