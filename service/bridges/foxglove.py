@@ -58,6 +58,9 @@ class FoxgloveOutlet(MessageOutlet):
     Args:
         host: address to listen on.
         port: port; 0: any.
+
+    Raises:
+        UsageError: the address cannot be listened on.
     """
 
     def __init__(self, host: str, port: int) -> None:

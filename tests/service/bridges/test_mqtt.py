@@ -1,0 +1,204 @@
+"""The MQTT bridge with a real broker and another client of it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import queue
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import aiomqtt
+import pytest
+from amqtt.broker import Broker
+
+from devices.errors import UsageError
+from service.bridges.follower import Event, LiveClock, Reporter
+from service.bridges.mqtt import MqttOutlet
+from tests.service.fake_node import FakeNode, Play
+from tests.service.process import Start
+from tests.service.running import Running, receive_live
+from tests.waiting import PATIENCE_S, until
+
+pytestmark = pytest.mark.process
+
+
+class Received(NamedTuple):
+    """A message of the broker."""
+
+    topic: str
+    content: Any
+    is_retained: bool
+
+
+class RunningBroker:
+    """A broker in a thread, on loopback, with a client that receives all topics."""
+
+    def __init__(self) -> None:
+        self.port = 0
+        self.received: queue.Queue[Received] = queue.Queue()
+        self.start()
+
+    @property
+    def url(self) -> str:
+        return f"mqtt://127.0.0.1:{self.port}"
+
+    def start(self) -> None:
+        self._ready, self._stop = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), name="broker")
+        self._thread.start()
+        assert self._ready.wait(PATIENCE_S)
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join(PATIENCE_S)
+
+    def receive(self, topic: str, is_wanted: Callable[[Any], bool] = lambda _: True) -> Received:
+        """The next message of a topic that is wanted; others are dropped."""
+        while True:
+            message = self.received.get(timeout=PATIENCE_S)
+            if message.topic == topic and is_wanted(message.content):
+                return message
+
+    async def _run(self) -> None:
+        listener = {"type": "tcp", "bind": f"127.0.0.1:{self.port}"}
+        plugins = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
+        broker = Broker({"listeners": {"default": listener}, "plugins": plugins})
+        await broker.start()
+        if not self.port:
+            (server,) = (each.instance for each in broker._servers.values())
+            self.port = server.sockets[0].getsockname()[1]
+        async with aiomqtt.Client("127.0.0.1", self.port) as client:
+            await client.subscribe("#", qos=1)
+            self._ready.set()
+            reader = asyncio.create_task(self._read(client))
+            await asyncio.to_thread(self._stop.wait)
+            reader.cancel()
+        await broker.shutdown()
+
+    async def _read(self, client: aiomqtt.Client) -> None:
+        async for message in client.messages:
+            assert isinstance(message.payload, bytes)
+            text = message.payload.decode()
+            content = json.loads(text) if text.startswith("{") else text
+            self.received.put(Received(str(message.topic), content, bool(message.retain)))
+
+
+@pytest.fixture
+def broker() -> Iterator[RunningBroker]:
+    broker = RunningBroker()
+    yield broker
+    broker.stop()
+
+
+def test_summaries_states_and_events_of_a_node_are_on_the_broker(
+    running: Running, tared: FakeNode, foottile: Start, broker: RunningBroker
+) -> None:
+    bridge = foottile("bridge", "mqtt", broker.url, "--rate", 5, "--server", running.url)
+    assert broker.receive("foottile/bridge").content == "online"
+    state = broker.receive("foottile/bench/state").content
+    assert (state["state"], state["tiles"]) == ("online", ["T01", "T02"])
+    with running.socket("/api/v1/live?rate_hz=5") as page, Play(tared, [20.0, 160.0]):
+        summary = broker.receive("foottile/bench/summary", lambda each: each["seq"] > 75).content
+        shown = receive_live(page, lambda each: each["type"] == "frame" and each["seq"] > 75)
+        assert summary.keys() == shown.keys()
+        assert summary["grf_n"] is None  # a tile is beyond its calibrated range
+        assert summary["saturated"] == [False, True]
+        assert summary["force_n"][0] == pytest.approx(20.0, rel=0.01)
+        recording = tared.record(name="mud")
+        started = broker.receive("foottile/bench/event").content
+        assert (started["kind"], started["text"]) == ("recording_started", "mud")
+        marker = running.http.post(f"{recording.url}/markers", json={"label": "a stone"}).json()
+        assert broker.receive("foottile/bench/event").content == {
+            "kind": "marker",
+            "node": "bench",
+            "session_id": recording.id,
+            "text": "a stone",
+            "t_ns": marker["t_ns"],
+        }
+        recording.stop()
+        assert broker.receive("foottile/bench/event").content["kind"] == "recording_stopped"
+    tared.leave()
+    broker.receive("foottile/bench/state", lambda each: each["state"] == "offline")
+    bridge.process.send_signal(signal.SIGINT)
+    assert broker.receive("foottile/bridge").content == "offline"
+    assert bridge.ended(20.0) == 0
+
+
+@pytest.mark.slow
+def test_a_bridge_that_is_killed_is_offline_by_its_last_will(
+    running: Running, tared: FakeNode, foottile: Start, broker: RunningBroker
+) -> None:
+    bridge = foottile("bridge", "mqtt", broker.url, "--server", running.url)
+    assert broker.receive("foottile/bridge").content == "online"
+    bridge.process.kill()
+    assert broker.receive("foottile/bridge").content == "offline"
+
+
+@pytest.mark.slow
+def test_a_broker_that_comes_back_gets_states_and_the_events_of_meanwhile(
+    running: Running, tared: FakeNode, foottile: Start, broker: RunningBroker
+) -> None:
+    bridge = foottile("bridge", "mqtt", broker.url, "--server", running.url)
+    broker.receive("foottile/bench/state")
+    broker.stop()
+    bridge.said("no connection")
+    tared.record(name="mud")
+    broker.start()
+    events = "foottile/bench/event"
+    assert broker.receive(events).content["text"] == "mud"
+    bridge.said("works again")
+    assert len([line for line in bridge.err if "no connection" in line]) == 1
+
+
+def make_outlet(url: str, said: list[str]) -> MqttOutlet:
+    return MqttOutlet(url, 1.0, Reporter(said.append))
+
+
+def test_what_waits_for_a_broker_is_bounded() -> None:
+    outlet = make_outlet("mqtt://127.0.0.1:1", [])
+    for number in range(5000):
+        outlet.write_event(Event("marker", "left", "s", str(number), number), LiveClock())
+        outlet.write_summary({"node": "left", "seq": number})
+    assert [json.loads(text)["t_ns"] for _, text in outlet._events] == list(range(4000, 5000))
+    assert not outlet._summaries  # old news is of no use to anybody
+
+
+def test_of_a_slow_broker_only_the_newest_summary_waits_and_that_is_said_once() -> None:
+    said: list[str] = []
+    outlet = make_outlet("mqtt://127.0.0.1:1", said)
+    outlet._is_connected = True
+    for number in range(9):
+        outlet.write_summary({"node": "left", "seq": number})
+    assert json.loads(outlet._summaries["foottile/left/summary"])["seq"] == 8
+    assert len(said) == 1
+
+
+def test_address_user_and_password_come_from_the_url_or_the_environment(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    options = make_outlet("mqtts://me:a%40b@host/lab/feet", [])._options
+    assert (options["hostname"], options["port"]) == ("host", 8883)
+    assert (options["username"], options["password"]) == ("me", "a@b")
+    assert options["tls_context"].check_hostname
+    assert options["will"].topic == "lab/feet/bridge"
+    monkeypatch.setenv("FOOTTILE_MQTT_USER", "you")
+    monkeypatch.setenv("FOOTTILE_MQTT_PASSWORD", "secret")
+    options = make_outlet("mqtt://host", [])._options
+    assert (options["port"], options["tls_context"]) == (1883, None)
+    assert (options["username"], options["password"]) == ("you", "secret")
+
+
+@pytest.mark.parametrize("url", ["host", "http://host", "mqtt://", "mqtt://host:x", "mqtt://[::"])
+def test_another_address_is_refused(url: str) -> None:
+    with pytest.raises(UsageError, match="broker"):
+        make_outlet(url, [])
+
+
+def test_a_name_of_a_node_is_one_level_of_a_topic() -> None:
+    outlet = make_outlet("mqtt://host", [])
+    outlet.write_node("a/b+#", None)
+    assert list(outlet._states) == ["foottile/a_b__/state"]
+    until(outlet._has_pending.is_set)
