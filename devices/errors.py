@@ -82,6 +82,7 @@ Extra = Literal[
     "client",
     "emulation",
     "discovery",
+    "tls",
     "plot",
     "gpio",
     "rig",
@@ -89,7 +90,6 @@ Extra = Literal[
     "mocap",
     "mcap",
     "bridges",
-    "tls",
 ]
 
 OUR_PACKAGES = ("devices", "storage", "service", "studies", "foottile")

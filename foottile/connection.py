@@ -24,20 +24,25 @@ _BYTES_MAX = 16 << 20
 """Size limit of a file of CAs: 70 times Debian's."""
 
 
-def make_context(ca: str | os.PathLike[str] | None = None) -> ssl.SSLContext:
+def make_context(
+    ca: str | os.PathLike[str] | None = None, *, is_exclusive: bool = False
+) -> ssl.SSLContext:
     """Return a context that trusts the CAs of this machine and of a file.
 
     The machine's CAs are OpenSSL's, or those of the variables SSL_CERT_FILE and SSL_CERT_DIR.
 
     Args:
         ca: certificates in PEM, or a folder prepared by `openssl rehash`.
+        is_exclusive: trust no other CA than these.
 
     Raises:
         UsageError: no readable certificate.
     """
-    context = ssl.create_default_context()
     if ca is None:
-        return context
+        return ssl.create_default_context()
+    context = (
+        ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT) if is_exclusive else ssl.create_default_context()
+    )
     path = Path(ca)
     count_before = len(context.get_ca_certs())
     try:
@@ -54,6 +59,23 @@ def make_context(ca: str | os.PathLike[str] | None = None) -> ssl.SSLContext:
         ) from error
     if not has_certs:
         raise UsageError(f"{str(path)!r}: there is no CA certificate in it; expected a file in PEM")
+    return context
+
+
+def make_local_context(ca: str) -> ssl.SSLContext:
+    """Return a context that trusts only the CA, or the certificate, of this user's own server.
+
+    Its name is not compared: it listens on a loopback address, and its file is this user's.
+
+    Raises:
+        UsageError: there is no readable certificate.
+    """
+    try:
+        context = ssl.create_default_context(cafile=ca)
+    except OSError as error:
+        raise UsageError(f"{ca!r}: the certificate of the local server: {error}") from error
+    context.check_hostname = False
+    context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
     return context
 
 

@@ -10,7 +10,12 @@ from contextlib import contextmanager
 from http import HTTPStatus
 from typing import Any
 
-from foottile.connection import explain_foreign_response, explain_tls, make_context
+from foottile.connection import (
+    explain_foreign_response,
+    explain_tls,
+    make_context,
+    make_local_context,
+)
 from foottile.environment import check_token, decode_zone, read_token
 from foottile.errors import FootTileError, ServerUnavailableError, UsageError, make_error
 from foottile.local_server import find_local_server
@@ -47,13 +52,17 @@ class HttpClient:
     ) -> None:
         scheme, separator, rest = decode_zone(url.strip().rstrip("/")).partition("://")
         self.url = scheme.lower() + separator + rest
-        self.context = make_context(ca) if self.url.startswith("https:") else None
+        token = check_token(token, "the token") if token else read_token()
+        local = find_local_server(self.url)
+        if local is not None and (token is None or local.ca):
+            self.url, token = local.url, token or local.token
+        is_tls = self.url.startswith("https:")
+        self.context = make_context(ca) if is_tls else None
         """Trusted CAs; None without TLS."""
+        if local is not None and local.ca and ca is None:
+            self.context = make_local_context(local.ca)
         if ca is not None and self.context is None:
             raise UsageError(f"{self.url}: a CA is for addresses with https://")
-        token = check_token(token, "the token") if token else read_token()
-        if token is None and (local := find_local_server(self.url)) is not None:
-            self.url, token = local.url, local.token
         self.headers = {"Authorization": f"Bearer {token}"} if token else {}
         try:
             self._client = httpx.Client(

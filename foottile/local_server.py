@@ -17,7 +17,7 @@ import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from urllib.parse import SplitResult, urlsplit
 
@@ -32,6 +32,8 @@ class LocalServer:
 
     url: str
     token: str
+    ca: str = ""
+    """File of its CA or its certificate; empty without TLS."""
 
 
 def find_local_server(url: str) -> LocalServer | None:
@@ -42,20 +44,24 @@ def find_local_server(url: str) -> LocalServer | None:
     the record.
 
     Args:
-        url: `http://` or `ws://`, with 127.0.0.1, another loopback address, or localhost.
+        url: `http://` or `ws://`, with 127.0.0.1, another loopback address, or localhost; for a
+            server with TLS also `https://` or `wss://`.
     """
     try:
         parts = urlsplit(url)
-        port = parts.port or 80
+        is_tls = parts.scheme in ("https", "wss")
+        port = parts.port or (443 if is_tls else 80)
     except ValueError:
         return None
     if os.name != "posix":  # a client may run there, a server does not
         return None
-    if parts.scheme not in ("http", "ws") or not is_loopback(parts.hostname or ""):
+    if not (is_tls or parts.scheme in ("http", "ws")) or not is_loopback(parts.hostname or ""):
         return None
     path = _record_path(port)
     record = None if path is None else _read_record(path)
     if record is None or not _is_same_address(parts, urlsplit(record.url)):
+        return None
+    if is_tls and not record.ca:
         return None
     return record
 
@@ -69,13 +75,13 @@ def publish_local_server(server: LocalServer) -> Iterator[None]:
     """
     import fcntl
 
-    path = _record_path(urlsplit(server.url).port or 80)
+    path = _record_path(urlsplit(server.url).port or (443 if server.ca else 80))
     if path is None:
         raise FileNotFoundError(errno.ENOENT, "no home folder", f"user {os.getuid()}")
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     if not _is_private(path.parent.lstat()):
         path.parent.chmod(0o700)
-    content = {"url": server.url, "token": server.token, "pid": os.getpid()}
+    content = {**asdict(server), "pid": os.getpid()}
     # The rename comes last, so a reader finds the file complete and locked.
     with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False) as file:
         try:
@@ -124,7 +130,7 @@ def _read_record(path: Path) -> LocalServer | None:
             return None  # the server was killed
         try:
             content = json.loads(file.read(_RECORD_BYTES_MAX))
-            return LocalServer(str(content["url"]), str(content["token"]))
+            return LocalServer(str(content["url"]), str(content["token"]), str(content["ca"]))
         except (ValueError, TypeError, KeyError):
             return None
 

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from zeroconf.asyncio import AsyncServiceBrowser, AsyncServiceInfo, AsyncZeroconf
 
 SERVERS = "_foottile._tcp.local."
+SERVER_HOST = "foottile"
+"""Host name and name of a server, without number and `.local`."""
 NODES = "_foottile-node._tcp.local."
 _POLL_S = 2.0
 _ANSWER_TIMEOUT_MS = 700

@@ -330,6 +330,14 @@ class AccessGuard:
         return found["zone"] is None or address.is_link_local
 
 
+def parse_host(header: str) -> str | None:
+    """Return the host of a Host header, without its port; None: it is none."""
+    found = _HOST_HEADER.fullmatch(header)
+    if found is None:
+        return None
+    return found["name"] or f"[{found['address']}{found['zone'] or ''}]"
+
+
 def _body_limit_bytes(scope: Scope) -> int:
     """Return the limit of the body: a whole file is accepted on one path only."""
     is_file = scope["type"] == "http" and scope["path"] == CALIBRATIONS_PATH

@@ -97,13 +97,16 @@ def is_wildcard(host: str) -> bool:
     return host in ("0.0.0.0", "::", "")  # noqa: S104  # compared only
 
 
-def list_urls(listening: socket.socket, host: str, advertised: str | None = None) -> list[str]:
+def list_urls(
+    listening: socket.socket, host: str, advertised: str | None = None, *, scheme: str = "http"
+) -> list[str]:
     """Return the URLs of a server, the most useful to others first.
 
     Args:
         listening: socket of the server.
         host: address or name to listen on.
         advertised: address or name to show instead of those found, as of `--advertise`.
+        scheme: http or https.
 
     Raises:
         UsageError: `advertised` is no address.
@@ -117,8 +120,8 @@ def list_urls(listening: socket.socket, host: str, advertised: str | None = None
         names = [*found, "127.0.0.1"]
     elif host == "localhost":  # another program may listen on its other address
         names = [bound]
-    first = [] if advertised is None else [parse_advertised_url(advertised, port)]
-    return list(dict.fromkeys([*first, *(_url(name, port) for name in names)]))
+    first = [] if advertised is None else [parse_advertised_url(advertised, port, scheme)]
+    return list(dict.fromkeys([*first, *(_url(name, port, scheme) for name in names)]))
 
 
 def list_announced_addresses(listening: socket.socket) -> list[str]:
@@ -129,7 +132,7 @@ def list_announced_addresses(listening: socket.socket) -> list[str]:
     return [] if is_loopback(bound) else [bound]
 
 
-def parse_advertised_url(advertised: str, port: int) -> str:
+def parse_advertised_url(advertised: str, port: int, scheme: str = "http") -> str:
     """Return the URL for `--advertise`: HOST, HOST:PORT, or a whole URL.
 
     Raises:
@@ -137,13 +140,14 @@ def parse_advertised_url(advertised: str, port: int) -> str:
     """
     text = advertised.strip().rstrip("/")
     if "://" not in text:
-        text = _url(text, None) if text.count(":") > 1 and text[0] != "[" else f"http://{text}"
+        is_bare = text.count(":") > 1 and text[0] != "["
+        text = _url(text, None, scheme) if is_bare else f"{scheme}://{text}"
         text += "" if re.search(r":\d+$", text.rpartition("]")[2]) else f":{port}"
     try:
         parts = urlsplit(text)
-        name, scheme = parts.hostname or "", parts.scheme
+        name = parts.hostname or ""
         has_more = bool(parts.path or parts.query or parts.fragment or parts.username)
-        is_right = scheme in ("http", "https") and parts.port != 0 and not has_more
+        is_right = parts.scheme in ("http", "https") and parts.port != 0 and not has_more
         is_right &= "[" in parts.netloc or _HOST_NAME.fullmatch(name) is not None or _is_ip(name)
     except ValueError:
         is_right = False
@@ -155,9 +159,9 @@ def parse_advertised_url(advertised: str, port: int) -> str:
     return text
 
 
-def _url(name: str, port: int | None) -> str:
+def _url(name: str, port: int | None, scheme: str) -> str:
     host = f"[{name.replace('%', '%25')}]" if ":" in name else name
-    return f"http://{host}" + ("" if port is None else f":{port}")
+    return f"{scheme}://{host}" + ("" if port is None else f":{port}")
 
 
 def _is_ip(name: str) -> bool:
@@ -225,18 +229,21 @@ def read_token(data: Path) -> str:
 
 
 @contextmanager
-def publish_token(listening: socket.socket, token: str) -> Iterator[None]:
+def publish_token(listening: socket.socket, token: str, ca: Path | None = None) -> Iterator[None]:
     """Context manager: let programs of this user on this machine find the token.
 
     Args:
         listening: socket of the server.
         token: token of the server.
+        ca: file of its CA or its certificate; None without TLS.
     """
-    url = list_urls(listening, listening.getsockname()[0])[-1]
+    scheme = "http" if ca is None else "https"
+    url = list_urls(listening, listening.getsockname()[0], scheme=scheme)[-1]
     with ExitStack() as stack:
         if is_loopback(urlsplit(url).hostname or ""):
+            record = LocalServer(url, token, "" if ca is None else str(ca.absolute()))
             try:
-                stack.enter_context(publish_local_server(LocalServer(url, token)))
+                stack.enter_context(publish_local_server(record))
             except OSError as error:
                 log.warning("%s: commands on this machine need FOOTTILE_TOKEN", error)
         yield

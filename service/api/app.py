@@ -6,6 +6,7 @@ import asyncio
 import logging
 import os
 import socket
+import ssl
 import sys
 from collections.abc import AsyncIterator, Callable, Collection, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager, suppress
@@ -20,6 +21,7 @@ from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.routing import APIRoute
 from starlette.exceptions import HTTPException
 from starlette.routing import BaseRoute
+from starlette.types import ASGIApp
 from starlette.websockets import WebSocket
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
@@ -259,13 +261,32 @@ _GRACE_S = 3
 
 @asynccontextmanager
 async def serve_app(
-    app: FastAPI, listening: socket.socket, limits: LimitSettings | None = None
+    app: FastAPI,
+    listening: socket.socket,
+    limits: LimitSettings | None = None,
+    context: ssl.SSLContext | None = None,
 ) -> AsyncIterator[None]:
     """Context manager: serve the app; on a new machine compile the models meanwhile."""
     compiling = None
     if not await asyncio.to_thread(load_cached_code):
         compiling = asyncio.create_task(_compile_in_process(app.state.server))
-    limits = limits if limits is not None else LimitSettings()
+    async with run_uvicorn(app, listening, limits or LimitSettings(), context):
+        try:
+            yield
+        finally:
+            if compiling is not None:  # first: sealing waits for it
+                compiling.cancel()
+                await asyncio.gather(compiling, return_exceptions=True)
+
+
+@asynccontextmanager
+async def run_uvicorn(
+    app: ASGIApp,
+    listening: socket.socket,
+    limits: LimitSettings,
+    context: ssl.SSLContext | None = None,
+) -> AsyncIterator[None]:
+    """Context manager: serve an application on a socket, with limits; `context` is its TLS."""
     config = LimitedConfig(
         app,
         log_level="warning",
@@ -286,6 +307,7 @@ async def serve_app(
     config.proxies = ProxyHeadersMiddleware(app, limits.trusted_peers)  # type: ignore[arg-type]  # Starlette's scope is wider
     logging.getLogger("uvicorn.error").addFilter(_is_relevant)
     server = _Uvicorn(config)
+    server.context = context
     task = asyncio.create_task(server.serve([listening]))
     try:
         while not server.started and not task.done():
@@ -294,9 +316,6 @@ async def serve_app(
             task.result()
         yield
     finally:
-        if compiling is not None:  # first: sealing waits for it
-            compiling.cancel()
-            await asyncio.gather(compiling, return_exceptions=True)
         server.should_exit = True
         await task
 
@@ -349,11 +368,14 @@ class _Uvicorn(uvicorn.Server):
     """uvicorn without signal handling, with limited connections."""
 
     config: LimitedConfig
+    context: ssl.SSLContext | None
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets=[])
         self._accepting = [
-            asyncio.create_task(accept_connections(each, self._protocol, self.config.limiter))
+            asyncio.create_task(
+                accept_connections(each, self._protocol, self.config.limiter, self.context)
+            )
             for each in sockets or ()
         ]
 

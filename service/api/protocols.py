@@ -11,6 +11,7 @@ import asyncio
 import errno
 import logging
 import socket
+import ssl
 import struct
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -41,6 +42,7 @@ SOCKET_EXTENSION = "foottile.outlet"
 """Extension in a websocket's scope with its connection, a `SubscriberSocket`."""
 CLIENT_MESSAGE_BYTES_MAX = 4096
 """Size limit of a message by clients other than nodes."""
+_BUFFER_BYTES = 64 << 10
 _UNREAD_BYTES_MAX = 1 << 20
 """Limit of unsent bytes for a client that sends requests and does not read."""
 _OUT_OF_RESOURCES = {errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM}
@@ -85,6 +87,7 @@ class LimitedHttp(HttpToolsProtocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn
         """Add the connection as idle."""
         super().connection_made(transport)
+        transport.set_write_buffer_limits(_BUFFER_BYTES)  # with TLS the default is eight times this
         self._unanswered: deque[RequestResponseCycle] = deque()
         """Requests without an answer, in their order; uvicorn has only the newest."""
         self.config.limiter.add_connection(transport, _address(self.client))
@@ -394,8 +397,57 @@ async def refuse_connection(scope: Scope, receive: Receive, send: Send) -> None:
     await answer(scope, receive, send)
 
 
+class _Handshake:
+    """TLS handshake of a connection; an idle connection until it is done.
+
+    Args:
+        connection: accepted socket.
+        address: address of the peer.
+        context: TLS of the server.
+        make_protocol: creates the protocol of the connection.
+        limiter: limiter of connections.
+    """
+
+    def __init__(
+        self,
+        connection: socket.socket,
+        address: str,
+        context: ssl.SSLContext,
+        make_protocol: Callable[[], Any],
+        limiter: ConnectionLimiter,
+    ) -> None:
+        self._connection = connection
+        self._limiter = limiter
+        self.task = asyncio.create_task(
+            asyncio.get_running_loop().connect_accepted_socket(
+                make_protocol,
+                connection,
+                ssl=context,
+                ssl_handshake_timeout=limiter.limits.header_timeout_s,
+            )
+        )
+        self.task.add_done_callback(self._end)
+        limiter.add_connection(self, address)
+
+    def abort(self) -> None:
+        """Close the connection now."""
+        self.task.cancel()
+
+    def _end(self, task: asyncio.Task[Any]) -> None:
+        self._limiter.remove_connection(self)
+        error = None if task.cancelled() else task.exception()
+        if task.cancelled() or error is not None:
+            self._connection.close()
+        # No TLS, too slow, or the certificate is not trusted: an OSError.
+        if error is not None and not isinstance(error, OSError):
+            log.error("a connection is closed: this is a bug; others are accepted", exc_info=error)
+
+
 async def accept_connections(
-    listening: socket.socket, make_protocol: Callable[[], Any], limiter: ConnectionLimiter
+    listening: socket.socket,
+    make_protocol: Callable[[], Any],
+    limiter: ConnectionLimiter,
+    context: ssl.SSLContext | None = None,
 ) -> None:
     """Accept connections until cancelled, one after the other.
 
@@ -406,27 +458,38 @@ async def accept_connections(
         listening: listening socket.
         make_protocol: creates a protocol for each connection.
         limiter: limiter of connections.
+        context: TLS of the server; None without.
     """
     loop = asyncio.get_running_loop()
+    handshakes: set[asyncio.Task[Any]] = set()
     listening.setblocking(False)
-    while True:
-        if limiter.is_full:
-            limiter.evict_idle()
-            await asyncio.sleep(_PAUSE_S)
-            continue
-        try:
-            connection, _ = await loop.sock_accept(listening)
-        except OSError as error:
-            is_starved = error.errno in _OUT_OF_RESOURCES  # or the client has disconnected
-            if is_starved:
-                limiter.log_limited("starved", f"no connection can be accepted now: {error}")
+    try:
+        while True:
+            if limiter.is_full:
                 limiter.evict_idle()
-            await asyncio.sleep(_OUT_OF_RESOURCES_PAUSE_S if is_starved else _PAUSE_S)
-            continue
-        try:
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            await loop.connect_accepted_socket(make_protocol, connection)
-        except Exception as error:
-            if not isinstance(error, OSError):
-                log.exception("a connection is closed: this is a bug; others are accepted")
-            connection.close()
+                await asyncio.sleep(_PAUSE_S)
+                continue
+            try:
+                connection, peer = await loop.sock_accept(listening)
+            except OSError as error:
+                is_starved = error.errno in _OUT_OF_RESOURCES  # or the client has disconnected
+                if is_starved:
+                    limiter.log_limited("starved", f"no connection can be accepted now: {error}")
+                    limiter.evict_idle()
+                await asyncio.sleep(_OUT_OF_RESOURCES_PAUSE_S if is_starved else _PAUSE_S)
+                continue
+            try:
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                if context is not None:  # others are accepted meanwhile
+                    task = _Handshake(connection, peer[0], context, make_protocol, limiter).task
+                    handshakes.add(task)
+                    task.add_done_callback(handshakes.discard)
+                else:
+                    await loop.connect_accepted_socket(make_protocol, connection)
+            except Exception as error:
+                if not isinstance(error, OSError):
+                    log.exception("a connection is closed: this is a bug; others are accepted")
+                connection.close()
+    finally:
+        for task in handshakes:
+            task.cancel()

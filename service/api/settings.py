@@ -77,6 +77,12 @@ class Settings(LimitSettings):
     """Further name of the server, beside its addresses and the machine's names (repeatable)."""
     advertise: str | None = None
     """Address or name shown to people, as that of a reverse proxy; else the addresses found."""
+    tls: bool = False
+    """Serve https, with a certificate of a CA that the server makes; phones install it once."""
+    tls_cert: Path | None = None
+    """Serve https with this certificate (PEM, with its chain)."""
+    tls_key: Path | None = None
+    """Key of --tls-cert."""
     no_quantize: bool = False
     """Store estimates of recorded sessions as computed; their noise is not rounded off."""
 
@@ -121,6 +127,10 @@ def load_settings(config: Path | None, **given: object) -> Settings:
         elif top in from_environment:
             where = variables[top]
         raise UsageError(f"setting {name!r}: {complaint['msg']}", where=where) from error
+    if settings.tls and (settings.tls_cert or settings.tls_key):
+        raise UsageError("--tls makes a certificate, and --tls-cert names one: choose one of them")
+    if (settings.tls_cert is None) != (settings.tls_key is None):
+        raise UsageError("a certificate needs its key", expected="both --tls-cert and --tls-key")
     return settings.model_copy(
         update={"data": resolve_user_folder("data", settings.data, "--data")}
     )

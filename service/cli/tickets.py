@@ -109,8 +109,8 @@ def make_qr_lines(text: str, *, is_ascii: bool = False) -> list[str]:
     return drawn.getvalue().splitlines()
 
 
-def show_qr_code(address: str, *, viewer: bool = False) -> None:
-    """Print the QR code of a login link, only on a terminal, not to a log."""
+def show_qr_code(address: str, *, purpose: str) -> None:
+    """Print the QR code of a link and its purpose, only on a terminal, not to a log."""
     if not sys.stdout.isatty():
         return
     lines = make_qr_lines(address, is_ascii=not is_encodable("█▀▄"))
@@ -122,8 +122,14 @@ def show_qr_code(address: str, *, viewer: bool = False) -> None:
         solid = re.sub("#+", rf"{_WHITE_ON_WHITE}\g<0>{_BLACK_ON_WHITE}", line)
         sys.stdout.write(f"{_BLACK_ON_WHITE}{solid}{_RESET}\n")
     sys.stdout.flush()
+    remark(purpose)
+
+
+def show_login_code(link: str, *, viewer: bool = False) -> None:
+    """Print the QR code of a login link, only on a terminal."""
     permissions = "look" if viewer else "tare, record and change"
-    remark(f"for a phone: it may {permissions}; once, for five minutes; more: `foottile invite`")
+    purpose = f"for a phone: it may {permissions}; once, for five minutes; more: `foottile invite`"
+    show_qr_code(link, purpose=purpose)
 
 
 def print_ticket(urls: list[str], *, viewer: bool) -> None:
@@ -131,7 +137,7 @@ def print_ticket(urls: list[str], *, viewer: bool) -> None:
     for url in urls:
         echo(url)
     if is_reachable(urls[0]):
-        show_qr_code(urls[0], viewer=viewer)
+        show_login_code(urls[0], viewer=viewer)
     else:
         remark(
             "a phone does not reach this address: start the server with --host 0.0.0.0. If it "

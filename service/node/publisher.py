@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import socket as sockets
+import ssl
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import TypeVar
@@ -16,7 +17,7 @@ from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.frames import CloseCode
 
 from devices.errors import LinkError
-from foottile.connection import AsyncWebsocket, make_context
+from foottile.connection import AsyncWebsocket, make_context, make_local_context
 from foottile.local_server import find_local_server
 from service.node.frame_sender import EstablishedLink, NodeCallbacks
 from service.node.server_connection import (
@@ -68,7 +69,11 @@ class Publisher:
         self._find_server = find_server
         self._url = make_ingest_url(server)
         is_tls = find_server is not None or self._url.startswith("wss:")
-        self._context = make_context(ca_path) if is_tls else None
+        # Of a server that any machine may have announced, no other CA can prove the identity.
+        self._context = (
+            make_context(ca_path, is_exclusive=find_server is not None) if is_tls else None
+        )
+        self._has_ca = ca_path is not None
         self._source = source
         self._token = token
         self._report = report
@@ -101,12 +106,17 @@ class Publisher:
                 # Before each attempt: the server may be started after its node.
                 if self._find_server is not None:
                     self._server = await self._find_server()
-                local = None if self._token else find_local_server(self._server)
-                server, token = (local.url, local.token) if local else (self._server, self._token)
+                server, token, context = self._server, self._token, self._context
+                local = find_local_server(server)
+                if local is not None and (token is None or local.ca):
+                    server, token = local.url, token or local.token
+                if local is not None and local.ca and not self._has_ca:
+                    context = make_local_context(local.ca)
                 self._url = make_ingest_url(server)
                 tcp = await connect_tcp(self._url)
                 try:
-                    await self._serve_connection(tcp, token, back_off)
+                    context = context if self._url.startswith("wss:") else None
+                    await self._serve_connection(tcp, token, context, back_off)
                 finally:
                     tcp.close()  # if the websocket does not own it
             except (OSError, ValueError, WebSocketException) as error:
@@ -121,12 +131,16 @@ class Publisher:
             await asyncio.sleep(back_off.next_delay_s())
 
     async def _serve_connection(
-        self, tcp: sockets.socket, token: str | None, back_off: ReconnectBackoff
+        self,
+        tcp: sockets.socket,
+        token: str | None,
+        context: ssl.SSLContext | None,
+        back_off: ReconnectBackoff,
     ) -> None:
         async with connect(
             self._url,
             sock=tcp,
-            ssl=self._context if self._url.startswith("wss:") else None,
+            ssl=context,
             create_connection=AsyncWebsocket,
             subprotocols=[SUBPROTOCOL],  # type: ignore[list-item]  # a NewType of str
             compression=None,  # costs three times the CPU, saves little (performance.md)

@@ -80,6 +80,7 @@ class Running:
         hosts: Sequence[str] = (),
         bounds: LimitSettings | None = None,
         unquantized: bool = False,
+        context: ssl.SSLContext | None = None,
     ) -> None:
         self.data = data
         self.server: Server
@@ -93,6 +94,7 @@ class Running:
         self._hosts = tuple(hosts)
         self._bounds = bounds
         self._unquantized = unquantized
+        self._context = context
         self._thread: threading.Thread | None = None
         self._loop: asyncio.AbstractEventLoop
         self._stop: asyncio.Event
@@ -228,7 +230,7 @@ class Running:
                 # Where a test is about something else, its pages stay logged in over a restart.
                 self.logins = Logins(self._token, is_private=self._is_private)
             app = make_app(self.server, logins=self.logins, hosts=self._hosts)
-            async with serve_app(app, listening, self._bounds):
+            async with serve_app(app, listening, self._bounds, self._context):
                 self.port = int(list_urls(listening, "127.0.0.1")[-1].rsplit(":", 1)[1])
                 ready.set()
                 await self._stop.wait()

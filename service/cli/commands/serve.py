@@ -13,11 +13,12 @@ from functools import partial
 from pathlib import Path
 from socket import gethostname
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_origin
-from urllib.parse import quote, urlsplit
+from urllib.parse import quote
 
 import typer
 
 from devices.errors import FootTileError, StateError, require_extra
+from foottile.local_server import is_loopback
 from service.api.connection_limits import raise_open_files_limit
 from service.api.settings import LimitSettings, Settings, load_settings
 from service.cli.commands.sessions import SERVER, ServerOption
@@ -45,7 +46,7 @@ from service.cli.tickets import (
     print_ticket,
     read_data_token,
     remark_unreachable,
-    show_qr_code,
+    show_login_code,
 )
 from service.version import SOFTWARE_VERSION
 
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
     import socket
 
     from service.api.access import Logins
+    from service.cli.server_tls import ServerTls
     from service.discovery import Discovery
     from service.server.server import Server
 
@@ -123,6 +125,7 @@ class _ListeningServer(NamedTuple):
     listening: socket.socket
     logins: Logins
     find_urls: Callable[[], list[str]]
+    tls: ServerTls | None
 
 
 @contextmanager
@@ -138,6 +141,7 @@ def _listen(settings: Settings) -> Iterator[_ListeningServer]:
         open_listening_socket,
         publish_token,
     )
+    from service.cli.server_tls import open_tls
     from service.server.server import Server
     from storage.permissions import set_umask_and_create_private_folder
 
@@ -145,10 +149,12 @@ def _listen(settings: Settings) -> Iterator[_ListeningServer]:
         set_umask_and_create_private_folder(settings.data)
         server = Server(settings.data, unquantized=settings.no_quantize)
         token = load_or_create_token(settings.token, settings.data)
-        find_urls = partial(list_urls, listening, settings.host, settings.advertise)
-        with publish_token(listening, token):
+        tls = open_tls(settings)
+        scheme = "https" if tls is not None else "http"
+        find_urls = partial(list_urls, listening, settings.host, settings.advertise, scheme=scheme)
+        with publish_token(listening, token, None if tls is None else tls.ca_path):
             logins = Logins(token, is_private=settings.private)
-            yield _ListeningServer(server, listening, logins, find_urls)
+            yield _ListeningServer(server, listening, logins, find_urls, tls)
 
 
 @asynccontextmanager
@@ -159,15 +165,17 @@ async def _serve(
     from devices.realtime import freeze_garbage_collector
     from service.api.address import list_own_names
     from service.api.app import make_app, serve_app
+    from service.cli.server_tls import hand_out_ca
 
-    server, listening, logins, find_urls = listening_server
+    server, listening, logins, find_urls, tls = listening_server
     urls = find_urls()
     hosts = {*settings.allow_host, *list_own_names(), get_host(urls[0])}
     announced: list[str] = []
 
     def on_announced(host: str) -> None:
         hosts.add(host)
-        announced[:] = [f"{urlsplit(urls[-1]).scheme}://{host}:{listening.getsockname()[1]}"]
+        scheme = "https" if tls is not None else "http"
+        announced[:] = [f"{scheme}://{host}:{listening.getsockname()[1]}"]
         remark(f"it is also at {announced[0]}, for machines that resolve names by mDNS")
 
     def find_all_urls() -> list[str]:
@@ -175,27 +183,36 @@ async def _serve(
         return [first, *announced, *others]
 
     app = make_app(server, logins=logins, hosts=hosts, find_urls=find_all_urls)
-    async with serve_app(app, listening, settings), AsyncExitStack() as stack:
+    context = tls.context if tls is not None else None
+    async with serve_app(app, listening, settings, context), AsyncExitStack() as stack:
         freeze_garbage_collector()
         is_stored = not settings.token
         print_addresses(urls, settings.data, logins, is_stored=is_stored, is_demo=is_demo)
         remark_unreachable(urls, settings.host)
-        if is_reachable(f"http://{listening.getsockname()[0]}"):
-            discovery = _make_discovery(server, listening, on_announced)
+        await stack.enter_async_context(
+            hand_out_ca(tls, settings, listening, lambda: [get_host(url) for url in announced])
+        )
+        if not is_loopback(listening.getsockname()[0]):
+            discovery = _make_discovery(server.id, listening, on_announced, is_tls=tls is not None)
             await stack.enter_async_context(discovery)
         yield server
 
 
 def _make_discovery(
-    server: Server, listening: socket.socket, on_announced: Callable[[str], None]
+    server_id: str,
+    listening: socket.socket,
+    on_announced: Callable[[str], None],
+    *,
+    is_tls: bool,
 ) -> Discovery:
     """Return the discovery that announces a server."""
     from service.api.address import list_announced_addresses
-    from service.discovery import SERVERS, Announcement, Discovery
+    from service.discovery import SERVER_HOST, SERVERS, Announcement, Discovery
 
-    texts = {"id": server.id, "tls": "0", "version": SOFTWARE_VERSION, "machine": gethostname()}
+    texts = {"id": server_id, "tls": str(int(is_tls))}
+    texts |= {"version": SOFTWARE_VERSION, "machine": gethostname()}
     port, find_addresses = listening.getsockname()[1], partial(list_announced_addresses, listening)
-    announcement = Announcement(SERVERS, "foottile", "foottile", port, texts, find_addresses)
+    announcement = Announcement(SERVERS, SERVER_HOST, SERVER_HOST, port, texts, find_addresses)
     return Discovery(announcement=announcement, on_announced=on_announced, report=remark)
 
 
@@ -227,7 +244,7 @@ def print_addresses(
             link = add_ticket(url, logins.tickets.create(Role.OPERATOR)) if is_demo else f"{url}/"
         echo(f"FootTile is at {link}")
     if has_screen and is_reachable(urls[0]):
-        show_qr_code(add_ticket(urls[0], logins.tickets.create(Role.OPERATOR)))
+        show_login_code(add_ticket(urls[0], logins.tickets.create(Role.OPERATOR)))
     remark(f"data in {data}; Ctrl-C ends it")
     if is_compiling():
         remark(COMPILING_NOTE)
@@ -236,7 +253,8 @@ def print_addresses(
         place = f"in {data / TOKEN_NAME}" if is_stored else "FOOTTILE_TOKEN"
         remark(f"its token is {place}; `foottile invite` prints a login link")
     token_text = token if sys.stderr.isatty() else where
-    remark(f"a node: FOOTTILE_TOKEN={token_text} foottile node --scene FILE --server {urls[0]}")
+    ca = " --ca FILE" if urls[0].startswith("https") else ""
+    remark(f"a node: FOOTTILE_TOKEN={token_text} foottile node --scene FILE --server {urls[0]}{ca}")
 
 
 NODE = "demo"
@@ -252,6 +270,7 @@ def demo_command(
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port; 0: any.")] = 8000,
     advertise: AdvertiseOption = None,
+    tls: Annotated[bool, typer.Option("--tls", help="Serve https, as `serve --tls`.")] = False,
     data: Annotated[
         Path | None, typer.Option(help="Folder for sessions; default: the user's demo folder.")
     ] = None,
@@ -285,7 +304,7 @@ def demo_command(
     if data is None:
         folder /= "demo"
     arguments.append(f"--journal={folder / 'node'}")
-    settings = Settings(host=host, port=port, advertise=advertise, data=folder)
+    settings = Settings(host=host, port=port, advertise=advertise, tls=tls, data=folder)
     settings = settings.model_copy(update={"token": read_token()})
     uvloop.run(_run_demo(settings, seconds, arguments))
 

@@ -1,0 +1,83 @@
+"""Page in plain HTTP from which a phone installs a server's CA, before it trusts anything else.
+
+It serves this page and the CA's certificate, never a ticket, the token or data. Everything else is
+redirected to the server with TLS.
+"""
+
+from __future__ import annotations
+
+from html import escape
+from http import HTTPStatus
+from string import Template
+
+from starlette.requests import Request
+from starlette.responses import RedirectResponse, Response
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from service.api.access import SAFE_METHODS, parse_host
+from service.api.certificates import CA_NAME
+from service.api.settings import LimitSettings
+
+LIMITS = LimitSettings(max_connections=32, max_connections_per_address=16, max_nodes=1)
+_HEADERS = {
+    "content-security-policy": "default-src 'none'; frame-ancestors 'none'",
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cache-control": "no-store",
+}
+_PAGE = Template("""<!doctype html>
+<html lang="en">
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width">
+<title>FootTile: trust this server</title>
+<h1>Trust this FootTile server</h1>
+<p>Compare this fingerprint (SHA-256) with the server's terminal. If it differs, stop: somebody else
+answers here.</p>
+<p><code>$fingerprint</code></p>
+<p><a href="/$file">Load the certificate</a>, then:</p>
+<h2>iPhone, iPad (Safari)</h2>
+<ol>
+<li>Settings, Profile Downloaded: Install.
+<li>Settings, General, About, Certificate Trust Settings: switch it on.
+</ol>
+<h2>Android (Chrome)</h2>
+<ol>
+<li>Settings, search for "CA certificate": Install anyway, and choose the file.
+</ol>
+<h2>Laptop, node</h2>
+<p>Import it in the browser's settings; commands and nodes: <code>--ca $file</code></p>
+<p>It can certify only local names and addresses. Done? <a href="$url">Open FootTile</a>.</p>
+""")
+
+
+def make_ca_page(certificate: bytes, fingerprint: str, port: int) -> ASGIApp:
+    """Build the application of the page.
+
+    Args:
+        certificate: the CA's, in PEM.
+        fingerprint: its SHA-256.
+        port: port of the server with TLS.
+    """
+
+    def make_response(request: Request) -> Response:
+        host = parse_host(request.headers.get("host", ""))
+        if host is None:
+            return Response(status_code=HTTPStatus.BAD_REQUEST, headers=_HEADERS)
+        url = f"https://{host}:{port}"
+        if request.method in SAFE_METHODS and request.url.path == "/":
+            page = _PAGE.substitute(fingerprint=fingerprint, file=CA_NAME, url=escape(url))
+            return Response(page, media_type="text/html", headers=_HEADERS)
+        if request.method in SAFE_METHODS and request.url.path == f"/{CA_NAME}":
+            return Response(certificate, media_type="application/x-x509-ca-cert", headers=_HEADERS)
+        # Not for good: a laptop may serve plain HTTP on this port later.
+        target = f"{url}{request.scope['raw_path'].decode('latin-1')}"
+        return RedirectResponse(target, HTTPStatus.TEMPORARY_REDIRECT, headers=_HEADERS)
+
+    async def answer(scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "websocket":
+            await receive()
+            await send({"type": "websocket.close"})
+        elif scope["type"] == "http":
+            await make_response(Request(scope))(scope, receive, send)
+
+    return answer

@@ -1,0 +1,165 @@
+"""TLS of `foottile serve`: certificates by its settings, and the page that hands out the CA."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import ssl
+from collections.abc import AsyncIterator, Callable
+from contextlib import ExitStack, asynccontextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+from devices.errors import FootTileError, LinkError, require_extra
+from service.api.address import (
+    is_wildcard,
+    list_addresses,
+    list_own_names,
+    list_urls,
+    open_listening_socket,
+)
+from service.api.settings import Settings
+from service.cli.options import remark
+from service.cli.tickets import is_reachable, show_qr_code
+from service.discovery import SERVER_HOST
+
+if TYPE_CHECKING:
+    from service.api.certificates import OwnAuthority
+
+_RENEWAL_PERIOD_S = 10.0
+"""Interval at which the names of the machine are compared with those of the certificate."""
+_PORT_MAX = 65535
+
+
+@dataclass(frozen=True)
+class ServerTls:
+    """TLS of a server.
+
+    Attributes:
+        context: context of the server.
+        ca_path: certificate that a client of this user trusts.
+        authority: the server's own CA; None: the certificate was given.
+    """
+
+    context: ssl.SSLContext
+    ca_path: Path
+    authority: OwnAuthority | None = None
+
+
+def open_tls(settings: Settings) -> ServerTls | None:
+    """Return the TLS that the settings ask for, None without; a CA is made at the first start.
+
+    Raises:
+        UsageError: a given file cannot be used.
+        StorageError, DamagedFileError: a file of the data folder cannot be used.
+    """
+    with require_extra("tls", "https"):
+        from service.api.certificates import OwnAuthority, load_given_context
+    if settings.tls_cert is not None and settings.tls_key is not None:
+        context, remarks = load_given_context(settings.tls_cert, settings.tls_key)
+        for each in remarks:
+            remark(each)
+        return ServerTls(context, settings.tls_cert)
+    if not settings.tls:
+        return None
+    names, now = _list_names(settings), datetime.now(UTC)
+    authority = OwnAuthority(settings.data, names, now)
+    _certify(authority, names, now)
+    return ServerTls(authority.context, authority.ca_path, authority)
+
+
+def _list_names(settings: Settings) -> list[str]:
+    """Return the names and addresses under which a server may be reached now."""
+    advertised = settings.advertise or ""
+    parts = urlsplit(advertised if "://" in advertised else f"//{advertised}")
+    return list(
+        dict.fromkeys(
+            [
+                *(f"{SERVER_HOST}.local", "localhost", "127.0.0.1", "::1", *list_own_names()),
+                *settings.allow_host,
+                *(
+                    name
+                    for name in (parts.hostname, settings.host)
+                    if name and not is_wildcard(name)
+                ),
+                *list_addresses(include_ipv6=True),
+            ]
+        )
+    )
+
+
+def _certify(authority: OwnAuthority, names: list[str], now: datetime) -> None:
+    from service.api.certificates import explain_outside
+
+    outside = authority.certify(names, now)
+    authority.load()
+    if outside:
+        remark(explain_outside(outside, authority))
+
+
+@asynccontextmanager
+async def hand_out_ca(
+    tls: ServerTls | None,
+    settings: Settings,
+    listening: socket.socket,
+    list_announced: Callable[[], list[str]],
+) -> AsyncIterator[None]:
+    """Context manager: serve the page of the CA, and renew the certificate when names change.
+
+    Args:
+        tls: TLS of the server; nothing is done unless it made its CA itself.
+        settings: settings of the server.
+        listening: socket of the server.
+        list_announced: returns the names announced in the network.
+    """
+    if tls is None or tls.authority is None:
+        yield
+        return
+    from service.api.app import run_uvicorn
+    from service.api.ca_page import LIMITS, make_ca_page
+
+    authority, port = tls.authority, listening.getsockname()[1]
+    page = make_ca_page(authority.certificate_pem, authority.fingerprint, port)
+    with ExitStack() as stack:
+        plain = stack.enter_context(_open_next(settings.host, port))
+        async with run_uvicorn(page, plain, LIMITS):
+            url = list_urls(plain, settings.host)[0]
+            remark(f"phones and laptops first have to trust it: {url}")
+            remark(f"compare there: SHA-256 {authority.fingerprint}")
+            remark(f"a node trusts it by --ca and a copy of {authority.ca_path}")
+            if is_reachable(url):
+                show_qr_code(url, purpose="for a phone, once, before it opens the page")
+            renewing = asyncio.create_task(_renew_forever(authority, settings, list_announced))
+            try:
+                yield
+            finally:
+                renewing.cancel()
+                await asyncio.gather(renewing, return_exceptions=True)
+
+
+def _open_next(host: str, port: int) -> socket.socket:
+    """Open a listening socket on the next port, or on any if that is in use."""
+    try:
+        return open_listening_socket(host, port + 1 if port < _PORT_MAX else 0)
+    except LinkError:
+        return open_listening_socket(host, 0)
+
+
+async def _renew_forever(
+    authority: OwnAuthority, settings: Settings, list_announced: Callable[[], list[str]]
+) -> None:
+    """Renew the certificate when the names of the machine change, and when it ends."""
+    before: tuple[list[str], int] | None = None
+    while True:
+        await asyncio.sleep(_RENEWAL_PERIOD_S)
+        now = datetime.now(UTC)
+        current = ([*_list_names(settings), *list_announced()], now.toordinal())
+        if current != before:
+            before = current
+            try:
+                _certify(authority, current[0], now)
+            except FootTileError as error:
+                remark(f"the certificate is not renewed: {error}")
