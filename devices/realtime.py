@@ -10,6 +10,7 @@ import ctypes
 import gc
 import os
 import signal
+from typing import NamedTuple
 
 _PR_SET_PDEATHSIG = 1
 _PR_SET_TIMERSLACK = 29  # include/uapi/linux/prctl.h
@@ -47,13 +48,37 @@ def terminate_with_parent() -> None:
     _libc().prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
 
 
+class _Timex(ctypes.Structure):
+    _fields_ = (
+        ("modes", ctypes.c_uint),
+        ("offset", ctypes.c_long),
+        ("freq", ctypes.c_long),
+        ("maxerror", ctypes.c_long),
+        ("rest", ctypes.c_char * _TIMEX_BYTES),
+    )
+
+
+class ClockState(NamedTuple):
+    """State of the wall clock, as the kernel reports it."""
+
+    is_set: bool
+    error_max_s: float
+
+
+def read_clock_state() -> ClockState | None:
+    """Read whether the wall clock is set, and the bound of its error; None if that is refused."""
+    timex = _Timex()
+    state = int(_libc().adjtimex(ctypes.byref(timex)))
+    return None if state < 0 else ClockState(state != _TIME_ERROR, timex.maxerror * 1e-6)
+
+
 def is_clock_set() -> bool:
     """Return whether the kernel reports the wall clock as set (by NTP or a laptop).
 
     A Raspberry Pi has no battery clock: until it is set, its UTC is a guess.
     """
-    state = int(_libc().adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES)))
-    return 0 <= state != _TIME_ERROR
+    state = read_clock_state()
+    return state is not None and state.is_set
 
 
 def _libc() -> ctypes.CDLL:

@@ -299,6 +299,7 @@ type NodeView = {
   warnings: Array<string>;
   compiling: boolean;
   fault_counts: Record<string, Record<string, number>>;
+  vitals: Vitals | null;
   last_t_ns: number | null;
   last_seen_t_ns: number | null;
   recording: Array<string>;
@@ -516,6 +517,8 @@ type SessionView = {
   stopped_t_ns: number | null;
   max_lost_tail_frames: number;
   marker_count: number;
+  vitals_at_start: Vitals | null;
+  vitals_at_stop: Vitals | null;
   bytes: number | null;
   sha256: string | null;
   parts: Array<Part>;
@@ -741,6 +744,20 @@ type Version = {
   software: string;
   api: string;
   protocol: string;
+};
+
+type Vitals = {
+  disk_free_bytes?: number | null;
+  recording_left_s?: number | null;
+  cpu_celsius?: number | null;
+  is_undervolted?: boolean | null;
+  was_undervolted?: boolean | null;
+  is_throttled?: boolean | null;
+  was_throttled?: boolean | null;
+  load_per_core?: number | null;
+  wifi_dbm?: number | null;
+  is_clock_synchronised?: boolean | null;
+  clock_error_max_s?: number | null;
 };
 
 type WeighingResultView = {

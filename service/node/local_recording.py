@@ -14,6 +14,7 @@ from pathlib import Path
 
 from devices.clock import server_utc_ns
 from devices.errors import FootTileError, StorageError
+from devices.vitals import Vitals
 from service.estimation.calibration import Calibration
 from service.sessions.lifecycle import (
     Reevaluate,
@@ -46,6 +47,7 @@ class LocalRecording:
         scene_content: content of the scene file.
         is_emulated: True if the array is emulated.
         report: called with messages for the user.
+        get_vitals: returns the newest vitals of this machine; None: not read yet.
     """
 
     def __init__(
@@ -59,6 +61,7 @@ class LocalRecording:
         scene_content: Mapping[str, object],
         is_emulated: bool,
         report: Callable[[str], None],
+        get_vitals: Callable[[], Vitals | None] = lambda: None,
     ) -> None:
         self._folder = SessionsFolder(node_folder / "sessions")
         self._journal = journal
@@ -67,6 +70,7 @@ class LocalRecording:
         self._scene_content = scene_content
         self._emulated = is_emulated
         self._report = report
+        self._get_vitals = get_vitals
         self._session: Session | None = None
         self._sealing_lock = threading.Lock()
         """Lock while sessions of earlier runs are sealed: a node may be stopped meanwhile."""
@@ -101,6 +105,7 @@ class LocalRecording:
                 Part(stream_id=stream.stream_id, seq_first=0),
                 scene_content=self._scene_content,
                 calibration=self._calibration,
+                vitals_at_start=self._get_vitals(),
             )
         else:
             ids = session.parts[-1].stream_id, stream.stream_id
@@ -194,6 +199,7 @@ class LocalRecording:
             has_reported=True,
             scene_content=self._scene_content,
             calibration=self._calibration,
+            vitals=self._get_vitals(),
         )
 
     def _update_retention(self) -> None:

@@ -18,6 +18,7 @@ from typing import Any
 
 from devices.errors import FileFormatError, FootTileError, StorageError
 from devices.sync_lines import RecordingLine
+from devices.vitals import VITALS_INTERVAL_S, Vitals, VitalsWarnings, read_vitals
 from service.estimation.calibration import Calibration
 from service.node.acquisition_process import (
     AcquiredBatch,
@@ -151,6 +152,7 @@ class RunningNode:
             scene_content=options.rig_options.scene.model_dump(mode="json"),
             is_emulated=options.rig_options.is_emulated,
             report=report,
+            get_vitals=lambda: self._vitals,
         )
         for problem in journal.problems:
             report(problem)
@@ -165,6 +167,10 @@ class RunningNode:
         self._recording_line: RecordingLine | None = None
         if sync is not None and sync.output_line is not None:
             self._recording_line = RecordingLine(sync)
+        self._vitals: Vitals | None = None
+        self._vitals_warnings: tuple[str, ...] = ()
+        self._queued_bytes = 0
+        """Bytes of frames since the last reading of the vitals."""
         self._reported_warnings: tuple[str, ...] = ()
         self._is_closing = False
         loop = asyncio.get_running_loop()
@@ -177,6 +183,7 @@ class RunningNode:
         """Run until stopped, or until the array fails for good."""
         stopping = asyncio.create_task(stop.wait())
         tasks: list[asyncio.Task[Any]] = [stopping, asyncio.create_task(self._report_warnings())]
+        tasks.append(asyncio.create_task(self._watch_vitals()))
         try:
             started = await self._await_array(stopping)
             if started is None:
@@ -268,6 +275,7 @@ class RunningNode:
             stream, message.encoded_batch, message.missed_slots
         )
         self._health = message.health
+        self._queued_bytes += len(message.encoded_batch.payload)
         if self._publisher is not None:
             self._publisher.notify_new_frames()
         for notice in message.warning_changes:
@@ -288,7 +296,7 @@ class RunningNode:
                 get_streams=lambda: {stream.stream_id: stream for stream in self._journal.streams},
                 make_hello=lambda: make_hello(
                     self._options, self._journal, self._get_present_stream()
-                ),
+                ).model_copy(update={"vitals": self._vitals}),
                 get_secret=secrets.get_or_create_secret,
                 make_status=self._make_status,
                 on_retention_request=self._on_retention_request,
@@ -315,11 +323,27 @@ class RunningNode:
                 *self._stall_warnings(),
                 *self._health.warnings,
                 *self._line_warnings,
+                *self._vitals_warnings,
                 *self._journal.disk_refusal_warnings,
                 *(problem[:_PROBLEM_LENGTH] for problem in self._journal.problems[:_PROBLEMS_MAX]),
             ),
             counts={serial: dict(counts) for serial, counts in self._health.fault_counts.items()},
+            vitals=self._vitals,
         )
+
+    async def _watch_vitals(self) -> None:
+        """Read the vitals every few seconds, in a thread: a disk or a command may hang."""
+        warnings, begin_s = VitalsWarnings(), None
+        while True:
+            bytes_per_s, now_s = None, time.monotonic()
+            if begin_s is not None:
+                bytes_per_s = self._queued_bytes / (now_s - begin_s)
+            begin_s, self._queued_bytes = now_s, 0
+            self._vitals = await asyncio.to_thread(
+                read_vitals, self._options.node_folder, bytes_per_s
+            )
+            self._vitals_warnings = warnings.update(self._vitals)
+            await asyncio.sleep(VITALS_INTERVAL_S)
 
     def _on_retention_request(
         self, server_id: str, wanted: RetentionMessage, known: tuple[str, ...]
@@ -356,6 +380,7 @@ class RunningNode:
             warnings = (
                 *self._stall_warnings(),
                 *self._line_warnings,
+                *self._vitals_warnings,
                 *self._journal.disk_refusal_warnings,
             )
             kinds = tuple(warning.partition(";")[0] for warning in warnings)

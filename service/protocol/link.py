@@ -48,6 +48,7 @@ from devices.types import (
     TNs,
     check_text,
 )
+from devices.vitals import Vitals
 from service.estimation.calibration import Calibration
 from storage.intervals import NO_END
 
@@ -89,7 +90,7 @@ SceneContent = Annotated[dict[str, Any], AfterValidator(_check_bounds)]
 `devices.scene` interprets it."""
 
 SUBPROTOCOL = "foottile.v1"
-PROTOCOL = 5
+PROTOCOL = 6
 INGEST_PATH = "/api/v1/ingest"
 MESSAGE_BYTES_MAX = 1 << 20
 """Longest message that either side accepts. A batch of 64 tiles is 0.1 MB."""
@@ -213,6 +214,8 @@ class Hello(StrictModel):
     """Lost frames of the present stream, by reason."""
     t_ns_first: TNs = 0
     """Instant of the oldest stored frame of the present stream, in the node's UTC; 0: none."""
+    vitals: Vitals | None = None
+    """Vitals of its machine; None: not read yet."""
     scene: SceneContent
     """Content of the scene file."""
     emulated: bool
@@ -326,6 +329,8 @@ class NodeStatus(StrictModel):
         Field(max_length=_WARNINGS_MAX),
     ] = Field(default={})
     """Fault counts of this stream, by serial and reason."""
+    vitals: Vitals | None = None
+    """Vitals of its machine; None: not read yet."""
 
 
 NodeMessage = (

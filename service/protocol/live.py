@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from devices.frames import ServoInfo
 from devices.types import StrictModel
+from devices.vitals import Vitals
 from service.estimation.tare.tare import IntervalSource
 from service.protocol.link import StreamId
 from service.user_folders import PublicText
@@ -179,6 +180,9 @@ class NodeView(NodeCounts):
     fault_counts: dict[str, dict[str, int]] = Field(
         description="Faults of this stream, counted by serial and reason."
     )
+    vitals: Vitals | None = Field(
+        description="Vitals of its machine, each few seconds; null: a value, or all, unknown."
+    )
     last_t_ns: int | None
     last_seen_t_ns: int | None = Field(description="Arrival time of its last frame, server's UTC.")
     recording: list[str] = Field(description="Ids of sessions that are being recorded.")
@@ -223,6 +227,8 @@ class SessionView(SessionProgress):
         "frames were abandoned."
     )
     marker_count: int = Field(description="Number of its markers.")
+    vitals_at_start: Vitals | None = Field(description="Vitals of its node at the start.")
+    vitals_at_stop: Vitals | None = Field(description="Vitals of its node at the stop.")
     bytes: int | None = Field(description="Size of the sealed file.")
     sha256: str | None = Field(description="Hash of the sealed file.")
     parts: list[Part] = Field(description="Intervals of streams, both ends included.")

@@ -108,6 +108,8 @@ class ServerNode:
         """Faults of its array or disk, from its last status."""
         self.fault_counts: dict[str, dict[str, int]] = {}
         """Faults of the present stream by serial and reason, from its last status."""
+        self.vitals = hello.vitals
+        """Vitals of its machine, from its last hello or status; None: unknown."""
         self.refused_ahead_frames = 0
         """Frames of the present stream that were refused because they are ahead of time."""
         self.received_frames = self.received_bytes = 0
@@ -238,7 +240,7 @@ class ServerNode:
             self.warnings, self.fault_counts = (), {}
             self.refused_ahead_frames = 0
             self._rate_meter.clear()
-        self.hello = hello
+        self.hello, self.vitals = hello, hello.vitals
         self.has_connected, self.hello_t_ns = True, now_t_ns
         for stream in list(self.streams.values()):
             stream.unacked = Intervals()
@@ -278,6 +280,7 @@ class ServerNode:
             scene_content=hello.scene,
             calibration=self.estimator.assigned_or_node_calibration,
             calibration_source=self.estimator.calibration_source,
+            vitals=self.vitals,
         )
 
     def _find_session_stream(self, stream_id: str) -> SessionStream | None:

@@ -149,6 +149,7 @@ class Recorder:
             take=take,
             request=request,
             missed_slots_at_start=stream.missed_slots,
+            vitals_at_start=node.vitals,
             clock=stream.list_clock_offsets_since(seq_first),
         )
         return self._store.save(session)

@@ -229,6 +229,7 @@ def _stop(session: Session, node: NodeFacts) -> Session:
         "stopped_t_ns": node.now_t_ns,
         "state": "pending",
         "problem": None,
+        "vitals_at_stop": node.vitals,
     }
     present = node.find_stream(node.present_id) if node.present_id is not None else None
     if present is None or not node.is_connected:

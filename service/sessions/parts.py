@@ -21,6 +21,7 @@ from typing import Any, Literal, NamedTuple
 
 from devices.errors import FootTileError
 from devices.frames import ArrayInfo
+from devices.vitals import Vitals
 from service.estimation.calibration import Calibration
 from storage.intervals import NO_END, Intervals
 from storage.journal.journal import Journal
@@ -156,6 +157,7 @@ class NodeFacts:
         scene_content: content of that scene's file.
         calibration: calibration of its present tiles.
         calibration_source: origin of the calibration.
+        vitals: newest vitals of its machine; None: unknown.
     """
 
     now_t_ns: int = 0
@@ -173,6 +175,7 @@ class NodeFacts:
     scene_content: Mapping[str, Any] = field(default_factory=dict)
     calibration: Calibration | None = None
     calibration_source: Literal["node", "server"] = "node"
+    vitals: Vitals | None = None
 
     @property
     def present_id(self) -> str | None:

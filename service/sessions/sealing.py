@@ -56,7 +56,9 @@ def write_sealed_files(inputs: SessionInputs, folder: Path, ledger: Ledger) -> S
     notes: dict[str, object] = {
         **inputs.notes,
         "session": session.model_dump(
-            mode="json", include=_FIELDS_IN_FILE | ({"take"} if session.take else set())
+            mode="json",
+            include=_FIELDS_IN_FILE
+            | {name for name in _OPTIONAL_IN_FILE if getattr(session, name)},
         ),
         "ledger": ledger.model_dump(mode="json"),
     }
@@ -104,6 +106,7 @@ def write_sealed_files(inputs: SessionInputs, folder: Path, ledger: Ledger) -> S
 
 _FIELDS_IN_FILE = {"id", "name", "node", "started_t_ns", "stopped_t_ns", "parts", "scene"}
 """Fields of a session in the sealed file; names and notes may change later and are not in it."""
+_OPTIONAL_IN_FILE = ("take", "vitals_at_start", "vitals_at_stop")
 
 
 _T = TypeVar("_T")

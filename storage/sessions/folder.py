@@ -19,6 +19,7 @@ from typing import Any, Literal, NamedTuple
 from pydantic import BaseModel, ConfigDict, Field
 
 from devices.errors import FileFormatError, FootTileError, StorageError, UnknownError
+from devices.vitals import Vitals
 from storage.clock.log import ClockOffset
 from storage.documents import read_document, write_document
 from storage.durable_files import (
@@ -149,6 +150,10 @@ class Session(_Record):
     missed_slots_at_start: int = 0
     missed_slots_at_stop: dict[str, int] = Field(default_factory=dict)
     """Count by stream_id, of the stream at the stop, if the node was connected."""
+    vitals_at_start: Vitals | None = None
+    """Vitals of the node's machine when it was started."""
+    vitals_at_stop: Vitals | None = None
+    """Vitals of the node's machine when it was stopped."""
     max_lost_tail_frames: dict[str, int] = Field(default_factory=dict)
     """Count by stream_id, of parts that ended because the node went away."""
     is_abandoned: bool = False

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.types import OFFSET_NS_END, T_MONO_NS_END
+from devices.vitals import Vitals
 from service.protocol.codec import (
     CloseConnection,
     append_crc,
@@ -85,7 +86,12 @@ FROM_NODE = (
     ClockProbe(id=3),
     ClockSample(t_mono_ns=5, server_minus_node_ns=-77, uncertainty_ns=9),
     LossReport(stream_id="b" * 32, lost={"node_busy": ((0, 0), (5, 6))}),
-    NodeStatus(missed_slots=3, warnings=("T01: does not answer",), counts={"T01": {"stale": 4}}),
+    NodeStatus(
+        missed_slots=3,
+        warnings=("T01: does not answer",),
+        counts={"T01": {"stale": 4}},
+        vitals=Vitals(disk_free_bytes=10**9, recording_left_s=3e4, wifi_dbm=-61, is_throttled=True),
+    ),
 )
 FROM_SERVER = (
     ACK,

@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from devices.vitals import Vitals
 from tests.service.fake_node import FakeNode, Play
 from tests.service.recording import Recording
 from tests.service.running import Running
@@ -52,13 +53,13 @@ class Scripted:
         self.node.send(10, now=True)
         return session
 
-    def tell(self, *warnings: str) -> None:
+    def tell(self, *warnings: str, vitals: Vitals | None = None) -> None:
         """Have the server warn of the node's troubles."""
 
         def change() -> None:
             server: Any = self.running.server
             node = server.nodes.get("bench")
-            node.warnings = warnings
+            node.warnings, node.vitals = warnings, vitals
             server.notify_node_changed(node)
 
         self.running.call(change)

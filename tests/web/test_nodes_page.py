@@ -7,6 +7,7 @@ import re
 import pytest
 from playwright.sync_api import Route, expect
 
+from devices.vitals import Vitals
 from service.protocol.link import compute_fingerprint
 from tests.service.fake_node import FakeNode, Play
 from tests.service.running import closed
@@ -194,6 +195,22 @@ def test_a_card_has_the_trace_contact_and_warnings_of_its_node(
         expect(bench.locator(".node-notes")).to_contain_text("Tile S0 (mux 0x70 channel 0)")
         play.force_n = 0.0
         expect(bench.locator(".contact")).to_have_text("flight")
+        assert complaints(page) == []
+
+
+def test_a_card_has_the_vitals_of_its_nodes_machine(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    vitals = Vitals(cpu_celsius=54.3, recording_left_s=40_000.0, wifi_dbm=-61.0)
+    with Play(scripted.node, 15.0):
+        page = open_page(f"{scripted.url}/nodes")
+        bench = page.locator(card("bench"))
+        expect(page.locator(live("bench"))).to_have_count(1)
+        expect(bench.get_by_text("Machine")).to_be_hidden()
+        scripted.tell("the supply sags: use a 5 V 3 A supply and a short cable", vitals=vitals)
+        expect(bench.locator(".node-facts")).to_contain_text("54 °C, disk for 11 h, Wi-Fi -61 dBm")
+        expect(bench.get_by_text("Machine")).to_be_visible()
+        expect(bench.locator(".node-notes")).to_contain_text("use a 5 V 3 A supply")
         assert complaints(page) == []
 
 

@@ -17,6 +17,21 @@ const SLOW = 0.9;
 const WARNINGS_MAX = 3;
 const NODE_KEY = "foottile.node"; // node on the live page
 
+/**
+ * Vitals in short, without unknown ones; whatever is bad is among the node's warnings.
+ * @param {Partial<Vitals>} vitals
+ */
+export function vitalsText(vitals) {
+  const known = (value, text) => value === null || value === undefined ? [] : [text(value)];
+  return [
+    ...known(vitals.cpu_celsius, (celsius) => `${celsius.toFixed(0)} °C`),
+    ...known(vitals.load_per_core, (load) => `load ${(100 * load).toFixed(0)} %`),
+    ...known(vitals.recording_left_s, (s) => `disk for ${roughly(s)}`),
+    ...known(vitals.wifi_dbm, (dbm) => `Wi-Fi ${dbm.toFixed(0)} dBm`),
+    ...known(vitals.is_clock_synchronised, (is) => is ? "clock synchronised" : "clock not synchronised"),
+  ].join(", ");
+}
+
 /** Card of a node. */
 export class Card {
   constructor(name) {
@@ -44,7 +59,7 @@ export class Card {
     const strip = el("canvas", { cls: "node-trace", role: "img", "aria-label": `Ground reaction force of ${name} over the last 10 seconds` });
     this.trace = new SmallTrace(strip, () => this.node.stream_id);
     const facts = el("dl", { cls: "node-facts" });
-    this.facts = Object.fromEntries(["Frames/s", "Losses", "Backlog", "Tare"].map((title) => {
+    this.facts = Object.fromEntries(["Frames/s", "Losses", "Backlog", "Tare", "Machine"].map((title) => {
       const value = el("dd");
       const row = el("div", {}, el("dt", { text: title, cls: title === "Losses" ? "unseen" : "" }), value);
       facts.append(row);
@@ -155,6 +170,9 @@ export class Card {
     this.facts.Backlog.row.hidden = backlog < SHOWN_BACKLOG_S * (node.nominal_rate_hz || 400);
     this.facts.Tare.row.hidden = !node.tare || node.tare.undone;
     fact("Tare", node.tare ? localTime(new Date(node.tare.t_ns / 1e6)) : "", false);
+    const machine = node.connected ? vitalsText(node.vitals ?? {}) : "";
+    this.facts.Machine.row.hidden = !machine;
+    fact("Machine", machine, false);
     fact("Backlog", `${backlog.toLocaleString("en-GB")} frames`, false);
   }
 

@@ -16,6 +16,7 @@ from devices.clock import Clock, SystemClock, VirtualClock
 from devices.errors import UsageError, require_extra
 from devices.scene.hardware_sections import EMULATED, ServoSection
 from devices.scene.scene_file import Scene, load_scene
+from devices.vitals import Vitals, VitalsWarnings, read_vitals
 from service.cli.options import JsonOption, echo, print_json, show_progress, stdout
 
 if TYPE_CHECKING:
@@ -74,12 +75,16 @@ def doctor_command(
             if port == EMULATED:
                 opened_port = stack.enter_context(_open_servo(the_scene, wanted))
             found = diagnose_servo(opened_port, SystemClock(), wanted)
+    vitals = read_vitals(None) if name != EMULATED else Vitals()
     if as_json:
-        print_json(_make_json(name, adapter, diagnosis, port, found))
+        content = _make_json(name, adapter, diagnosis, port, found)
+        print_json(content | {"vitals": vitals.model_dump()})
     else:
         _print_diagnosis(name, adapter, diagnosis, the_scene)
         if found is not None:
             echo(f"Servo at {port}: {found.verdict}")
+        for warning in VitalsWarnings().update(vitals):
+            echo(f"Machine: {warning}")
     if not diagnosis.rates_hz:
         raise typer.Exit(1)
     if not diagnosis.is_rate_reached or (found is not None and not found.is_well):

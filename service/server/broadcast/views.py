@@ -176,6 +176,7 @@ def make_node_view(
         warnings=[*node.warnings, *node.refused_ahead_frames_warnings],
         compiling=is_compiling(),
         fault_counts=node.fault_counts,
+        vitals=node.vitals,
         last_t_ns=node.last_t_ns,
         last_seen_t_ns=node.last_seen_t_ns,
         recording=[session.id for session in recorder.list_recording(node.name)],

@@ -240,6 +240,7 @@ async def _receive_messages(socket: WebSocket, server: Server, link: NodeLink) -
             case NodeStatus():
                 node.present_stream.missed_slots = parsed.missed_slots
                 node.warnings, node.fault_counts = parsed.warnings, parsed.counts
+                node.vitals = parsed.vitals
                 server.notify_node_changed(node)
             case LossReport():
                 _find_announced_stream(node, parsed.stream_id).set_node_losses(parsed.lost)
