@@ -17,6 +17,7 @@ import { look } from "./common/login.js";
 import { quietly } from "./common/notices.js";
 import { ReplacementWarning } from "./common/replacement.js";
 import { loadModule } from "./common/request.js";
+import { Trials } from "./common/trials.js";
 import { inSunlight } from "./common/sunlight.js";
 import { byId, el, setText } from "./common/text.js";
 import { Actions } from "./live/actions.js";
@@ -53,7 +54,8 @@ const state = {
 
 inSunlight();
 const absence = new Absence();
-const alerts = addDeviceMenu();
+const trials = new Trials(() => link.serverNowMs(), () => state.cannotRecord);
+const alerts = addDeviceMenu(() => [trials.makeItem()]);
 const framePace = new FramePace();
 const pace = new Pace(draw);
 const redraw = () => {
@@ -118,7 +120,7 @@ const handlers = {
   },
 };
 
-const watchers = [absence, alerts].map((one) => (message) => one.watch(message));
+const watchers = [absence, alerts, trials].map((one) => (message) => one.watch(message));
 const link = new Link({ handlers, watchers });
 const status = new Status(link);
 
@@ -237,6 +239,7 @@ function tick() {
   byId("calibration-line").hidden = !node;
   setText(byId("calibration-name"), node?.calibration ? `Calibration “${node.calibration.name}”` : "No calibration");
   actions.draw();
+  trials.draw();
   lastSession.draw(node);
   if (node && !node.connected) history.update(node, null, trace.windowS, nowMs, tileTraces.column(bars.unit));
 }

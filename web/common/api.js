@@ -78,6 +78,12 @@ export const getTake = (take) => call("GET", `/takes/${id(take)}`);
 export const stopTake = (take) => stop("takes", take);
 /** @type {(take: string, marker: object) => Promise<TakeView>} */
 export const addTakeMarker = (take, marker) => call("POST", `/takes/${id(take)}/markers`, { body: marker });
+/** @type {(text: string) => Promise<TrialsView>} */
+export const setTrials = (text) => call("PUT", "/trials", { body: text });
+/** @type {(changes: object) => Promise<TrialsView>} */
+export const changeTrials = (changes) => call("PATCH", "/trials", { body: changes });
+/** @type {() => Promise<TrialsView>} */
+export const recordTrial = () => call("POST", "/trials/record", { body: {} });
 /** @type {(session: string) => Promise<SessionView>} */
 export const getSession = (session) => call("GET", `/sessions/${id(session)}`);
 /** @type {(session: string) => Promise<Page_MarkerView_>} */

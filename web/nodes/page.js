@@ -8,6 +8,7 @@ import { LOSSES_HELP } from "../common/losses.js";
 import { look } from "../common/login.js";
 import { inSunlight } from "../common/sunlight.js";
 import { byId, setText } from "../common/text.js";
+import { Trials } from "../common/trials.js";
 import { Card } from "./card.js";
 import { Takes } from "./take.js";
 
@@ -57,8 +58,9 @@ const handlers = {
 };
 
 const absence = new Absence();
-const alerts = addDeviceMenu();
-const watchers = [absence, alerts].map((one) => (message) => one.watch(message));
+const trials = new Trials(() => link.serverNowMs(), () => takes.page.cannotRecord());
+const alerts = addDeviceMenu(() => [trials.makeItem()]);
+const watchers = [absence, alerts, trials].map((one) => (message) => one.watch(message));
 const link = new Link({ handlers, watchers, rateHz: RATE_HZ });
 
 function updateNode(node) {
@@ -95,6 +97,7 @@ function write() {
   down.hidden = link.open || !link.failures && !all.length;
   setText(down, link.open ? "" : `Server link down${link.closeReason ? ` (${link.closeReason})` : ""}; reconnecting.`);
   takes.draw();
+  trials.draw();
 }
 
 function draw() {
