@@ -27,14 +27,14 @@ EDGES_PER_BATCH_MAX = 64
 """Most edges of a batch, 2560 a second: further ones are dropped and counted."""
 _KERNEL_EDGES_MAX = 1024
 """Edges that wait in the kernel, its limit; it drops the oldest, as a gap in `line_seqno`."""
-_REOPEN_NS = 1_000_000_000
 _DROP_WARNING_NS = 1_000_000_000
 """Time for which dropped edges are a warning."""
 
 
-def _request_line(scene: SyncSection, line: int, settings: LineSettings) -> LineRequest:
+def _request_line(scene: SyncSection, line: int | None, settings: LineSettings) -> LineRequest:
     import gpiod
 
+    assert line is not None  # noqa: S101  # the caller has checked
     with translate_gpio_errors(scene.gpiochip, [line], "[sync]"):
         return gpiod.request_lines(
             scene.gpiochip,
@@ -54,7 +54,7 @@ class EdgeSink(FrameSink, Protocol):
 class SyncInput:
     """Input line whose edges are read with each frame.
 
-    A line that fails later is a warning; it is requested again every second.
+    A line that fails later is a warning, and has no more edges.
 
     Args:
         scene: its section; `input_line` is set.
@@ -70,38 +70,28 @@ class SyncInput:
         """Sink of the present stream; None: frames and edges in flight are not stored."""
         self.dropped_edges = 0
         """Number of edges that came faster than they can be stored."""
-        self._scene = scene
         self._clock = clock
         self._edges: list[Edge] = []
-        self._number = self._line_seqno = 0
+        self._number = 0
         self._problem = ""
-        self._reopen_at_ns = 0
         self._dropped_at_ns: float = -math.inf
         with require_extra("gpio", "the sync line"):
-            import gpiod
-        self._is_rising_type = gpiod.EdgeEvent.Type.RISING_EDGE
-        self._request: LineRequest | None = self._open()
-
-    def _open(self) -> LineRequest:
-        from gpiod import LineSettings
-        from gpiod.line import Bias, Direction, Edge
-
-        scene = self._scene
+            from gpiod import LineSettings
+            from gpiod.line import Bias, Direction
+            from gpiod.line import Edge as EdgeType
         settings = LineSettings(
             direction=Direction.INPUT,
-            edge_detection=Edge[scene.edge.upper()],
+            edge_detection=EdgeType[scene.edge.upper()],
             bias=Bias[scene.bias.upper()],
             debounce_period=timedelta(microseconds=scene.debounce_us),
         )
-        assert scene.input_line is not None  # noqa: S101  # the caller has checked
-        self._line_seqno = 0
-        return _request_line(scene, scene.input_line, settings)
+        self._request = _request_line(scene, scene.input_line, settings)
 
     @property
     def warning(self) -> str:
         """Warning about the line; empty if there is none."""
         if self._problem:
-            return f"the sync line fails, and edges are lost; retry every second: {self._problem}"
+            return f"the sync line fails, and edges are lost until a restart: {self._problem}"
         if self._clock.now_ns() - self._dropped_at_ns < _DROP_WARNING_NS:
             return (
                 f"the sync line has more than {EDGES_PER_BATCH_MAX} edges in 25 ms; further ones "
@@ -124,34 +114,25 @@ class SyncInput:
 
     def close(self) -> None:
         """Release the line."""
-        if self._request is not None:
-            with suppress(OSError):
-                self._request.release()
+        with suppress(OSError):
+            self._request.release()
 
     def _read_edges(self) -> list[Edge]:
         new: list[Edge] = []
         try:
-            if self._request is None:
-                if self._clock.now_ns() < self._reopen_at_ns:
-                    return new
-                self._reopen_at_ns = self._clock.now_ns() + _REOPEN_NS
-                self._request, self._problem = self._open(), ""
-            if not self._request.wait_edge_events(0.0):
+            if self._problem or not self._request.wait_edge_events(0.0):
                 return new
             events = self._request.read_edge_events()
         except OSError as error:
             self._problem = error.strerror or str(error)
-            self.close()
-            self._request = None
-            self._reopen_at_ns = self._clock.now_ns() + _REOPEN_NS
             return new
         for event in events:
-            step = (event.line_seqno - self._line_seqno) % 2**32
-            self._line_seqno = event.line_seqno
+            # The kernel's number of 32 bits may wrap, and leaps over events that it dropped.
+            step = (event.line_seqno - self._number) % 2**32
             self._number += step
             is_kept = len(self._edges) + len(new) < EDGES_PER_BATCH_MAX
             if is_kept:
-                is_rising = event.event_type is self._is_rising_type
+                is_rising = event.event_type is event.Type.RISING_EDGE
                 new.append(Edge(self._number, event.timestamp_ns, is_rising))
             if dropped := step - is_kept:
                 self.dropped_edges += dropped
@@ -174,10 +155,9 @@ class RecordingLine:
         with require_extra("gpio", "the recording line"):
             from gpiod import LineSettings
             from gpiod.line import Direction
-        assert scene.output_line is not None  # noqa: S101  # the caller has checked
-        self._line = scene.output_line
-        settings = LineSettings(direction=Direction.OUTPUT)  # low
-        self._request = _request_line(scene, self._line, settings)
+        self._line = scene.output_line or 0
+        low = LineSettings(direction=Direction.OUTPUT)
+        self._request = _request_line(scene, scene.output_line, low)
 
     def drive(self, *, high: bool) -> None:
         """Drive the line; a failure is a warning."""

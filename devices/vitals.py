@@ -6,13 +6,13 @@ The bits of `get_throttled` are those of the Raspberry Pi's documentation (`vcge
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import subprocess
-from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated
 
 from pydantic import Field
 
@@ -151,47 +151,26 @@ def _read_wifi_dbm(root: Path) -> float | None:
     return found if found is not None and found < 0 else None  # else no dBm, or no link
 
 
-class _Rule(NamedTuple):
-    """Warning about one value."""
-
-    name: str
-    is_bad: Callable[[Any], bool]
-    is_good: Callable[[Any], bool]
-    """Between the two it stays as it was."""
-    text: str
-
-
-_RULES = (
-    _Rule(
-        *("recording_left_s", lambda s: s < 3600, lambda s: s > 7200),
-        "the journal's disk has room for less than an hour of recording: free space on it",
+_SUPPLY = "use a 5 V 3 A supply and a short cable"
+_RULES: tuple[tuple[str, float, float, str], ...] = (
+    (
+        "recording_left_s",
+        -3600,
+        -7200,
+        "the journal's disk is full in less than an hour: free space on it",
     ),
-    _Rule(
-        *("cpu_celsius", lambda t: t >= 80, lambda t: t < 75),
-        "the CPU is at 80 °C or more and will be slowed down: cool it",
+    ("cpu_celsius", 80, 75, "the CPU is at 80 °C, where a Raspberry Pi is slowed down: cool it"),
+    ("is_undervolted", 1, 0, f"the supply sags below 4.63 V: {_SUPPLY}"),
+    (
+        *("was_undervolted", 1, 0),
+        f"the supply has sagged below 4.63 V since the machine was started: {_SUPPLY}, and restart",
     ),
-    _Rule(
-        *("is_undervolted", bool, lambda v: not v),
-        "the supply sags below 4.63 V: use a 5 V 3 A supply and a short cable",
-    ),
-    _Rule(
-        *("was_undervolted", bool, lambda v: not v),
-        "the supply has sagged below 4.63 V since the start of the machine: use a 5 V 3 A supply "
-        "and a short cable, then restart it",
-    ),
-    _Rule(
-        *("is_throttled", bool, lambda v: not v),
-        "the CPU is slowed down by heat or by the supply: cool it, and use a 5 V 3 A supply",
-    ),
-    _Rule(
-        *("load_per_core", lambda load: load > 1.5, lambda load: load < 1),
-        "the CPU has more work than it can do: end other programs",
-    ),
-    _Rule(
-        *("wifi_dbm", lambda dbm: dbm < -75, lambda dbm: dbm > -70),
-        "the Wi-Fi signal is below -75 dBm: bring the access point nearer, or use a cable",
-    ),
+    ("is_throttled", 1, 0, f"the CPU is slowed down by heat or supply: cool it, or {_SUPPLY}"),
+    ("wifi_dbm", 75, 70, "the Wi-Fi signal is below -75 dBm: bring the access point nearer"),
 )
+"""Name, threshold of a warning, threshold of its end, text; values that are bad if low by their
+negative. Between the thresholds it stays as it was."""
+_NEGATIVE = ("recording_left_s", "wifi_dbm")
 
 
 class VitalsWarnings:
@@ -203,19 +182,15 @@ class VitalsWarnings:
 
     def update(self, vitals: Vitals) -> tuple[str, ...]:
         """Return the present warnings after new vitals; an unknown value ends one, too."""
-        return tuple(self._iterate_texts(vitals))
-
-    def _iterate_texts(self, vitals: Vitals) -> Iterator[str]:
-        for rule in _RULES:
-            value, calm = getattr(vitals, rule.name), self._calm_updates
-            if value is not None and rule.is_bad(value):
-                calm[rule.name] = 0
-            elif rule.name in calm and (value is None or rule.is_good(value)):
-                calm[rule.name] += 1
-                if calm[rule.name] >= _CALM_UPDATES:
-                    del calm[rule.name]
-            elif rule.name in calm:
-                calm[rule.name] = 0
-            is_repetition = rule.name == "was_undervolted" and "is_undervolted" in calm
-            if rule.name in calm and not is_repetition:
-                yield rule.text
+        calm = self._calm_updates
+        for name, bad, good, _ in _RULES:
+            value = getattr(vitals, name)
+            level = -math.inf if value is None else -value if name in _NEGATIVE else value
+            if level >= bad:
+                calm[name] = 0
+            elif name in calm:
+                calm[name] = calm[name] + 1 if level <= good else 0
+                if calm[name] >= _CALM_UPDATES:
+                    del calm[name]
+        present = calm.keys() - ({"was_undervolted"} if "is_undervolted" in calm else set())
+        return tuple(text for name, _, _, text in _RULES if name in present)

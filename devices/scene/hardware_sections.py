@@ -4,22 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidationInfo,
-    field_validator,
-    model_validator,
-)
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from devices.chips.dynamixel.protocol import FIRMWARES
 from devices.chips.pressure_chip import ChipSettings, Registers
 from devices.chips.pressure_chips import PRESSURE_CHIPS
 from devices.chips.tca9548a import ADDRESSES, CHANNELS
 from devices.errors import UsageError
-from devices.types import Identifier, check_user_name
+from devices.types import Identifier
 
 # A quantity beyond a million is a typing error or a wrong unit.
 Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
@@ -243,9 +235,7 @@ class SyncSection(SceneSection):
     input_line: GpioLineNumber | None = None
     """Line whose edges become markers; absent: not wired."""
     edge: Literal["rising", "falling", "both"] = "rising"
-    label: Annotated[
-        str, Field(min_length=1, max_length=100, pattern=r"\S"), AfterValidator(check_user_name)
-    ] = "sync"
+    label: Name = "sync"
     """Label of the markers; with `edge = "both"` the edge's direction follows it."""
     bias: Literal["as_is", "disabled", "pull_up", "pull_down"] = "as_is"
     debounce_us: Annotated[int, Field(ge=0, le=1_000_000)] = 0
@@ -259,8 +249,7 @@ class SyncSection(SceneSection):
 
         A debounced edge is stamped at a tick of the kernel, of up to 10 ms, after that time.
         """
-        debounce_ns = 1000 * self.debounce_us + 10_000_000 if self.debounce_us else 0
-        return 200_000 + debounce_ns
+        return 200_000 + (1000 * self.debounce_us + 10_000_000 if self.debounce_us else 0)
 
     @model_validator(mode="after")
     def _lines_are_named_and_differ(self) -> Self:

@@ -322,9 +322,7 @@ class RunningNode:
             warnings=(
                 *self._stall_warnings(),
                 *self._health.warnings,
-                *self._line_warnings,
-                *self._vitals_warnings,
-                *self._journal.disk_refusal_warnings,
+                *self._machine_warnings,
                 *(problem[:_PROBLEM_LENGTH] for problem in self._journal.problems[:_PROBLEMS_MAX]),
             ),
             counts={serial: dict(counts) for serial, counts in self._health.fault_counts.items()},
@@ -361,10 +359,11 @@ class RunningNode:
             self._recording_line.drive(high=is_recording and not self._current_stream.has_ended)
 
     @property
-    def _line_warnings(self) -> tuple[str, ...]:
-        """Warning about the recording line; empty if it is as it should be."""
-        line = self._recording_line
-        return (line.warning,) if line is not None and line.warning else ()
+    def _machine_warnings(self) -> tuple[str, ...]:
+        """Warnings about the recording line, the vitals and the disk."""
+        line = self._recording_line.warning if self._recording_line is not None else ""
+        warnings = (line, *self._vitals_warnings, *self._journal.disk_refusal_warnings)
+        return tuple(filter(None, warnings))
 
     def _stall_warnings(self) -> tuple[str, ...]:
         """Return a warning if acquisition is stalled; this process and its link go on."""
@@ -377,12 +376,7 @@ class RunningNode:
         """Report stalls of acquisition and problems of the disk, and their end."""
         while True:
             await asyncio.sleep(_WARNINGS_INTERVAL_S)
-            warnings = (
-                *self._stall_warnings(),
-                *self._line_warnings,
-                *self._vitals_warnings,
-                *self._journal.disk_refusal_warnings,
-            )
+            warnings = (*self._stall_warnings(), *self._machine_warnings)
             kinds = tuple(warning.partition(";")[0] for warning in warnings)
             for kind in kinds:
                 if kind not in self._reported_warnings:

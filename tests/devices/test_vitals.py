@@ -133,9 +133,8 @@ BAD: list[tuple[str, Any, Any, str]] = [
     ("recording_left_s", 3000.0, 8000.0, "free space"),
     ("cpu_celsius", 81.0, 60.0, "cool it"),
     ("is_undervolted", True, False, "use a 5 V 3 A supply and a short cable"),
-    ("was_undervolted", True, False, "since the start of the machine"),
-    ("is_throttled", True, False, "slowed down by heat or by the supply"),
-    ("load_per_core", 2.0, 0.5, "end other programs"),
+    ("was_undervolted", True, False, "since the machine was started"),
+    ("is_throttled", True, False, "slowed down by heat or supply"),
     ("wifi_dbm", -80.0, -60.0, "access point"),
 ]
 
@@ -154,7 +153,7 @@ def test_a_warning_begins_at_once_and_ends_after_half_a_minute(
         assert all(words in text for text in texts)
 
 
-@given(levels=st.lists(st.floats(75.0, 79.9), min_size=1, max_size=40))
+@given(levels=st.lists(st.floats(75.1, 79.9), min_size=1, max_size=40))
 def test_between_the_thresholds_a_warning_stays_as_it_is(levels: list[float]) -> None:
     cool, hot = VitalsWarnings(), VitalsWarnings()
     hot.update(Vitals(cpu_celsius=85.0))

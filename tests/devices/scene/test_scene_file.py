@@ -280,7 +280,7 @@ def test_a_wrong_type_or_no_finite_number_is_refused_and_not_converted(section: 
         ("", "[sync]\nedge = 'both'", "sync: names no line, or one line twice"),
         ("", "[sync]\ninput_line = 4\noutput_line = 4", "sync: names no line, or one line twice"),
         ("", "[sync]\ninput_line = 4\nedge = 'any'", "sync.edge"),
-        ("", "[sync]\ninput_line = 4\nlabel = ' '", "sync.label"),
+        ("", "[sync]\ninput_line = 4\nlabel = 'a b'", "sync.label"),
         ("", "[sync]\ninput_line = 4\ndebounce_us = -1", "sync.debounce_us"),
         ("", "[reference]\nn_per_v = 30", "key 'reference.zero_v' is missing"),
         ("", "[reference]\nzero_v = 1.65", "key 'reference.n_per_v' is missing"),

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from storage.sessions.folder import SessionsFolder
 from storage.sessions.metadata import read_existing_markers
 from tests.devices.array.gpio_chip import FileChip
 from tests.service.cli.outcome import static_only
@@ -124,7 +125,12 @@ def test_a_node_alone_has_its_edges_in_its_session(
     (folder,) = (tmp_path / "node" / "sessions").iterdir()
     markers = read_existing_markers(folder / "markers.parquet")
     assert [(m.t_mono_ns, m.bound_ns) for m in markers] == [(t, BOUND_NS) for t in sent]
-    assert "3 edges of the sync line are lost" in (folder / "session.json").read_text()
+    session = SessionsFolder(folder.parent).load(folder.name)
+    assert session.problem is not None
+    assert "3 edges of the sync line are lost" in session.problem
+    assert session.vitals_at_start is not None
+    assert session.vitals_at_start.disk_free_bytes
+    assert (session.vitals_at_stop is None) == is_killed
     proof = foottile("verify", tmp_path / "node", "--json")
     assert proof.ended(20.0) == 0, (proof.out, proof.err)
     export = foottile(
@@ -144,6 +150,6 @@ def test_a_chip_that_is_not_there_is_said_at_the_start(
 ) -> None:
     (chip.path / "line17").unlink()
     process = leg("--record", "trial")
-    assert process.ended(20.0) == 1
+    assert process.ended(60.0) == 1
     assert any("lines 17: GPIO lines cannot be used" in line for line in process.err), process.err
     assert json.dumps(process.err).count("Check [sync]") == 1

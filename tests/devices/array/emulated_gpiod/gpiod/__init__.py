@@ -28,7 +28,7 @@ class _Request:
         self._settings = settings
         self._path = chip / f"line{line}"
         self._is_input = settings.direction is globals()["line"].Direction.INPUT
-        self._seqno = 0
+        self._seqno = 0  # of 32 bits
         if self._is_input:
             # For writing, too: else it would be readable at its end without a writer.
             self._fd = os.open(self._path, os.O_RDWR | os.O_NONBLOCK)
@@ -46,7 +46,7 @@ class _Request:
             wanted = self._settings.edge_detection.name
             if wanted not in ("BOTH", "RISING" if is_rising else "FALLING"):
                 continue
-            self._seqno += 1 + lost
+            self._seqno = (self._seqno + 1 + lost) % 2**32
             kind = EdgeEvent.Type.RISING_EDGE if is_rising else EdgeEvent.Type.FALLING_EDGE
             events.append(EdgeEvent(kind.value, t_ns, 0, self._seqno, self._seqno))
         return events
