@@ -123,8 +123,10 @@ def _calibrate_on_rig(
     scene: Scene, parts_seed: int, folder: Path | None, progress: ProgressCallback
 ) -> Calibration:
     serial = scene.tile[0].serial
-    # The name contains version and rig scene, defaults too, because the result depends on all.
-    made_by = hashlib.sha256(f"{SOFTWARE_VERSION}/{parts_seed}/{scene.model_dump_json()}".encode())
+    # The name contains version and rig scene, defaults too, because the result depends on all but
+    # the sync lines.
+    rig = scene.model_dump_json(exclude={"sync"})
+    made_by = hashlib.sha256(f"{SOFTWARE_VERSION}/{parts_seed}/{rig}".encode())
     name = f"{serial}-{made_by.hexdigest()[:16]}.json"
     kept = folder / name if folder is not None else None
     if kept is not None and (found := _read_cached(kept, serial, progress)) is not None:
