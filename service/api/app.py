@@ -60,6 +60,7 @@ _PAGES = {
     "/sessions": "sessions.html",
     "/sessions/{session_id}": "session.html",
     "/docs": "docs.html",
+    "/worker.js": "worker.js",  # its folder is the scope of a service worker
 }
 _SWAGGER_FILES = ("swagger-ui-bundle.js", "swagger-ui.css")
 

@@ -89,6 +89,8 @@ _MEDIA_TYPES = {
     ".css": "text/css",
     ".js": "text/javascript",
     ".svg": "image/svg+xml",
+    ".png": "image/png",
+    ".webmanifest": "application/manifest+json",
 }
 """Media types, the same on every machine: `mimetypes` would read the machine's own tables."""
 

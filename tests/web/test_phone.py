@@ -8,6 +8,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from tests.service.fake_node import Play
+from tests.waiting import until
 from tests.web.pages import PHONE, SMALL_PHONE, OpenPage, complaints, complaints_at, live
 from tests.web.scripted import Scripted
 
@@ -94,7 +95,7 @@ def test_the_screen_is_locked_on_and_again_when_the_page_is_back(
     expect(page.locator("#notices")).not_to_contain_text("dark")
     assert page.evaluate("locks.length") == 2
     page.goto(f"{scripted.url}/nodes")  # remembered
-    page.wait_for_function("locks.length === 1")
+    until(lambda: page.evaluate("locks.length === 1"))
     page.evaluate("refuses = true; locks[0].release()")
     page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
     expect(page.locator("#notices")).to_contain_text("perhaps to save energy")
@@ -188,7 +189,7 @@ def test_after_sleep_a_force_is_drawn_within_a_second_and_what_was_missed_is_sai
         ):
             expect(notices).to_contain_text(text)
         assert page.evaluate("opened.length") == 2
-        page.wait_for_function("frameMs !== null")
+        until(lambda: page.evaluate("frameMs !== null"))
         assert page.evaluate("frameMs - resumedMs") < 1000.0
         assert complaints(page) == []
 

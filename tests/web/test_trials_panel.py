@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
 import pytest
 from playwright.sync_api import expect
@@ -107,8 +108,10 @@ def test_an_armed_trial_begins_at_the_contact_and_can_be_disarmed(
         expect(page.locator("#recordings")).to_be_hidden()
 
 
-def test_a_viewer_sees_the_list_and_cannot_press(script: object, open_page: OpenPage) -> None:
-    scripted: Scripted = script(token=TOKEN)  # type: ignore[operator]
+def test_a_viewer_sees_the_list_and_cannot_press(
+    script: Callable[..., Scripted], open_page: OpenPage
+) -> None:
+    scripted = script(token=TOKEN)
     scripted.running.http.put(
         "/trials", content=b"mud 1, mud 2", headers={"Content-Type": "text/plain"}
     )

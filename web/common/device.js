@@ -18,6 +18,7 @@ export function addDeviceMenu(more = () => []) {
   const button = menuButton("Screen and alerts of this device", () => { draw(); return [screen, sound, vibration, ...more()]; });
   const awake = new Awake(draw);
   for (const one of [screen, sound, vibration]) one.addEventListener("click", () => draw());
+  navigator.serviceWorker?.register("/worker.js").catch(() => {}); // in secure contexts, where the browser allows it
   button.id = "device";
   byId("sun").after(button);
   draw();
