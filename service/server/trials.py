@@ -27,6 +27,7 @@ from service.server.session_store import SessionStore
 from service.server.takes import Take, TakeRecorder
 from storage.documents import read_document, write_document
 from storage.durable_files import try_set_aside_and_describe
+from storage.intervals import NO_END
 from storage.sessions.folder import IdempotencyRecord, Session
 
 log = logging.getLogger("foottile.trials")
@@ -250,11 +251,8 @@ class TrialRecorder:
     def advance(self) -> None:
         """Stop the running trial when its time is over; stop waiting while no node is connected."""
         stored = self._list
-        if stored.stop_at_t_ns is not None and server_utc_ns() >= stored.stop_at_t_ns:
-            running = self._list_running()
-            if running:
-                self._takes.stop_take(str(stored.take))
-            self._save(stop_at_t_ns=None)
+        if server_utc_ns() >= (stored.stop_at_t_ns or NO_END) and (running := self._list_running()):
+            self._takes.stop_take(str(stored.take))
             self._on_change(running)
         if self._is_armed and not any(
             node.is_connected for node in self._nodes if stored.node in (None, node.name)
@@ -275,13 +273,10 @@ class TrialRecorder:
                 self._make_trial_view(i, row, sessions.get(i, []))
                 for i, row in enumerate(stored.trials)
             ],
+            **stored.model_dump(include={"next_index", "node", "start_at_contact", "stop_after_s"}),
             text=format_trials(stored.trials),
-            next_index=stored.next_index,
             next_name=self._next_name,
             last_index=wanted.get(stored.take or ""),
-            node=stored.node,
-            start_at_contact=stored.start_at_contact,
-            stop_after_s=stored.stop_after_s,
             is_armed=self._is_armed,
             take=stored.take if is_running else None,
             stop_at_t_ns=stored.stop_at_t_ns if is_running else None,
