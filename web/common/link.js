@@ -47,7 +47,7 @@ export class Link {
     // After sleep or loss of the network reconnect at once.
     addEventListener("online", () => this.wake());
     document.addEventListener("visibilitychange", () => document.hidden || this.wake());
-    addEventListener("pageshow", () => this.wake());
+    addEventListener("pageshow", ({ persisted }) => this.wake(persisted)); // the browser's cache closes sockets
   }
 
   async connect() {
@@ -164,10 +164,10 @@ export class Link {
     this.onChange();
   }
 
-  /** Reconnect at once if the socket is missing or stale; some clocks stand still during sleep, the date does not. */
-  wake() {
+  /** Reconnect at once if the socket is missing, dead or stale; some clocks stand still during sleep, the date does not. */
+  wake(isDead = false) {
     const silentMs = Math.max(performance.now() - this.receivedMs, Date.now() - this.receivedDateMs);
-    if (this.socket && silentMs > STALE_AFTER_MS) this.lost("no messages");
+    if (this.socket && (isDead || silentMs > STALE_AFTER_MS)) this.lost("no messages");
     if (this.retry === null || this.socket) return;
     this.waitS = FIRST_WAIT_S;
     this.connect();
