@@ -221,6 +221,13 @@ type Ledger = {
   missed_slots: number;
 };
 
+type ListedTrial = {
+  name: string;
+  tags?: Array<string>;
+  subject?: string;
+  notes?: string;
+};
+
 type LogIn = {
   ticket?: string | null;
 };
@@ -689,15 +696,8 @@ type TileView = {
   full_scale_n: number | null;
 };
 
-type Trial = {
-  name: string;
-  tags?: Array<string>;
-  subject?: string;
-  notes?: string;
-};
-
 type TrialList = {
-  trials: Array<Trial>;
+  trials: Array<ListedTrial>;
 };
 
 type TrialView = {

@@ -64,7 +64,7 @@ _TrialTag = Annotated[
 ]
 
 
-class Trial(StrictModel):
+class ListedTrial(StrictModel):
     """Row of the list: description of the sessions to record."""
 
     name: _TrialName = Field(examples=["mud 1"])
@@ -73,7 +73,7 @@ class Trial(StrictModel):
     notes: Annotated[str, Field(max_length=10_000), AfterValidator(check_user_text)] = ""
 
 
-class _StoredTrial(Trial):
+class _StoredTrial(ListedTrial):
     takes: tuple[str, ...] = ()
     """Takes in which it was recorded, the latest last."""
 
@@ -90,7 +90,7 @@ class _StoredTrials(StrictModel):
     """Time at which that take is stopped, server's UTC."""
 
 
-def parse_trials(text: str) -> tuple[Trial, ...]:
+def parse_trials(text: str) -> tuple[ListedTrial, ...]:
     """Parse a text: a trial a line, `name; tag, tag`; a line without `;` may name several trials.
 
     Empty lines, and lines that begin with `#`, are ignored.
@@ -98,14 +98,14 @@ def parse_trials(text: str) -> tuple[Trial, ...]:
     Raises:
         UsageError: a line is no trial.
     """
-    trials: list[Trial] = []
+    trials: list[ListedTrial] = []
     for number, line in enumerate(text.removeprefix("\ufeff").replace("\r\n", "\n").split("\n"), 1):
         if not line.strip() or line.strip().startswith("#"):
             continue
         names, has_tags, tags = line.partition(";")
         try:
             trials += [
-                Trial(name=name, tags=tuple(tag for tag in tags.split(",") if tag.strip()))
+                ListedTrial(name=name, tags=tuple(tag for tag in tags.split(",") if tag.strip()))
                 for name in ([names] if has_tags else names.split(","))
             ]
         except ValidationError as error:
@@ -118,7 +118,7 @@ def parse_trials(text: str) -> tuple[Trial, ...]:
     return tuple(trials)
 
 
-def format_trials(trials: Sequence[Trial]) -> str:
+def format_trials(trials: Sequence[ListedTrial]) -> str:
     """Return the text that `parse_trials` reads; subjects and notes are not in it."""
     return "".join(
         f"{one.name}; {', '.join(one.tags)}".rstrip() + "\n"
@@ -169,7 +169,7 @@ class TrialRecorder:
         except FileFormatError as error:
             self.file_problems = [f"list of trials: {try_set_aside_and_describe(path, error)}"]
 
-    def set_trials(self, trials: Sequence[Trial]) -> None:
+    def set_trials(self, trials: Sequence[ListedTrial]) -> None:
         """Replace the list; equal rows at its beginning keep their recordings and the place.
 
         Raises:

@@ -67,6 +67,7 @@ export class Awake {
   async lockScreen() {
     this.lock = await navigator.wakeLock.request("screen");
     this.lock.addEventListener("release", () => {
+      if (document.hidden) return; // requested again when the page is shown
       this.reason = REFUSED;
       this.onChange();
     });

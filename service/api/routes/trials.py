@@ -16,7 +16,7 @@ from service.api.routes.common import (
     problem_responses,
 )
 from service.protocol.live import TrialsView
-from service.server.trials import STOP_AFTER_S_MAX, TRIALS_MAX, Trial, parse_trials
+from service.server.trials import STOP_AFTER_S_MAX, TRIALS_MAX, ListedTrial, parse_trials
 
 router = APIRouter(prefix="/trials", tags=["trials"])
 
@@ -24,7 +24,7 @@ router = APIRouter(prefix="/trials", tags=["trials"])
 class TrialList(StrictModel):
     """List of trials."""
 
-    trials: Annotated[tuple[Trial, ...], Field(max_length=TRIALS_MAX)]
+    trials: Annotated[tuple[ListedTrial, ...], Field(max_length=TRIALS_MAX)]
 
 
 class ChangeTrials(StrictModel):

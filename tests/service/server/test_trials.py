@@ -14,16 +14,16 @@ from pydantic import ValidationError
 
 from devices.errors import FootTileError, StateError, UsageError
 from service.server.takes import Take
-from service.server.trials import Trial, TrialRecorder, format_trials, parse_trials
+from service.server.trials import ListedTrial, TrialRecorder, format_trials, parse_trials
 
 _TEXT = st.text(
     st.characters(codec="utf-8", exclude_categories=("Cc", "Cs")), min_size=1, max_size=12
 )
 
 
-def _make_trial_or_none(name: str, tags: list[str]) -> Trial | None:
+def _make_trial_or_none(name: str, tags: list[str]) -> ListedTrial | None:
     try:
-        return Trial(name=name, tags=tuple(tags))
+        return ListedTrial(name=name, tags=tuple(tags))
     except ValidationError:
         return None
 
@@ -66,7 +66,7 @@ class Stub:
 
 
 @given(st.lists(TRIALS, max_size=20))
-def test_the_text_of_a_list_is_parsed_to_the_list(trials: list[Trial]) -> None:
+def test_the_text_of_a_list_is_parsed_to_the_list(trials: list[ListedTrial]) -> None:
     assert parse_trials(format_trials(trials)) == tuple(trials)
 
 
@@ -105,7 +105,7 @@ def test_no_order_of_steps_loses_a_row_and_only_a_success_advances(
     stub = Stub()
     trials = stub.make(path)
     names = [f"trial {i}" for i in range(count)]
-    trials.set_trials([Trial(name=name) for name in names])
+    trials.set_trials([ListedTrial(name=name) for name in names])
     recorded = [0] * count
     for step in steps:
         before = trials.make_view()
@@ -158,7 +158,7 @@ def test_a_longer_list_keeps_what_was_recorded(tmp_path: Path) -> None:
     trials.set_trials(parse_trials("b, a"))
     assert (trials.make_view().next_name, trials.make_view().last_index) == ("b", None)
     with pytest.raises(UsageError, match="at most 1000"):
-        trials.set_trials([Trial(name="x")] * 1001)
+        trials.set_trials([ListedTrial(name="x")] * 1001)
 
 
 def test_a_damaged_file_is_set_aside_and_named(tmp_path: Path) -> None:
