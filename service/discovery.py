@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import logging
-import socket
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -110,7 +109,7 @@ class Discovery:
         self._on_announced = on_announced
         self._report = report
         self._reported = ""
-        self._names: dict[str, dict[str, None]] = {kind: {} for kind in browsed}
+        self._names: dict[str, dict[str, None]] = {kind: {} for kind in browsed}  # in their order
         self._browsed_s = 0.0
         self._interfaces: list[str | int] = []
         self._open: AsyncZeroconf | None = None
@@ -150,11 +149,17 @@ class Discovery:
                     before = found
                     if is_changed or self._has_conflict():
                         await self._close()
-                        await self._open_on(library.AsyncZeroconf, found)
-                        self._interfaces = found
+                        if found:
+                            self._open = library.AsyncZeroconf(interfaces=found)
+                            await self._open.zeroconf.async_wait_for_start()
+                            await self._browse(self._open)
+                            await self._announce(self._open)
+                        self._interfaces, self._reported = found, ""
                 except Exception as error:  # of a network that changes, or a bug: never the end
-                    what = str(error) or type(error).__name__
-                    self._report_change(f"servers and nodes are not found by themselves: {what}")
+                    what = f"servers and nodes are not found by themselves: {error!r}"
+                    if what != self._reported:
+                        self._report(what)
+                    self._reported = what
                     with suppress(Exception):
                         await self._close()
                 await asyncio.sleep(_POLL_S)
@@ -180,18 +185,6 @@ class Discovery:
             await self._browse(opened)
         return found
 
-    async def _open_on(
-        self, make: Callable[..., AsyncZeroconf], interfaces: list[str | int]
-    ) -> None:
-        if not interfaces:
-            return
-        self._open = make(interfaces=interfaces)
-        await self._open.zeroconf.async_wait_for_start()
-        await self._browse(self._open)
-        if self._announcement is not None:
-            await self._announce(self._open, self._announcement)
-        self._reported = ""
-
     async def _browse(self, opened: AsyncZeroconf) -> None:
         from zeroconf import ServiceStateChange
         from zeroconf.asyncio import AsyncServiceBrowser
@@ -212,11 +205,13 @@ class Discovery:
                 opened.zeroconf, list(self._names), handlers=[on_change]
             )
 
-    async def _announce(self, opened: AsyncZeroconf, wanted: Announcement) -> None:
-        """Announce the service under the first free name."""
+    async def _announce(self, opened: AsyncZeroconf) -> None:
+        """Announce the service, if there is one, under the first free name."""
         from zeroconf import NonUniqueNameException
         from zeroconf.asyncio import AsyncServiceInfo
 
+        if (wanted := self._announcement) is None:
+            return
         for number in range(1, _NAMES_MAX):
             mark = "" if number == 1 else f"-{number}"
             info = AsyncServiceInfo(
@@ -258,11 +253,6 @@ class Discovery:
         if opened is not None:
             await opened.async_close()
 
-    def _report_change(self, message: str) -> None:
-        if message != self._reported:
-            self._report(message)
-        self._reported = message
-
 
 _TXT, _IN = 16, 1  # RFC 1035
 
@@ -296,15 +286,12 @@ def _list_adapters() -> list[tuple[int, _Interface]]:
     import ifaddr
 
     found = [
-        (adapter.index or 0, ipaddress.ip_interface(f"{_plain(ip.ip)}/{ip.network_prefix}"))
+        (adapter.index or 0, ipaddress.ip_interface(f"{address}/{ip.network_prefix}"))
         for adapter in ifaddr.get_adapters()
         for ip in adapter.ips
+        for address in (ip.ip if isinstance(ip.ip, str) else ip.ip[0],)
     ]
     return [(index, ip) for index, ip in found if not ip.ip.is_loopback]
-
-
-def _plain(address: str | tuple[str, int, int]) -> str:
-    return address if isinstance(address, str) else address[0].partition("%")[0]
 
 
 async def _is_host_taken(opened: AsyncZeroconf, host: str) -> bool:
@@ -329,19 +316,9 @@ def _describe(info: AsyncServiceInfo) -> FoundService:
         name=info.name.removesuffix(f".{info.type}"),
         host=str(info.server).rstrip("."),
         port=info.port or 0,
-        addresses=tuple(map(_name_zone, [*filter(is_near, addresses)] or addresses)),
+        addresses=tuple([*filter(is_near, addresses)] or addresses),
         texts=texts,
     )
-
-
-def _name_zone(address: str) -> str:
-    """Return a scoped address with the name of its interface in place of the index."""
-    plain, mark, zone = address.partition("%")
-    if not zone.isdecimal():
-        return address
-    with suppress(OSError):
-        zone = socket.if_indextoname(int(zone))
-    return plain + mark + zone
 
 
 _LABEL_BYTES_MAX = 63

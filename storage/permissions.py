@@ -25,17 +25,8 @@ from storage.durable_files import (
 )
 
 _OUR_NAMES = {
-    *(
-        LOCK_NAME,
-        ".writable",
-        "journal",
-        "nodes",
-        "server.json",
-        "sessions",
-        "tls",
-        "token",
-        "trash",
-    ),
+    *(LOCK_NAME, ".writable", "journal", "nodes", "server.json", "sessions", "token", "trash"),
+    "tls",  # certificates
     "demo",  # a data folder of its own, within the user's
     "servers",  # foottile.local_server keeps it beside a node's journal
 }

@@ -15,6 +15,7 @@ from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.api.access import SAFE_METHODS, parse_host
+from service.api.app import find_page_folder
 from service.api.certificates import CA_NAME
 from service.api.settings import LimitSettings
 
@@ -25,29 +26,6 @@ _HEADERS = {
     "referrer-policy": "no-referrer",
     "cache-control": "no-store",
 }
-_PAGE = Template("""<!doctype html>
-<html lang="en">
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width">
-<title>FootTile: trust this server</title>
-<h1>Trust this FootTile server</h1>
-<p>Compare this fingerprint (SHA-256) with the server's terminal. If it differs, stop: somebody else
-answers here.</p>
-<p><code>$fingerprint</code></p>
-<p><a href="/$file">Load the certificate</a>, then:</p>
-<h2>iPhone, iPad (Safari)</h2>
-<ol>
-<li>Settings, Profile Downloaded: Install.
-<li>Settings, General, About, Certificate Trust Settings: switch it on.
-</ol>
-<h2>Android (Chrome)</h2>
-<ol>
-<li>Settings, search for "CA certificate": Install anyway, and choose the file.
-</ol>
-<h2>Laptop, node</h2>
-<p>Import it in the browser's settings; commands and nodes: <code>--ca $file</code></p>
-<p>It can certify only local names and addresses. Done? <a href="$url">Open FootTile</a>.</p>
-""")
 
 
 def make_ca_page(certificate: bytes, fingerprint: str, port: int) -> ASGIApp:
@@ -58,6 +36,7 @@ def make_ca_page(certificate: bytes, fingerprint: str, port: int) -> ASGIApp:
         fingerprint: its SHA-256.
         port: port of the server with TLS.
     """
+    template = Template((find_page_folder() / "trust.html").read_text("utf-8"))
 
     def make_response(request: Request) -> Response:
         host = parse_host(request.headers.get("host", ""))
@@ -65,7 +44,7 @@ def make_ca_page(certificate: bytes, fingerprint: str, port: int) -> ASGIApp:
             return Response(status_code=HTTPStatus.BAD_REQUEST, headers=_HEADERS)
         url = f"https://{host}:{port}"
         if request.method in SAFE_METHODS and request.url.path == "/":
-            page = _PAGE.substitute(fingerprint=fingerprint, file=CA_NAME, url=escape(url))
+            page = template.substitute(fingerprint=fingerprint, file=CA_NAME, url=escape(url))
             return Response(page, media_type="text/html", headers=_HEADERS)
         if request.method in SAFE_METHODS and request.url.path == f"/{CA_NAME}":
             return Response(certificate, media_type="application/x-x509-ca-cert", headers=_HEADERS)

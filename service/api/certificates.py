@@ -82,9 +82,10 @@ class OwnAuthority:
         if self.certificate.not_valid_after_utc < now:
             raise DamagedFileError("the CA has expired", where=str(path), remedy=_NEW_CA)
         write_atomically(self.ca_path, self.certificate_pem, mode=0o644)
-        self.context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+        found = self.certificate.extensions.get_extension_for_class(x509.NameConstraints)
+        self._permitted = found.value.permitted_subtrees or ()
+        self.context = _make_context()
         """TLS of the server, with its newest certificate."""
-        self.context.options |= ssl.OP_NO_RENEGOTIATION
 
     @property
     def certificate_pem(self) -> bytes:
@@ -103,19 +104,16 @@ class OwnAuthority:
             The names that the CA may not certify, and the certificate does not cover.
         """
         wanted = {each: _to_general_name(each) for each in names}
-        allowed = {name for name in wanted.values() if name is not None and self._permits(name)}
+        allowed = {n for n in wanted.values() if n is not None and _is_within(n, self._permitted)}
         try:
             _, leaf = _read_pair(self._leaf_path)
             leaf.verify_directly_issued_by(self.certificate)
-            covered = set(
-                leaf.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-            )
-            is_current = (
-                leaf.not_valid_before_utc <= now < leaf.not_valid_after_utc - _RENEWED_BEFORE
-            )
+            alternative = leaf.extensions.get_extension_for_class(x509.SubjectAlternativeName)
+            ends = leaf.not_valid_after_utc - _RENEWED_BEFORE
+            is_usable = allowed <= {*alternative.value} and leaf.not_valid_before_utc <= now < ends
         except (FileNotFoundError, DamagedFileError, InvalidSignature, ValueError):
-            covered, is_current = set(), False
-        if not (is_current and allowed <= covered):
+            is_usable = False
+        if not is_usable:
             key = ec.generate_private_key(ec.SECP256R1())
             _write_pair(self._leaf_path, key, self._sign(key, allowed, now))
         return [each for each, name in wanted.items() if name not in allowed]
@@ -123,10 +121,6 @@ class OwnAuthority:
     def load(self) -> None:
         """Use the newest certificate for new connections."""
         self.context.load_cert_chain(self._leaf_path)
-
-    def _permits(self, name: x509.GeneralName) -> bool:
-        found = self.certificate.extensions.get_extension_for_class(x509.NameConstraints)
-        return _is_within(name, found.value.permitted_subtrees or ())
 
     def _sign(
         self, key: _Key, names: Iterable[x509.GeneralName], now: datetime
@@ -168,8 +162,7 @@ def load_given_context(certificate: Path, key: Path) -> tuple[ssl.SSLContext, li
             expired.
     """
     expected = "a PEM file of the certificate and its chain, and one of its key without a password"
-    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
-    context.options |= ssl.OP_NO_RENEGOTIATION
+    context = _make_context()
     try:
         for path in (certificate, key):
             path.open().close()  # the error of ssl does not name it
@@ -186,6 +179,12 @@ def load_given_context(certificate: Path, key: Path) -> tuple[ssl.SSLContext, li
             remedy="Renew it. Is the clock of this machine right?",
         )
     return context, [f"everybody may read {str(key)!r}: chmod 600"] if is_open else []
+
+
+def _make_context() -> ssl.SSLContext:
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    context.options |= ssl.OP_NO_RENEGOTIATION
+    return context
 
 
 def _make_ca(names: Iterable[str], now: datetime) -> tuple[_Key, x509.Certificate]:

@@ -6,12 +6,11 @@ import asyncio
 import socket
 import ssl
 from collections.abc import AsyncIterator, Callable
-from contextlib import ExitStack, asynccontextmanager
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
-from urllib.parse import urlsplit
 
 from devices.errors import FootTileError, LinkError, require_extra
 from service.api.address import (
@@ -20,10 +19,11 @@ from service.api.address import (
     list_own_names,
     list_urls,
     open_listening_socket,
+    parse_advertised_url,
 )
 from service.api.settings import Settings
 from service.cli.options import remark
-from service.cli.tickets import is_reachable, show_qr_code
+from service.cli.tickets import get_host, is_reachable, show_qr_code
 from service.discovery import SERVER_HOST
 
 if TYPE_CHECKING:
@@ -56,6 +56,8 @@ def open_tls(settings: Settings) -> ServerTls | None:
         UsageError: a given file cannot be used.
         StorageError, DamagedFileError: a file of the data folder cannot be used.
     """
+    if not settings.tls and settings.tls_cert is None:
+        return None
     with require_extra("tls", "https"):
         from service.api.certificates import OwnAuthority, load_given_context
     if settings.tls_cert is not None and settings.tls_key is not None:
@@ -63,38 +65,24 @@ def open_tls(settings: Settings) -> ServerTls | None:
         for each in remarks:
             remark(each)
         return ServerTls(context, settings.tls_cert)
-    if not settings.tls:
-        return None
     names, now = _list_names(settings), datetime.now(UTC)
     authority = OwnAuthority(settings.data, names, now)
-    _certify(authority, names, now)
+    _load_and_explain(authority, authority.certify(names, now))
     return ServerTls(authority.context, authority.ca_path, authority)
 
 
 def _list_names(settings: Settings) -> list[str]:
     """Return the names and addresses under which a server may be reached now."""
-    advertised = settings.advertise or ""
-    parts = urlsplit(advertised if "://" in advertised else f"//{advertised}")
-    return list(
-        dict.fromkeys(
-            [
-                *(f"{SERVER_HOST}.local", "localhost", "127.0.0.1", "::1", *list_own_names()),
-                *settings.allow_host,
-                *(
-                    name
-                    for name in (parts.hostname, settings.host)
-                    if name and not is_wildcard(name)
-                ),
-                *list_addresses(include_ipv6=True),
-            ]
-        )
-    )
+    names = [f"{SERVER_HOST}.local", "localhost", "127.0.0.1", "::1", *list_own_names()]
+    names += [*settings.allow_host, *list_addresses(include_ipv6=True)]
+    if settings.advertise is not None:
+        names.append(get_host(parse_advertised_url(settings.advertise, port=1)))
+    return names if is_wildcard(settings.host) else [*names, settings.host]
 
 
-def _certify(authority: OwnAuthority, names: list[str], now: datetime) -> None:
+def _load_and_explain(authority: OwnAuthority, outside: list[str]) -> None:
     from service.api.certificates import explain_outside
 
-    outside = authority.certify(names, now)
     authority.load()
     if outside:
         remark(explain_outside(outside, authority))
@@ -123,10 +111,9 @@ async def hand_out_ca(
 
     authority, port = tls.authority, listening.getsockname()[1]
     page = make_ca_page(authority.certificate_pem, authority.fingerprint, port)
-    with ExitStack() as stack:
-        plain = stack.enter_context(_open_next(settings.host, port))
+    with _open_next(settings.host, port) as plain:
+        url = list_urls(plain, settings.host)[0]
         async with run_uvicorn(page, plain, LIMITS):
-            url = list_urls(plain, settings.host)[0]
             remark(f"phones and laptops first have to trust it: {url}")
             remark(f"compare there: SHA-256 {authority.fingerprint}")
             remark(f"a node trusts it by --ca and a copy of {authority.ca_path}")
@@ -160,6 +147,7 @@ async def _renew_forever(
         if current != before:
             before = current
             try:
-                _certify(authority, current[0], now)
-            except FootTileError as error:
+                outside = await asyncio.to_thread(authority.certify, current[0], now)
+                _load_and_explain(authority, outside)
+            except (FootTileError, OSError) as error:
                 remark(f"the certificate is not renewed: {error}")

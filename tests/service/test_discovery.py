@@ -149,7 +149,7 @@ def test_a_refused_multicast_is_a_remark() -> None:
     )
     lines = run_in_network({"near": "10.77.0.1/24"}, code).splitlines()
     assert lines == [
-        "servers and nodes are not found by themselves: not here",
+        "servers and nodes are not found by themselves: PermissionError('not here')",
         "{'_foottile._tcp.local.': []}",
     ]
 

@@ -6,10 +6,9 @@ import asyncio
 from dataclasses import asdict
 
 import typer
-from rich.table import Table
 
-from devices.errors import escape_control_chars, require_extra
-from service.cli.options import JsonOption, print_json, remark, show_progress, stdout
+from devices.errors import require_extra
+from service.cli.options import JsonOption, echo, print_json, remark, show_progress
 
 _SEARCH_S = 2.0
 
@@ -28,28 +27,17 @@ def find_command(as_json: JsonOption = False) -> None:
 
     with show_progress("looking for servers and nodes"):
         found = asyncio.run(search_once((SERVERS, NODES), _SEARCH_S, remark))
-    servers, nodes = found[SERVERS], found[NODES]
+    servers = [{**asdict(each), "urls": each.urls} for each in found[SERVERS]]
+    nodes = [asdict(each) for each in found[NODES]]
     if as_json:
-        print_json(
-            {
-                "servers": [{**asdict(each), "urls": each.urls} for each in servers],
-                "nodes": [asdict(each) for each in nodes],
-            }
-        )
-    elif servers or nodes:
-        table = Table(box=None, pad_edge=False)
-        for title in ("kind", "name", "addresses", "machine", "version"):
-            table.add_column(title)
-        for kind, services in (("server", servers), ("node", nodes)):
-            for each in services:
-                cells = (
-                    *(kind, each.host if kind == "server" else each.name),
-                    " ".join(each.urls if kind == "server" else each.addresses),
-                    *(each.texts.get("machine", ""), each.texts.get("version", "")),
-                )
-                table.add_row(*map(escape_control_chars, cells))
-        stdout.print(table, markup=False)
-    else:
-        remark("no server and no node announces itself in this network")
+        print_json({"servers": servers, "nodes": nodes})
+    for each in [] if as_json else [*servers, *nodes]:
+        name = each["host"] if "urls" in each else f"node {each['name']}"
+        where = " ".join(each.get("urls") or each["addresses"])
+        echo(f"{name}: {where} ({', '.join(each['texts'].get(k, '') for k in _SHOWN)})")
     if not (servers or nodes):
+        remark("no server and no node announces itself in this network")
         raise typer.Exit(1)
+
+
+_SHOWN = ("machine", "version")
