@@ -114,7 +114,6 @@ class Discovery:
         self._interfaces: list[str | int] = []
         self._open: AsyncZeroconf | None = None
         self._browser: AsyncServiceBrowser | None = None
-        self._announced: AsyncServiceInfo | None = None
         self.is_installed = True
         """False once the library is found to be missing."""
 
@@ -147,7 +146,7 @@ class Discovery:
                     found = list_interfaces()
                     is_changed = found != self._interfaces and before in (None, found)
                     before = found
-                    if is_changed or self._has_conflict():
+                    if is_changed:
                         await self._close()
                         if found:
                             self._open = library.AsyncZeroconf(interfaces=found)
@@ -226,35 +225,16 @@ class Discovery:
                 continue
             with suppress(NonUniqueNameException):
                 await opened.async_register_service(info)
-                self._announced = info
                 self._on_announced(str(info.server).rstrip("."))
                 return
 
-    def _has_conflict(self) -> bool:
-        """Return whether another process has taken the same name at the same instant.
-
-        The one with the smaller description keeps it. This one says no goodbye, which would remove
-        both.
-        """
-        if self._open is None or self._announced is None:
-            return False
-        zeroconf, info = self._open.zeroconf, self._announced
-        others = zeroconf.cache.async_all_by_details(info.name, _TXT, _IN)
-        has_conflict = any(getattr(record, "text", info.text) < info.text for record in others)
-        if has_conflict:
-            zeroconf.registry.async_remove(info)
-        return has_conflict
-
     async def _close(self) -> None:
         opened, self._open = self._open, None
-        self._browser, self._announced, self._interfaces = None, None, []
+        self._browser, self._interfaces = None, []
         for names in self._names.values():
             names.clear()
         if opened is not None:
             await opened.async_close()
-
-
-_TXT, _IN = 16, 1  # RFC 1035
 
 
 async def search_once(

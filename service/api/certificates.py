@@ -40,17 +40,11 @@ _CA_LIFE = timedelta(days=3652)
 _LEAF_LIFE = timedelta(days=397)
 """Life of a server's certificate, with the month before; browsers accept 398 days."""
 _RENEWED_BEFORE = timedelta(days=30)
-_LOCAL_NAMES: tuple[x509.GeneralName, ...] = (
-    *map(x509.DNSName, ("local", "localhost")),
-    *(
-        x509.IPAddress(ipaddress.ip_network(network))
-        for network in (
-            *("10.0.0.0/8", "100.64.0.0/10", "127.0.0.0/8", "169.254.0.0/16", "172.16.0.0/12"),
-            *("192.168.0.0/16", "::1/128", "fc00::/7", "fe80::/10"),
-        )
-    ),
+_LOCAL_DOMAINS = ("local", "localhost")
+_LOCAL_NETWORKS = (
+    *("10.0.0.0/8", "100.64.0.0/10", "127.0.0.0/8", "169.254.0.0/16", "172.16.0.0/12"),
+    *("192.168.0.0/16", "::1/128", "fc00::/7", "fe80::/10"),
 )
-"""Names and addresses that every CA permits: those of local networks."""
 _Key = ec.EllipticCurvePrivateKey
 
 
@@ -189,7 +183,8 @@ def _make_context() -> ssl.SSLContext:
 
 def _make_ca(names: Iterable[str], now: datetime) -> tuple[_Key, x509.Certificate]:
     key = ec.generate_private_key(ec.SECP256R1())
-    permitted: list[x509.GeneralName] = list(_LOCAL_NAMES)
+    permitted: list[x509.GeneralName] = [*map(x509.DNSName, _LOCAL_DOMAINS)]
+    permitted += [x509.IPAddress(ipaddress.ip_network(each)) for each in _LOCAL_NETWORKS]
     for name in map(_to_general_name, names):
         if name is None or _is_within(name, permitted):
             continue

@@ -11,13 +11,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.errors import LinkError
 from foottile.local_server import LocalServer, publish_local_server
+from service import discovery
+from service.cli.commands.node import _ask_for_server
 from service.discovery import Discovery, FoundService
 from service.node.server_finder import LOCAL_URL, ServerFinder, list_candidates
+from storage.permissions import SECRETS_NAME, write_secrets
 from tests.service.networks import Machine, connected_machines, needs_networks, run_in_network
 from tests.service.process import BIN, Process
 from tests.waiting import in_a_loop, until
@@ -122,11 +126,11 @@ async def test_without_the_library_the_extra_is_named_and_nothing_is_found(
     monkeypatch.setitem(sys.modules, "zeroconf", None)
     monkeypatch.setitem(sys.modules, "zeroconf.asyncio", None)
     reports: list[str] = []
-    async with Discovery(report=reports.append) as discovery:
+    async with Discovery(report=reports.append) as missing:
         while not reports:
             await asyncio.sleep(0.01)
-        assert not discovery.is_installed
-        assert await ServerFinder(discovery).find(()) == LOCAL_URL
+        assert not missing.is_installed
+        assert await ServerFinder(missing).find(()) == LOCAL_URL
     assert "foottile[discovery]" in reports[0]
 
 
@@ -152,6 +156,21 @@ def test_a_refused_multicast_is_a_remark() -> None:
         "servers and nodes are not found by themselves: PermissionError('not here')",
         "{'_foottile._tcp.local.': []}",
     ]
+
+
+@pytest.mark.parametrize("known", [(), ("b",)])
+def test_a_person_chooses_on_a_terminal_unless_a_server_is_known(
+    known: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def search(*_: object) -> dict[str, list[FoundService]]:
+        return {discovery.SERVERS: [server("a"), server("b")]}
+
+    write_secrets(tmp_path / SECRETS_NAME, dict.fromkeys(known, "0" * 64))
+    monkeypatch.setattr(discovery, "search_once", search)
+    monkeypatch.setattr(typer, "prompt", lambda *_, **__: 1)
+    assert _ask_for_server(tmp_path, None) == ""
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
+    assert _ask_for_server(tmp_path, None) == ("" if known else "a")
 
 
 def find(machine: Machine) -> dict[str, Any]:
