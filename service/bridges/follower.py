@@ -16,20 +16,20 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
+from itertools import count
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import WebSocketException
 
-from devices.errors import FootTileError, UsageError
+from devices.errors import UsageError
 from devices.frames import ArrayInfo
 from foottile.errors import FootTileError as ClientError
 from foottile.errors import NotFoundError
 from service.protocol.codec import run_until_first_ends
 from service.protocol.live import LIVE_PATH
-from storage.clock.bounds import ClockOffsets, OffsetRows
-from storage.clock.table import ClockTable, StreamClockFacts
+from storage.clock.bounds import BoundedOffset, ClockOffsets, OffsetRows
 from storage.schema import (
     SERVER_TIME_COLUMNS,
     UNKNOWN_T_NS,
@@ -45,7 +45,9 @@ if TYPE_CHECKING:
     from foottile import Server
 
 _RETRY_S = 1.0
-_PING_INTERVAL_S = 2.0
+_PING_INTERVAL_S, _FIRST_PINGS = 2.0, 8
+_CLOCK_FIELDS = ("t_mono_ns", "server_minus_node_ns", "uncertainty_ns")
+_SERVER_TIMES = tuple(column.name for column in SERVER_TIME_COLUMNS)
 _ROWS_MAX = 64
 """Clock measurements kept: of two minutes, or ten of a node's."""
 
@@ -152,30 +154,27 @@ class LiveClock:
         self._rows: deque[tuple[int, int, int]] = deque(maxlen=_ROWS_MAX)
         self._offsets: ClockOffsets | None = None
 
-    @property
-    def rows(self) -> OffsetRows:
-        """Measurements."""
-        return OffsetRows(*np.array(self._rows, dtype=np.int64).reshape(-1, 3).T.copy())
+    def add(self, t_mono_ns: int, offset_ns: int, uncertainty_ns: int) -> None:
+        """Add a measurement, unless it is known."""
+        if (row := (t_mono_ns, offset_ns, uncertainty_ns)) not in self._rows:
+            self._rows.append(row)
+            columns = np.array(self._rows, dtype=np.int64).T.copy()
+            self._offsets = ClockOffsets(OffsetRows(*columns))
 
-    def add(self, t_mono_ns: int, offset_ns: int, uncertainty_ns: int) -> bool:
-        """Add a measurement; False if it is known."""
-        row = t_mono_ns, offset_ns, uncertainty_ns
-        if row in self._rows:
-            return False
-        self._rows.append(row)
-        self._offsets = None
-        return True
+    def offset_and_bound_at(self, t_mono_ns: Array) -> BoundedOffset | None:
+        """Return the offset and its bound at instants of the clock that never steps.
 
-    def to_local_ns(self, t_ns: Array) -> tuple[Array, Array] | None:
-        """Return the local instants of this clock's, and their bounds; None: never measured."""
-        if not self._rows:
+        None: never measured.
+        """
+        return None if self._offsets is None else self._offsets.offset_and_bound_at(t_mono_ns)
+
+    def to_mono_ns(self, t_ns: Array) -> tuple[Array, Array] | None:
+        """Return instants by the clock that never steps, and their bounds; None: never measured."""
+        if self._offsets is None:
             return None
-        self._offsets = self._offsets or ClockOffsets(self.rows)
-        # Twice: the offset at an instant that is off by a drift of seconds is exact to 1 ns.
-        near_ns = t_ns - self._rows[-1][1]
-        near_ns = t_ns - self._offsets.offset_and_bound_at(near_ns).offset_ns
-        offset_ns, bound_ns = self._offsets.offset_and_bound_at(near_ns)
-        return t_ns - offset_ns, bound_ns
+        # The instant is off by the drift since the last row, and the offset by as much of that.
+        offset_ns, bound_ns = self._offsets.offset_and_bound_at(t_ns - self._rows[-1][1])
+        return t_ns - offset_ns, bound_ns + bound_ns // 1000
 
 
 @dataclass
@@ -192,7 +191,6 @@ class _KnownNode:
 
     stream_id: str
     clock: LiveClock = field(default_factory=LiveClock)
-    table: ClockTable | None = None
 
 
 class ServerFollower:
@@ -294,11 +292,8 @@ class ServerFollower:
         node = self._nodes.get(name)
         if node is None or node.stream_id != stream_id:
             node = self._nodes[name] = _KnownNode(stream_id)
-        if measured is not None and node.clock.add(
-            measured["t_mono_ns"], measured["server_minus_node_ns"], measured["uncertainty_ns"]
-        ):
-            rows = {stream_id: node.clock.rows}
-            node.table = ClockTable(rows, [StreamClockFacts(stream_id)], [stream_id])
+        if measured is not None:
+            node.clock.add(*(measured[each] for each in _CLOCK_FIELDS))
         self._outlet.write_node(name, view)
         if self._outlet.columns is not None and name not in self._feeds:
             self._feeds[name] = asyncio.create_task(self._feed_frames(name, self._outlet.columns))
@@ -320,7 +315,6 @@ class ServerFollower:
         known = self._sessions.get(session_id)
         if not self._is_followed(view["node"]) or (known is None and state == "sealed"):
             return
-
         is_new = is_new and (known is not None or state == "recording")
 
         def write(kind: str, text: str, t_ns: int) -> None:
@@ -370,8 +364,8 @@ class ServerFollower:
                         if self._outlet.has_readers(name):
                             self._write_frames(name, info, quantities, batch)
                         self._reporter.report(name, None)
-            except (OSError, WebSocketException, ClientError, FootTileError) as error:
-                self._reporter.report(name, f"no frames: {error}")
+            except Exception as error:  # a bug of one feed must not end the others
+                self._reporter.report(name, f"no frames: {error!r}")
             await asyncio.sleep(_RETRY_S)
 
     def _write_frames(
@@ -387,13 +381,13 @@ class ServerFollower:
             for (name, quantity), values in zip(quantities.items(), batch.columns, strict=True)
             if quantity is not None
         }
-        if node.table is not None and node.stream_id == info.stream_id:
-            columns |= node.table.compute_server_time_columns_or_unknown(
-                columns["t_mono_ns"], columns["t_ns"], None
-            )
-        else:
-            unknown = np.full(len(batch), UNKNOWN_T_NS)
-            columns |= {column.name: unknown for column in SERVER_TIME_COLUMNS}
+        is_present = node.stream_id == info.stream_id
+        measured = node.clock.offset_and_bound_at(columns["t_mono_ns"]) if is_present else None
+        unknown = np.full(len(batch), UNKNOWN_T_NS)
+        times = (unknown, unknown)
+        if measured is not None:
+            times = columns["t_ns"] + measured.offset_ns, measured.bound_ns
+        columns |= zip(_SERVER_TIMES, times, strict=True)
         has_estimates = not batch.column("estimate_flags").null_count
         frames = LiveFrames(name, info.stream_id, info, columns, has_estimates)
         self._outlet.write_frames(frames, self.server_clock)
@@ -406,6 +400,7 @@ def _to_numpy(values: pa.Array[Any], missing_value: int | None) -> Array:
 
 
 async def _ping(socket: ClientConnection) -> None:
-    while True:
+    """Send pings, the first ones fast: one of several has a short round trip."""
+    for number in count():
         await socket.send(json.dumps({"type": "ping", "t_ms": time.monotonic_ns() * 1e-6}))
-        await asyncio.sleep(_PING_INTERVAL_S)
+        await asyncio.sleep(_PING_INTERVAL_S if number > _FIRST_PINGS else 0.1)

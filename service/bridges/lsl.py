@@ -46,7 +46,7 @@ class LslOutlet(Outlet):
     def write_frames(self, frames: LiveFrames, server_clock: LiveClock) -> None:
         """Push the samples of frames whose instant is known."""
         known = np.flatnonzero(frames.columns["t_server_ns"] != UNKNOWN_T_NS)
-        local = server_clock.to_local_ns(frames.columns["t_server_ns"][known])
+        local = server_clock.to_mono_ns(frames.columns["t_server_ns"][known])
         if local is None or not len(known):
             problem = "no samples: its clock is not compared with the server's yet"
             self._reporter.report(f"clock of {frames.node}", problem)
@@ -56,17 +56,16 @@ class LslOutlet(Outlet):
         if node is None or node[0] != key:
             self._nodes.pop(frames.node, None)  # its outlet ends before another of the same name
             node = self._nodes[frames.node] = key, _make_outlet(frames.info)
-        local_ns, bound_ns = local
         samples = [
             to_floats_with_nan(quantity.name, frames.columns[name][known])
             for name, quantity in _list_channels(frames.info)
         ]
-        samples.append((bound_ns + frames.columns["t_server_uncertainty_ns"][known]) * 1e-9)
-        node[1].push_chunk(np.stack(samples, axis=1), (local_ns * 1e-9).tolist())
+        samples.append((local[1] + frames.columns["t_server_uncertainty_ns"][known]) * 1e-9)
+        node[1].push_chunk(np.stack(samples, axis=1), (local[0] * 1e-9).tolist())
 
     def write_event(self, event: Event, server_clock: LiveClock) -> None:
         """Push an event as a marker at its instant."""
-        local = server_clock.to_local_ns(np.array([event.t_ns]))
+        local = server_clock.to_mono_ns(np.array([event.t_ns]))
         if local is not None:
             self._markers.push_sample([str(event)], float(local[0][0]) * 1e-9)
 
