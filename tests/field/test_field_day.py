@@ -11,7 +11,7 @@ import json
 import os
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing
 from importlib import resources
 from pathlib import Path
@@ -58,14 +58,16 @@ class FieldDay:
         self.page: Page
         self._devtools: CDPSession
 
-    def start(self, machine: int, *words: object, **environment: str) -> Process:
+    def start(
+        self, machine: int, *words: object, environment: Mapping[str, str] | None = None
+    ) -> Process:
         """Start a command on a machine."""
         state = str(self.folder / f"state-{machine}")
         process = Process(
             *words,
             folder=self.folder / f"run-{machine}",
             before=self._machines[machine].before,
-            **{"XDG_STATE_HOME": state, **environment},
+            **{"XDG_STATE_HOME": state, **(environment or {})},
         )
         return self._stack.enter_context(closing(process))
 
@@ -157,7 +159,7 @@ def play_field_day(field: FieldDay, outage_s: float) -> None:
     node = field.start(
         *(ROBOT, "node", "--scene", make_scene(field), "--name", "left"),
         *("--journal", disk.folder / "node"),
-        **field.chip.environment,
+        environment=field.chip.environment,
     )
     node.said("frames/s")
     laptop = field.start(LAPTOP, "serve", "--host=0.0.0.0", "--data", field.folder / "data")
@@ -232,7 +234,7 @@ def test_every_trial_of_a_field_day_is_complete_and_has_its_edge(
         assert marker.bound_ns is not None
         off_ns = abs(marker.t_ns - field.edges[session.name])
         assert off_ns <= marker.bound_ns < 20_000_000, (session.name, off_ns, marker.bound_ns)
-    words = [BIN / "foottile", "verify", field.folder / "data", "--json"]
+    words = [str(BIN / "foottile"), "verify", str(field.folder / "data"), "--json"]
     done = subprocess.run(words, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-2000:]
     assert json.loads(done.stdout)

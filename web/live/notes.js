@@ -149,10 +149,8 @@ function nodeWarnings(node, frame, serverNowMs) {
   const add = (key, text, id = key) => notes.push(makeNote(key, text, id));
   const bits = frame?.estimate_flags ?? 0;
   const tare = node.tare && !node.tare.undone ? node.tare : null;
+  if (node.storage_problem) add("storage", `The server cannot record: ${node.storage_problem}`);
   if (!node.calibration) add("no_calibration", withReason("No calibration", node.calibration_problem || "pressures only."));
-  else if (node.calibration.absolute_scale === "assumed" || bits & ESTIMATE.ASSUMED_SCALE) {
-    add("scale_assumed", "Scale assumed: newtons are approximate.");
-  }
   if (bits & ESTIMATE.TARE_LOST) add("tare", "Tare lost: forces unknown.", "tare_lost");
   if (!tare) add("tare", withReason("Not tared", node.tare_problem || "lift the foot and press Tare."));
   else {
@@ -165,9 +163,12 @@ function nodeWarnings(node, frame, serverNowMs) {
   if (node.compiling) add("compiling", "Models are being compiled, once on this machine: pressures only until then.");
   for (const warning of node.warnings ?? []) add("", sentence(warning), warning);
   for (const [reason, text] of lossTexts(node.lost)) add("lost", `Lost ${text}.`, `lost ${reason}`);
-  if (node.storage_problem) add("storage", `The server cannot record: ${node.storage_problem}`);
   // An emulated node has the clock of this machine.
   if (node.clock_set === false && !node.emulated) add("clock", "The node's clock is not set: dates may be wrong.");
+  // The last one, as it stays all day: on a phone it would cover what has just happened.
+  if (node.calibration && (node.calibration.absolute_scale === "assumed" || bits & ESTIMATE.ASSUMED_SCALE)) {
+    add("scale_assumed", "Scale assumed: newtons are approximate.");
+  }
   return notes;
 }
 
