@@ -132,10 +132,8 @@ class Discovery:
             library = await asyncio.to_thread(import_module, "zeroconf.asyncio")
         except ModuleNotFoundError:
             self.is_installed = False
-            self._report(
-                "servers and nodes are not found by themselves without zeroconf: "
-                "pip install 'foottile[discovery]'"
-            )
+            if self._names:
+                self._report("to find a server by itself: pip install 'foottile[discovery]'")
             return
         logging.getLogger("zeroconf").setLevel(logging.CRITICAL)  # an unplugged cable is no error
         before: list[str | int] | None = None

@@ -126,7 +126,7 @@ async def test_without_the_library_the_extra_is_named_and_nothing_is_found(
     monkeypatch.setitem(sys.modules, "zeroconf", None)
     monkeypatch.setitem(sys.modules, "zeroconf.asyncio", None)
     reports: list[str] = []
-    async with Discovery(report=reports.append) as missing:
+    async with Discovery((discovery.SERVERS,), report=reports.append) as missing:
         while not reports:
             await asyncio.sleep(0.01)
         assert not missing.is_installed

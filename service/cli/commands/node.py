@@ -27,6 +27,7 @@ from service.cli.options import (
     load_adapted_scene,
     remark,
 )
+from service.discovery import SERVERS
 from service.node.server_finder import LOCAL_URL
 from service.version import SOFTWARE_VERSION
 
@@ -160,13 +161,7 @@ async def _run_node(options: NodeOptions, chosen_id: str | None) -> NodeOutcome:
         chosen_id: id of a chosen server, empty: any; None: it looks for no server.
     """
     from devices.realtime import freeze_garbage_collector
-    from service.discovery import (
-        NODES,
-        SERVERS,
-        Announcement,
-        Discovery,
-        list_interface_addresses,
-    )
+    from service.discovery import NODES, Announcement, Discovery, list_interface_addresses
     from service.node.running_node import run_node
     from service.node.server_finder import ServerFinder
     from service.systemd import report_to_systemd
@@ -178,10 +173,8 @@ async def _run_node(options: NodeOptions, chosen_id: str | None) -> NodeOutcome:
     texts = {"machine": socket.gethostname(), "version": SOFTWARE_VERSION}
     announced = Announcement(NODES, name, host, 0, texts, list_interface_addresses)
     browsed = (SERVERS,) if chosen_id is not None else ()
-    async with (
-        report_to_systemd(stop),
-        Discovery(browsed, announced, report=remark) as discovery,
-    ):
+    discovery = Discovery(browsed, announced, report=remark)
+    async with report_to_systemd(stop), discovery:
         if chosen_id is not None:
             finder = ServerFinder(discovery, chosen_id=chosen_id, ca_path=options.ca_path)
             options = replace(options, find_server=finder.find)
@@ -191,13 +184,13 @@ async def _run_node(options: NodeOptions, chosen_id: str | None) -> NodeOutcome:
 def _ask_for_server(folder: Path, ca: Path | None) -> str:
     """Return the id of a server that a person chooses on a terminal; empty: there is no choice."""
     from foottile.local_server import find_local_server
-    from service.discovery import SERVERS, search_once
+    from service.discovery import search_once
     from service.node.running_node import ServerSecrets
     from service.node.server_finder import describe_candidates, list_candidates
 
     if not sys.stdin.isatty() or find_local_server(LOCAL_URL) is not None:
         return ""
-    found = asyncio.run(search_once((SERVERS,), _SEARCH_S, remark))[SERVERS]
+    found = asyncio.run(search_once((SERVERS,), _SEARCH_S, lambda _: None))[SERVERS]
     known_ids = ServerSecrets(folder, remark).list_server_ids()
     candidates = list_candidates(found, known_ids, needs_tls=ca is not None)
     if len(candidates) < 2:  # nothing to choose
