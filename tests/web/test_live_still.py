@@ -145,6 +145,8 @@ def test_a_recording_has_a_row_with_its_name_time_and_lost_frames(
         frames = row.locator(".recording-frames")
         before = frames.inner_text()
         expect(frames).not_to_have_text(before)  # it counts on
+        node.running.http.post(f"{session.url}/markers", json={"label": "a stone"})
+        expect(frames).to_contain_text("frames, 1 marker")
         node.socket.send(json.dumps({"type": "status", "missed_slots": 5, "warnings": []}))
         expect(row.locator(".recording-lost")).to_have_text(re.compile("^0 lost, .+ not sampled$"))
         expect(page.locator("#actions .primary:visible")).to_have_attribute("id", "stop")

@@ -207,7 +207,9 @@ export class Actions {
       const row = rows.get(session.id);
       setText(row.querySelector(".recording-name"), `“${session.name}”`);
       setText(row.querySelector(".recording-time"), duration(elapsedS));
-      setText(row.querySelector(".recording-frames"), `${session.frames.toLocaleString("en-GB")} frames`);
+      const markers = session.marker_count; // edges of a sync line, too
+      const marked = markers ? `, ${markers} marker${markers === 1 ? "" : "s"}` : "";
+      setText(row.querySelector(".recording-frames"), `${session.frames.toLocaleString("en-GB")} frames${marked}`);
       const losses = row.querySelector(".recording-lost");
       setText(losses, [`${lost.toLocaleString("en-GB")} lost`, missedText(session)].filter(Boolean).join(", "));
       setData(losses, "bad", String(lost > 0));
