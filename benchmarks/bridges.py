@@ -28,7 +28,7 @@ from served import COMMAND, Server, cpu_s, served
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-READY_S, SETTLE_S = 120.0, 6.0
+READY_S, SETTLE_S = 120.0, 10.0
 MQTT_PORT = 18830
 
 
@@ -163,7 +163,8 @@ def measure(kind: str, server: Server, seconds: float) -> dict[str, object]:
         bridge.terminate()
         bridge.wait(30.0)
     both = ours["at_s"].keys() & theirs["at_s"].keys()
-    span = [seq for seq in theirs["at_s"] if min(map(int, both)) <= int(seq) <= max(map(int, both))]
+    first, last = min(map(int, both)), max(map(int, both))
+    span = [seq for seq in theirs["at_s"] if first <= int(seq) <= last]
     added_ms = [1e3 * (ours["at_s"][seq] - theirs["at_s"][seq]) for seq in both]
     p50, p99, most = np.percentile(added_ms, [50, 99, 100])
     return {

@@ -268,6 +268,8 @@ class ServerFollower:
             match message["type"]:
                 case "hello":
                     self._reporter.report(self._server.url, None)
+                    for name in {*self._names} - {view["node"] for view in message["nodes"]}:
+                        self._reporter.report(f"node {name}", "not known to the server yet")
                     for view in message["nodes"]:
                         self._update_node(view)
                     await self._update_sessions(message["recording"], is_first=is_first)
@@ -289,6 +291,7 @@ class ServerFollower:
         name, stream_id, measured = view["node"], view["stream_id"], view["clock"]
         if not self._is_followed(name):
             return
+        self._reporter.report(f"node {name}", None)
         node = self._nodes.get(name)
         if node is None or node.stream_id != stream_id:
             node = self._nodes[name] = _KnownNode(stream_id)

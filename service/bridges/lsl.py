@@ -8,13 +8,16 @@ channels are metadata as in an XDF file.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
+import pyarrow as pa
 import pylsl
 
 from devices.frames import ArrayInfo
 from service.bridges.follower import Event, LiveClock, LiveFrames, Outlet, Reporter
 from storage.formats.writers.format import to_floats_with_nan
-from storage.schema import ESTIMATE_COLUMNS, UNKNOWN_T_NS, Column, map_flat_columns
+from storage.schema import ESTIMATE_COLUMNS, UNKNOWN_T_NS, Array, Column, map_flat_columns
 
 _BUFFERED_S = 10
 """Longest time that samples wait for a slow inlet; then the oldest are dropped."""
@@ -39,7 +42,7 @@ class LslOutlet(Outlet):
 
     def __init__(self, reporter: Reporter) -> None:
         self._reporter = reporter
-        self._nodes: dict[str, tuple[object, pylsl.StreamOutlet]] = {}
+        self._nodes: dict[str, _NodeOutlet] = {}
         info = pylsl.StreamInfo("foottile markers", "Markers", 1, 0.0, "string", "foottile markers")
         self._markers = pylsl.StreamOutlet(info, 0, _BUFFERED_S)
 
@@ -52,16 +55,16 @@ class LslOutlet(Outlet):
             self._reporter.report(f"clock of {frames.node}", problem)
             return
         self._reporter.report(f"clock of {frames.node}", None)
-        node, key = self._nodes.get(frames.node), (frames.info.tiles, frames.info.nominal_rate_hz)
-        if node is None or node[0] != key:
+        node, info = self._nodes.get(frames.node), frames.info
+        if node is None or (node.info.tiles, node.info.nominal_rate_hz) != (
+            info.tiles,
+            info.nominal_rate_hz,
+        ):
             self._nodes.pop(frames.node, None)  # its outlet ends before another of the same name
-            node = self._nodes[frames.node] = key, _make_outlet(frames.info)
-        samples = [
-            to_floats_with_nan(quantity.name, frames.columns[name][known])
-            for name, quantity in _list_channels(frames.info)
-        ]
-        samples.append((local[1] + frames.columns["t_server_uncertainty_ns"][known]) * 1e-9)
-        node[1].push_chunk(np.stack(samples, axis=1), (local[0] * 1e-9).tolist())
+            node = self._nodes[frames.node] = _NodeOutlet(info)
+        bound_ns = local[1] + frames.columns["t_server_uncertainty_ns"][known]
+        columns = {name: frames.columns[name][known] for name in node.channels}
+        node.push(columns, local[0] * 1e-9, bound_ns * 1e-9)
 
     def write_event(self, event: Event, server_clock: LiveClock) -> None:
         """Push an event as a marker at its instant."""
@@ -75,34 +78,37 @@ class LslOutlet(Outlet):
         del self._markers
 
 
-def _list_channels(info: ArrayInfo) -> list[tuple[str, Column]]:
-    """Return name and quantity of each channel but the last."""
-    found = map_flat_columns(len(info.tiles)).items()
-    return [(name, column) for name, column in found if column.name in _QUANTITIES]
+class _NodeOutlet:
+    """Outlet of a node, with metadata as the XDF writer's."""
 
+    def __init__(self, info: ArrayInfo) -> None:
+        self.info = info
+        self.channels = {
+            name: column
+            for name, column in map_flat_columns(len(info.tiles)).items()
+            if column.name in _QUANTITIES
+        }
+        stream = pylsl.StreamInfo(
+            *(f"{info.node} frames", "Force", len(self.channels) + 1, info.nominal_rate_hz),
+            *("double64", f"foottile {info.node} frames"),
+        )
+        described = stream.desc().append_child("channels")
+        bound = Column(
+            TIME_BOUND, pa.float64(), "s", "bound of the sample's instant, plus or minus"
+        )
+        for name, column in {**self.channels, TIME_BOUND: bound}.items():
+            channel = described.append_child("channel")
+            texts = {"label": name, "unit": column.unit, "type": "Force"}
+            texts |= {"description": column.description}
+            if column.per_tile:
+                texts["serial"] = info.tiles[int(name.removeprefix(f"{column.name}_"))].serial
+            for key, text in texts.items():
+                channel.append_child_value(key, text)
+        self._outlet = pylsl.StreamOutlet(stream, 0, _BUFFERED_S)
 
-def _make_outlet(info: ArrayInfo) -> pylsl.StreamOutlet:
-    """Make the outlet of a node, with metadata as the XDF writer's."""
-    named = _list_channels(info)
-    stream = pylsl.StreamInfo(
-        f"{info.node} frames",
-        "Force",
-        len(named) + 1,
-        info.nominal_rate_hz,
-        "double64",
-        f"foottile {info.node} frames",
-    )
-    channels = stream.desc().append_child("channels")
-    for name, column in named:
-        channel = channels.append_child("channel")
-        channel.append_child_value("label", name).append_child_value("unit", column.unit)
-        channel.append_child_value("type", "Force")
-        channel.append_child_value("description", column.description)
-        if column.per_tile:
-            tile = info.tiles[int(name.removeprefix(f"{column.name}_"))]
-            channel.append_child_value("serial", tile.serial)
-    channel = channels.append_child("channel")
-    channel.append_child_value("label", TIME_BOUND).append_child_value("unit", "s")
-    channel.append_child_value("type", "Force")
-    channel.append_child_value("description", "bound of the sample's instant, plus or minus")
-    return pylsl.StreamOutlet(stream, 0, _BUFFERED_S)
+    def push(self, columns: Mapping[str, Array], at_s: Array, bound_s: Array) -> None:
+        """Push samples at their instants."""
+        samples = [
+            to_floats_with_nan(column.name, columns[name]) for name, column in self.channels.items()
+        ]
+        self._outlet.push_chunk(np.stack([*samples, bound_s], axis=1), at_s.tolist())

@@ -51,9 +51,8 @@ def bridge_command(
     if kind not in KINDS:
         raise UsageError(f"bridge {kind!r}", expected=f"one of {', '.join(KINDS)}")
     if (kind == "mqtt") != (broker is not None):
-        raise UsageError(
-            f"bridge {kind} {broker or ''}", expected="the address of a broker for mqtt"
-        )
+        expected = "the address of a broker behind `mqtt`, and behind no other kind"
+        raise UsageError(f"bridge {kind}", expected=expected)
 
     def open_outlet(reporter: Reporter) -> Outlet:
         if broker is not None:

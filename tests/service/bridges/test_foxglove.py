@@ -126,6 +126,18 @@ def test_it_goes_on_after_a_restart_of_the_server_says_so_once_and_ends_with_ctr
 
 
 @pytest.mark.slow
+def test_a_viewer_that_does_not_read_takes_nothing_from_another(
+    tared: FakeNode, bridge: Process, viewer: Viewer
+) -> None:
+    stalled = Viewer(url_of(bridge))
+    with Play(tared, 20.0):
+        stalled.receive_of("/bench/frames")
+        seen = [viewer.receive_of("/bench/frames").content.seq for _ in range(2000)]
+    assert seen == sorted(set(seen))  # by now more than waits for one viewer
+    stalled.close()
+
+
+@pytest.mark.slow
 def test_a_private_server_is_republished_only_if_that_is_said(
     serve_with: ServeWith, foottile: Start
 ) -> None:
