@@ -66,6 +66,7 @@ def test_a_thumb_pastes_a_list_records_skips_and_repeats(
         expect(page.locator("#trial-name")).to_have_text("mud 1 (2)")
         other.keyboard.press("n")
         expect(page.locator("#recordings")).to_contain_text("“mud 1 (2)”")
+        expect(other.locator("#stop-all")).to_be_enabled()
         other.keyboard.press("s")
         expect(other.locator("#trial-name")).to_have_text("mud 2")
         other.click("#device")
