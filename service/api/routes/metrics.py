@@ -10,8 +10,7 @@ from __future__ import annotations
 import asyncio
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from collections.abc import Iterator
 
 from fastapi import APIRouter, Request, Response
 from prometheus_client import CollectorRegistry, ProcessCollector
@@ -47,113 +46,52 @@ async def get_metrics(request: Request, server: ServerState) -> Response:
     return Response(encode(registry), media_type=media_type)
 
 
-class _NodeMetric(NamedTuple):
-    """Metric with one value a node; None, as before the first frame, is left out."""
-
-    kind: type[GaugeMetricFamily | CounterMetricFamily]
-    name: str
-    help_text: str
-    read: Callable[[ServerNode], float | None]
+_Value = tuple[str, float | None]
+"""Help text and value; None, as before the first frame, is left out."""
 
 
-_NODE_METRICS = (
-    _NodeMetric(
-        GaugeMetricFamily,
-        "connected",
-        "1 if the node is connected.",
-        lambda node: node.is_connected,
-    ),
-    _NodeMetric(
-        CounterMetricFamily,
-        "received_frames",
-        "Frames received, repeated ones included.",
-        lambda node: node.received_frames,
-    ),
-    _NodeMetric(
-        CounterMetricFamily,
-        "received_bytes",
-        "Bytes of received frames.",
-        lambda node: node.received_bytes,
-    ),
-    _NodeMetric(
-        GaugeMetricFamily,
-        "frame_rate_hertz",
-        "Sampled frames per second, over the last second.",
-        lambda node: node.rate_hz if node.is_connected else 0.0,
-    ),
-    _NodeMetric(
-        GaugeMetricFamily,
-        "nominal_frame_rate_hertz",
-        "Frames per second that the bus allows.",
-        lambda node: node.last_info.nominal_rate_hz,
-    ),
-    _NodeMetric(
-        CounterMetricFamily,
-        "missed_slots",
-        "Times at which the node sampled no frame, as it was late.",
-        lambda node: node.present_stream.missed_slots,
-    ),
-    _NodeMetric(
-        GaugeMetricFamily,
-        "backlog_frames",
-        "Frames that the node still has to send.",
-        lambda node: node.present_stream_backlog_frames,
-    ),
-    _NodeMetric(
-        GaugeMetricFamily,
-        "backlog_bytes",
-        "Bytes of these frames, by the mean of received ones.",
-        lambda node: (
-            node.present_stream_backlog_frames * node.received_bytes / node.received_frames
-            if node.received_frames
-            else None
+def _list_node_values(node: ServerNode) -> dict[str, _Value]:
+    """Return the values of a node by the metric's name; counters end in `_total`."""
+    now_t_ns, clock = server_utc_ns(), node.clock_offset
+    backlog = node.present_stream_backlog_frames
+    frame_bytes = node.received_bytes / node.received_frames if node.received_frames else None
+    silent_ns = None if node.last_seen_t_ns is None else now_t_ns - node.last_seen_t_ns
+    rate_hz = node.rate_hz if node.is_connected else 0.0
+    return {
+        "connected": ("1 if the node is connected.", node.is_connected),
+        "received_frames_total": ("Frames received, repeated ones, too.", node.received_frames),
+        "received_bytes_total": ("Bytes of received frames.", node.received_bytes),
+        "frame_rate_hertz": ("Sampled frames per second, over the last second.", rate_hz),
+        "nominal_frame_rate_hertz": ("Rate that the bus allows.", node.last_info.nominal_rate_hz),
+        "missed_slots_total": ("Frames not sampled: too late.", node.present_stream.missed_slots),
+        "backlog_frames": ("Frames that the node still has to send.", backlog),
+        "backlog_bytes": ("Their bytes, by the mean.", frame_bytes and backlog * frame_bytes),
+        "backlog_age_seconds": ("Age of the oldest.", node.compute_backlog_age_s(now_t_ns)),
+        "last_frame_age_seconds": ("Time since a frame.", silent_ns and silent_ns * 1e-9),
+        "clock_offset_seconds": (
+            "Clock of the server minus clock of the node.",
+            None if clock is None else clock.server_minus_node_ns * 1e-9,
         ),
-    ),
-    _NodeMetric(
-        GaugeMetricFamily,
-        "backlog_age_seconds",
-        "Age of the oldest of these frames; 0: there are none.",
-        lambda node: node.compute_backlog_age_s(server_utc_ns()),
-    ),
-    _NodeMetric(
-        GaugeMetricFamily,
-        "last_frame_age_seconds",
-        "Time since the last frame was received.",
-        lambda node: (
-            (server_utc_ns() - node.last_seen_t_ns) * 1e-9
-            if node.last_seen_t_ns is not None
-            else None
+        "clock_offset_bound_seconds": (
+            "Greatest error of this offset.",
+            None if clock is None else clock.uncertainty_ns * 1e-9,
         ),
-    ),
-    _NodeMetric(
-        GaugeMetricFamily,
-        "clock_offset_seconds",
-        "Clock of the server minus clock of the node.",
-        lambda node: (
-            node.clock_offset.server_minus_node_ns * 1e-9 if node.clock_offset is not None else None
-        ),
-    ),
-    _NodeMetric(
-        GaugeMetricFamily,
-        "clock_offset_bound_seconds",
-        "Greatest error of this offset.",
-        lambda node: (
-            node.clock_offset.uncertainty_ns * 1e-9 if node.clock_offset is not None else None
-        ),
-    ),
-    _NodeMetric(
-        GaugeMetricFamily,
-        "warnings",
-        "Present warnings of the node.",
-        lambda node: len(node.warnings),
-    ),
-    _NodeMetric(
-        GaugeMetricFamily,
-        "storage_failed",
-        "1 if the server cannot store the node's frames.",
-        lambda node: node.storage_problem is not None,
-    ),
+        "warnings": ("Present warnings of the node.", len(node.warnings)),
+        "storage_failed": ("1: its frames cannot be stored.", node.storage_problem is not None),
+    } | {
+        f"vitals_{name}": (f"{title}; of the node's machine.", getattr(node.vitals, field, None))
+        for name, field, title in _VITALS
+    }
+
+
+_VITALS = (
+    ("disk_free_bytes", "disk_free_bytes", "Free disk"),
+    ("cpu_celsius", "cpu_celsius", "Temperature of the CPU"),
+    ("undervolted", "is_undervolted", "1: the supply is too low"),
+    ("throttled", "is_throttled", "1: the CPU is slowed down"),
+    ("wifi_signal_dbm", "wifi_dbm", "Signal of the Wi-Fi"),
 )
+"""Metric, field of `Vitals`, and title."""
 
 
 class _ServerCollector(Collector):
@@ -166,12 +104,15 @@ class _ServerCollector(Collector):
     def collect(self) -> Iterator[Metric]:
         yield from self._collect_server()
         nodes = list(self._server.nodes)
-        for kind, name, help_text, read in _NODE_METRICS:
-            metric = kind(f"foottile_node_{name}", help_text, labels=["node"])
-            for node in nodes:
-                if (value := read(node)) is not None:
+        metrics: dict[str, GaugeMetricFamily | CounterMetricFamily] = {}
+        for node in nodes:
+            for name, (help_text, value) in _list_node_values(node).items():
+                kind = CounterMetricFamily if name.endswith("_total") else GaugeMetricFamily
+                new = kind(f"foottile_node_{name}", help_text, labels=["node"])
+                metric = metrics.setdefault(name, new)
+                if value is not None:
                     metric.add_metric([node.name], value)
-            yield metric
+        yield from metrics.values()
         lost = GaugeMetricFamily(
             "foottile_node_lost_frames", "Lost frames, by reason.", labels=["node", "reason"]
         )
