@@ -34,8 +34,6 @@ from storage.schema import (
     SERVER_TIME_COLUMNS,
     UNKNOWN_T_NS,
     Array,
-    Column,
-    map_flat_columns,
     read_array_info,
 )
 
@@ -60,7 +58,8 @@ class LiveFrames:
         node: name of the node.
         stream_id: its stream.
         info: array of the stream.
-        columns: flat columns, n rows each; unknown values as in memory. With the server's time.
+        columns: flat columns, n rows each, with the server's time. What may be unknown is a float,
+            and NaN where it is; an unknown server's time is `UNKNOWN_T_NS`.
         has_estimates: False: no calibration or tare, or still compiling; estimates are NaN.
     """
 
@@ -361,29 +360,31 @@ class ServerFollower:
                         stream_id = stream.position and stream.position[0]
                         if info is None or info.stream_id != stream_id:
                             info = read_array_info(batch.schema, where=f"live feed of {name}")
-                            by_name = map_flat_columns(len(info.tiles))
-                            # None: `recomputed`.
-                            quantities = {each: by_name.get(each) for each in batch.schema.names}
+                            # Bits of an estimate are known if it is there.
+                            may_be_unknown = [
+                                field.name
+                                for field in batch.schema
+                                if field.nullable and field.name != "estimate_flags"
+                            ]
                         if self._outlet.has_readers(name):
-                            self._write_frames(name, info, quantities, batch)
+                            self._write_frames(name, info, may_be_unknown, batch)
                         self._reporter.report(name, None)
             except Exception as error:  # a bug of one feed must not end the others
                 self._reporter.report(name, f"no frames: {error!r}")
             await asyncio.sleep(_RETRY_S)
 
     def _write_frames(
-        self,
-        name: str,
-        info: ArrayInfo,
-        quantities: Mapping[str, Column | None],
-        batch: pa.RecordBatch,
+        self, name: str, info: ArrayInfo, may_be_unknown: list[str], batch: pa.RecordBatch
     ) -> None:
         node = self._nodes[name]
         columns = {
-            name: _to_numpy(values, quantity.missing_value)
-            for (name, quantity), values in zip(quantities.items(), batch.columns, strict=True)
-            if quantity is not None
+            each: batch.column(each).to_numpy(zero_copy_only=False)
+            for each in batch.schema.names
+            if each not in may_be_unknown
         }
+        # All at once: one by one, these conversions would take most of a bridge's time.
+        numbers = batch.select(may_be_unknown).to_tensor(null_to_nan=True).to_numpy()
+        columns |= zip(may_be_unknown, numbers.T, strict=True)
         is_present = node.stream_id == info.stream_id
         measured = node.clock.offset_and_bound_at(columns["t_mono_ns"]) if is_present else None
         unknown = np.full(len(batch), UNKNOWN_T_NS)
@@ -394,12 +395,6 @@ class ServerFollower:
         has_estimates = not batch.column("estimate_flags").null_count
         frames = LiveFrames(name, info.stream_id, info, columns, has_estimates)
         self._outlet.write_frames(frames, self.server_clock)
-
-
-def _to_numpy(values: pa.Array[Any], missing_value: int | None) -> Array:
-    if missing_value is not None and values.null_count:
-        values = values.fill_null(missing_value)
-    return values.to_numpy(zero_copy_only=False)
 
 
 async def _ping(socket: ClientConnection) -> None:

@@ -43,10 +43,13 @@ def viewer(bridge: Process) -> Iterator[Viewer]:
 def test_a_viewer_gets_every_frame_with_all_values_and_flags_at_the_servers_time(
     running: Running, tared: FakeNode, viewer: Viewer
 ) -> None:
-    with client.connect(running.url) as server, server.live("bench", from_seq=70) as live:
-        with Play(tared, [20.0, 160.0]):  # the other tile is beyond its calibrated range
-            first = viewer.receive_of("/bench/frames", lambda frame: frame.t_server_ns > 0)
-            seen = [first, *(viewer.receive_of("/bench/frames") for _ in range(99))]
+    with (
+        client.connect(running.url) as server,
+        server.live("bench", from_seq=70) as live,
+        Play(tared, [20.0, 160.0]),  # the other tile is beyond its calibrated range
+    ):
+        first = viewer.receive_of("/bench/frames", lambda frame: frame.t_server_ns > 0)
+        seen = [first, *(viewer.receive_of("/bench/frames") for _ in range(99))]
         wanted = {frame.content.seq: frame for frame in seen}
         found = 0
         for batch in live:
