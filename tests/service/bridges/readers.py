@@ -79,5 +79,6 @@ class Viewer:
             decoder = GetMessageClass(pool.FindMessageTypeByName(name))
             self.topics[number], self.schemas[channel["topic"]] = channel["topic"], name
             self._decoders[number] = decoder.FromString
-        asked = [{"id": channel["id"], "channelId": channel["id"]} for channel in channels]
-        self._socket.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
+            # One by one: a channel that was closed meanwhile would have the others refused.
+            asked = [{"id": number, "channelId": number}]
+            self._socket.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
