@@ -77,10 +77,10 @@ def escape_control_chars(text: str, *, keep_line_breaks: bool = False) -> str:
     )
 
 
-Extra = (
-    Literal["server", "client", "emulation", "plot", "gpio", "rig", "archive", "mocap", "mcap"]
-    | Literal["discovery", "tls", "bridges"]
-)
+Extra = Literal[
+    "server", "client", "emulation", "discovery", "tls", "plot",
+    "gpio", "rig", "archive", "mocap", "mcap", "bridges",
+]  # fmt: skip
 
 OUR_PACKAGES = ("devices", "storage", "service", "studies", "foottile")
 

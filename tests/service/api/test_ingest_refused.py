@@ -72,8 +72,14 @@ def test_another_subprotocol_is_refused(healthy: FakeNode, offered: list[str] | 
 @pytest.mark.parametrize(
     ("first", "reason"),
     [
-        ('{"type":"hello","protocol":2,"array_info":{}}', "protocol 2; this server speaks 5: node"),
-        ('{"type":"identify","protocol":6,"more":0}', "protocol 6; this server speaks 5: server"),
+        (
+            '{"type":"hello","protocol":2,"array_info":{}}',
+            f"protocol 2; this server speaks {PROTOCOL}: node",
+        ),
+        (
+            f'{{"type":"identify","protocol":{PROTOCOL + 1},"more":0}}',
+            f"protocol {PROTOCOL + 1}; this server speaks {PROTOCOL}: server",
+        ),
     ],
 )
 def test_another_protocol_is_refused(
@@ -89,7 +95,7 @@ def test_another_protocol_is_refused(
     [
         *(b"\0\1\2", "", "hello", "null", "[]", "[" * 100_000, '{"type":"identify"}'),
         *('{"type":"goodbye"}', '{"type":"probe","id":1}', '{"type":"identify","😀":1}'),
-        '{"type":"identify","protocol":5,"node":null}',
+        f'{{"type":"identify","protocol":{PROTOCOL},"node":null}}',
     ],
     ids=lambda first: repr(first[:30]),
 )

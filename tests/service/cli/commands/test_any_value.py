@@ -39,6 +39,7 @@ SHORT = (
 COMMANDS: dict[str, tuple[object, ...]] = {
     "accept-node": ("bench", "--server", "http://127.0.0.1:1"),
     "benchmark": ("--out", "bench", "--scene", "gone.toml"),
+    "bridge": ("foxglove", "--server", "http://127.0.0.1:1"),
     "calibrate": ("s.parquet", "--out", "cal.json"),
     "compare": ("s.parquet", "--reference", "s.parquet", "--out", "o"),
     "demo": ("--scene", "gone.toml"),
@@ -49,6 +50,7 @@ COMMANDS: dict[str, tuple[object, ...]] = {
         *("--calibration", "paper-eq2-shape", "--models", "static"),
     ),
     "export": ("s.parquet", "--format", "csv", "--out", "x.csv"),
+    "find": ("--json",),
     "node": ("--scene", "gone.toml"),
     "pull": ("20200101T000000Z-000000", "--out", "x", "--server", "http://127.0.0.1:1"),
     "query": ("SELECT 1", "--data", "."),
@@ -186,6 +188,8 @@ READ: dict[tuple[str, str], tuple[object, ...]] = {
     ("export", "manifest"): ("--manifest", "{}", "--format", "csv", "--out", "o"),
     ("node", "scene"): ("--scene", "{}"),
     ("serve", "config"): ("--host", "192.0.2.1", "--config", "{}"),
+    ("serve", "tls_cert"): ("--port", 0, "--tls-cert", "{}", "--tls-key", "{}"),
+    ("serve", "tls_key"): ("--port", 0, "--tls-cert", "{}", "--tls-key", "{}"),
     ("simulate", "scene"): ("--scene", "{}", "--seconds", 1),
     ("simulate", "load"): ("--scene", "standing", "--load", "{}"),
     ("verify", "targets"): ("{}",),
@@ -198,7 +202,7 @@ READ: dict[tuple[str, str], tuple[object, ...]] = {
     ("sessions", "ca"): ("--server", "https://127.0.0.1:1", "--ca", "{}"),
     **{  # the last --server counts
         (command, "ca"): (*COMMANDS[command], "--server", "https://127.0.0.1:1", "--ca", "{}")
-        for command in ("accept-node", "pull", "stream", "invite")
+        for command in ("accept-node", "bridge", "pull", "stream", "invite")
     },
 }
 WRITTEN: dict[tuple[str, str], tuple[object, ...]] = {

@@ -77,6 +77,8 @@ COMMANDS: dict[str, tuple[tuple[object, ...], ...]] = {
     "demo": (("--scene", HOSTILE),),
     "doctor": (("--scene", HOSTILE),),
     "domes": (("--family", HOSTILE),),
+    "bridge": ((HOSTILE,), ("mqtt", HOSTILE, "--server", "http://127.0.0.1:1")),
+    "find": ((),),
     "pull": ((HOSTILE, "--out", "o", "--server", "http://127.0.0.1:1"),),
     "reproduce": (("--out", "/dev/null/x" + HOSTILE),),
     "serve": (("--host", HOSTILE),),
