@@ -1,8 +1,8 @@
 """`GET /metrics`: state of server and nodes in the text form of Prometheus.
 
 Names, units and suffixes are those of its conventions (prometheus.io, "Metric and label naming").
-All values are read when a scraper asks: without one it costs nothing. Counts of a node are those of
-its present stream, and begin again with a new one, as after a restart of a process.
+All values are read when a scraper asks: without one it costs nothing. Received frames and bytes
+count from the server's start; other counts of a node are those of its present stream.
 """
 
 from __future__ import annotations
