@@ -332,7 +332,8 @@ class ServerFollower:
             path = f"/sessions/{session_id}/markers"
             markers = (await asyncio.to_thread(self._server.http.get, path))["items"]
             for marker in markers:
-                if marker["id"] not in known.marker_ids:
+                is_known = marker["stream_id"] is None or marker["bound_ns"] is not None  # its time
+                if is_known and marker["id"] not in known.marker_ids:
                     write("marker", marker["label"], marker["t_ns"])
             known.marker_ids = {marker["id"] for marker in markers}
         if known.state == "recording" != state:

@@ -445,8 +445,8 @@ def user_fields_revision(session: Session) -> str:
 
 
 def marker_revision(marker: Marker) -> str:
-    """Return the revision of a marker, a short hash."""
-    return _hash(marker.model_dump_json())
+    """Return the revision of a marker, a short hash of what people may change."""
+    return _hash(f"{marker.t_ns} {marker.label}")
 
 
 def _hash(text: str) -> str:

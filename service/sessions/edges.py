@@ -7,6 +7,7 @@ sealed session has each once, whatever was sent twice or was down meanwhile.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from devices.frames import ArrayInfo, Edge
 from devices.scene.hardware_sections import SyncSection
 from service.sessions.inputs import SessionInputs
 from storage.clock.table import ClockTable
+from storage.intervals import Intervals
 from storage.schema import UNKNOWN_T_NS
 from storage.sessions.folder import Marker, Session
 
@@ -50,28 +52,33 @@ def collect_edge_markers(inputs: SessionInputs) -> EdgeMarkers:
     if section is None:
         return EdgeMarkers()
     found: list[Marker] = []
-    lost, clock = 0, inputs.make_clock_table()
+    lost = further = 0
+    clock = inputs.make_clock_table()
     for span in inputs.find_part_spans():
         part, journal = inputs.session.parts[span.number], inputs.journals[span.stream_id]
         seq_last = journal.stored.last if part.seq_last is None else part.seq_last
         begin_ns, end_ns = span.t_mono_ns
-        edges = sorted(
-            edge
-            for edge in set(journal.read_edges(part.seq_first, seq_last or 0))
-            if begin_ns <= edge.t_mono_ns <= end_ns
-        )
-        if edges:
-            lost += edges[-1].number - edges[0].number + 1 - len(edges)
+        # Of an endless pulse train only the numbers and the first edges are kept. A message that
+        # was cut or came twice repeats edges of its neighbours, so these come not quite in order.
+        numbers, first = Intervals(), list[Edge]()
+        for edge in journal.read_edges(part.seq_first, seq_last or 0):
+            number = edge.number
+            if begin_ns <= edge.t_mono_ns <= end_ns and not numbers.restricted_to(number, number):
+                numbers.add(number, number)
+                if len(first) < 2 * EDGE_MARKERS_MAX:
+                    first.append(edge)
+        edges = sorted(first)[: EDGE_MARKERS_MAX - len(found)]
+        lost += sum(begin - end - 1 for (_, end), (begin, _) in pairwise(numbers))
+        further += numbers.number_count - len(edges)
         found += make_edge_markers(edges, section, journal.info, clock, span.number)
     problems = []
     if lost:
         problems.append(f"{lost} edges of the sync line are lost: too many at once, or with frames")
-    if len(found) > EDGE_MARKERS_MAX:
-        further = len(found) - EDGE_MARKERS_MAX
+    if further:
         problems.append(
             f"{further} edges of the sync line are no markers, beyond {EDGE_MARKERS_MAX}"
         )
-    return EdgeMarkers(tuple(found[:EDGE_MARKERS_MAX]), "; ".join(problems) or None)
+    return EdgeMarkers(tuple(found), "; ".join(problems) or None)
 
 
 def make_edge_markers(
@@ -92,7 +99,7 @@ def make_edge_markers(
     times = clock.compute_server_time_columns_or_unknown(t_mono_ns, t_ns, parts)
     is_known = times["t_server_ns"] != UNKNOWN_T_NS
     at_ns = np.where(is_known, times["t_server_ns"], t_ns).tolist()
-    clock_bound_ns = np.where(is_known, times["t_server_uncertainty_ns"], 0).tolist()
+    bound_ns = (times["t_server_uncertainty_ns"] + section.bound_ns).tolist()
     return [
         Marker(
             id=f"{info.stream_id}-{edge.number}",
@@ -100,7 +107,7 @@ def make_edge_markers(
             t_ns=at_ns[row],
             stream_id=info.stream_id,
             t_mono_ns=edge.t_mono_ns,
-            bound_ns=section.bound_ns + clock_bound_ns[row],
+            bound_ns=bound_ns[row] if is_known[row] else None,
         )
         for row, edge in enumerate(edges)
     ]

@@ -110,7 +110,7 @@ class Marker(_Record):
     t_mono_ns: int | None = None
     """Instant of the edge by the node's clock, as `t_mono_ns` of frames."""
     bound_ns: int | None = None
-    """Bound of the error of `t_ns`."""
+    """Bound of the error of `t_ns`; None: the server's time of the edge is unknown."""
 
 
 class IdempotencyRecord(_Record):

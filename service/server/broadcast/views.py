@@ -66,13 +66,15 @@ class MarkerView(View):
         description="Stream of an edge of a sync line; null: a person set the marker."
     )
     t_mono_ns: int | None = Field(description="Instant of an edge by its node's clock.")
-    bound_ns: int | None = Field(description="Bound of the error of an edge's `t_ns`.")
+    bound_ns: int | None = Field(
+        description="Bound of the error of an edge's `t_ns`; null: that is its node's UTC."
+    )
     revision: str = Field(description="Its revision, for `If-Match`.")
 
 
 def make_marker_view(marker: Marker) -> MarkerView:
     """Return a marker of a session."""
-    return MarkerView(**marker.model_dump(), revision=marker_revision(marker))
+    return MarkerView(**vars(marker), revision=marker_revision(marker))
 
 
 def make_tare_view(recorded: RecordedTare) -> TareView:
