@@ -98,12 +98,14 @@ def make_app(
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        running = asyncio.create_task(server.run_ticks())
+        steps = server.run_ticks(), server.recorder.restore_live_edges()
+        running = [asyncio.create_task(step) for step in steps]
         try:
             yield
         finally:
-            running.cancel()
-            await asyncio.gather(running, return_exceptions=True)
+            for task in running:
+                task.cancel()
+            await asyncio.gather(*running, return_exceptions=True)
             await server.close()
 
     app = FastAPI(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Literal
@@ -53,7 +53,7 @@ from storage.clock.table import (
 )
 from storage.edges import read_edges
 from storage.intervals import NO_END, Intervals, to_open_pairs
-from storage.sessions.folder import IdempotencyRecord, Ledger, Part, Session
+from storage.sessions.folder import IdempotencyRecord, Ledger, Marker, Part, Session
 from storage.sessions.ledger import group_numbers_by_stream
 from storage.sessions.metadata import write_markers
 
@@ -92,10 +92,10 @@ class Recorder:
         self._sealing: dict[str, asyncio.Task[None]] = {}
         self._retry_after_s: dict[str, float] = {}
         self._failures: dict[str, str] = {}
+        self._edge_ids: dict[str, set[str]] = {}
+        """Ids of the edges that a session being recorded has as markers."""
         for session in store.list_unsealed():
             store.cache(self._with_clock_offsets(session))
-            if read_sync_section(session) is not None:
-                store.cache(self._with_stored_edges(store.get_session(session.id)))
 
     def list_recording(self, node: str) -> list[Session]:
         """Return the sessions that are being recorded on a node."""
@@ -365,32 +365,50 @@ class Recorder:
     def add_live_edges(self, node: ServerNode, stream: ServerStream, payload: bytes) -> None:
         """Add the edges of a stored message to the sessions being recorded, in memory.
 
-        At sealing they are read from the journal; the clock may be known better then.
+        Subscribers get them with the next heartbeat. At sealing edges are read from the journal;
+        the clock may be known better then.
         """
-        if stream.journal is None or not (edges := read_edges(payload, stream.decoder.schema)):
+        sessions = [
+            session
+            for session in self.list_recording(node.name)
+            if session.parts[-1].stream_id == stream.stream_id
+            and len(session.markers) < EDGE_MARKERS_MAX
+        ]
+        if not sessions or not (edges := read_edges(payload, stream.decoder.schema)):
             return
-        offset_ns = stream.info.utc_offset_ns
-        for session in self.list_recording(node.name):
-            section, part = read_sync_section(session), session.parts[-1]
-            begin_t_ns = stream.journal.find_batch_t_ns_near(part.seq_first, at_or_before=False)
-            if section is None or part.stream_id != stream.stream_id or begin_t_ns is None:
+        frames = stream.decoder.decode(payload)
+        first, last = int(frames.seq[0]), int(frames.seq[-1])
+        if stream.stored.missing_in(first, last):  # refused, or the disk is full
+            return
+        rows = group_rows_by_stream_in_given_order(stream.clock_offsets)
+        clock = ClockTable(rows, [StreamClockFacts(stream.stream_id)], [stream.stream_id])
+        for session in sessions:
+            section, before = read_sync_section(session), session.parts[-1].seq_first - first
+            if section is None or before >= len(frames):
                 continue
-            rows = group_rows_by_stream_in_given_order(stream.clock_offsets)
-            clock = ClockTable(rows, [StreamClockFacts(part.stream_id)], [part.stream_id])
-            since = [edge for edge in edges if edge.t_mono_ns + offset_ns >= begin_t_ns]
-            known = {marker.id: marker for marker in session.markers if marker.stream_id}
-            new = {m.id: m for m in make_edge_markers(since, section, stream.info, clock, 0)}
-            if new.keys() - known.keys() and len(known) < EDGE_MARKERS_MAX:
-                changed = session.with_edge_markers((new | known).values())
-                self._store.cache(changed)
-                self._store.on_change(changed)
+            # Edges are read with a frame, so all those of later messages are behind the first.
+            begin_ns = int(frames.t_mono_ns[before]) if before >= 0 else 0
+            own = [edge for edge in edges if edge.t_mono_ns >= begin_ns]
+            self._cache_edges(session, make_edge_markers(own, section, stream.info, clock, 0))
 
-    def _with_stored_edges(self, session: Session) -> Session:
-        """Return an unsealed session with the edges that its journals have."""
-        with suppress(FootTileError):  # its node is unknown, or a journal is damaged
-            inputs = self.collect_inputs_from_journals(session.id)
-            return session.with_edge_markers(collect_edge_markers(inputs).markers)
-        return session
+    async def restore_live_edges(self) -> None:
+        """Add the edges in the journals to the sessions being recorded, after a restart."""
+        for session in self._store.list_unsealed():
+            if session.state == "recording" and read_sync_section(session) is not None:
+                with suppress(FootTileError):  # no node, a damaged journal, or a deleted session
+                    inputs = self.collect_inputs_from_journals(session.id)
+                    found = await asyncio.to_thread(collect_edge_markers, inputs)
+                    self._cache_edges(self._store.get_session(session.id), found.markers)
+
+    def _cache_edges(self, session: Session, edges: Sequence[Marker]) -> None:
+        known = self._edge_ids.get(session.id)
+        if known is None:
+            known = self._edge_ids[session.id] = {marker.id for marker in session.markers}
+        new = [marker for marker in edges if marker.id not in known]
+        if new and session.state == "recording":
+            known.update(marker.id for marker in new)
+            markers = (*session.markers, *new)
+            self._store.cache(session.model_copy(update={"markers": markers}))
 
     def cache_missing_clock_offsets(self, node: ServerNode) -> None:
         """Add missing clock measurements to a node's unsealed sessions, in memory.
@@ -527,6 +545,7 @@ class Recorder:
             self._failures[session_id] = f"cannot be sealed yet, and is retried: {error}"
             store.on_change(store.get_session(session_id))
         finally:
+            self._edge_ids.pop(session_id, None)
             del self._sealing[session_id]
 
     def _with_clock_offsets(self, session: Session) -> Session:

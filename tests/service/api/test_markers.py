@@ -18,6 +18,7 @@ import foottile
 from devices.errors import StorageError
 from devices.frames import Edge
 from service.pull import pull_session
+from storage.journal.journal import Journal
 from storage.schema import wire_schema
 from storage.sessions.metadata import read_existing_markers, write_markers
 from storage.verify.session import verify_session
@@ -26,7 +27,7 @@ from tests.service.command import command
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
 from tests.service.running import Running, assert_refused, content_of
-from tests.storage.faulty_disk import failing_once
+from tests.storage.faulty_disk import failing_if, failing_once
 from tests.waiting import until
 
 HOUR_NS = 3_600_000_000_000
@@ -326,4 +327,54 @@ def test_an_edge_is_shown_at_once_and_changed_only_once_it_is_sealed(shared: Run
     moved = content_of(shared.http.patch(url, json={"t_ns": edge["t_ns"] + 5}))
     assert (moved["stream_id"], moved["t_mono_ns"], moved["bound_ns"]) == (None, None, None)
     assert verify_session(session.folder).problems == []
+    node.close()
+
+
+def test_edges_of_refused_frames_are_no_markers_and_no_disk_is_asked(
+    shared: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = FakeNode(shared, name="ahead")
+    node.greet(scene={"sync": {"input_line": 17, "label": "TTL"}})
+    node.deliver(50, alive=True)
+    session = node.record()
+
+    def send(t_mono_ns: int, number: int) -> None:
+        batch = node.frames(20, alive=True)
+        edge = Edge(number, t_mono_ns, True)
+        node.socket.send(encode_frames(batch, wire_schema(node.info), [edge]))
+
+    begin_ns = node.next_t_mono_ns
+    refuse = failing_if(lambda *_: True, Journal.find_batch_t_ns_near, StorageError, "full")
+    with monkeypatch.context() as full:
+        full.setattr(Journal, "find_batch_t_ns_near", refuse)
+        send(begin_ns, 1)
+        until(lambda: len(shared.server.sessions.get_session(session.id).markers) == 1)
+    true_at = node.seq, node.next_t_mono_ns
+    node.seq += 10**9
+    send(node.next_t_mono_ns, 2)
+    node.seq, node.next_t_mono_ns = true_at
+    send(node.next_t_mono_ns, 3)
+    until(lambda: len(list_markers(session)) == 2)
+    assert [marker["id"].rpartition("-")[2] for marker in list_markers(session)] == ["1", "3"]
+    assert shared.node("ahead")["connected"]
+    node.taken_in()
+    node.finish(session)
+    node.close()
+
+
+def test_edges_are_shown_again_after_a_restart_of_the_server(running: Running) -> None:
+    node = FakeNode(running)
+    node.greet(scene={"sync": {"input_line": 17, "label": "TTL"}})
+    node.deliver(50, alive=True)
+    session = node.record()
+    batch = node.frames(20, alive=True)
+    edges = [Edge(n, int(batch.t_mono_ns[n]), True) for n in (1, 2)]
+    node.socket.send(encode_frames(batch, wire_schema(node.info), edges))
+    until(lambda: len(list_markers(session)) == 2)
+    node.acknowledged(69)
+    before = list_markers(session)
+    node.leave()
+    running.stop()
+    running.start()
+    until(lambda: list_markers(session) == before)
     node.close()
