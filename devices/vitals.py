@@ -125,7 +125,8 @@ def _run_vcgencmd(root: Path) -> str:
             [command, "get_throttled"],
             capture_output=True,
             check=True,
-            text=True,
+            encoding="utf-8",
+            errors="replace",
             timeout=_COMMAND_TIMEOUT_S,
         ).stdout.strip()
     return ""
@@ -145,8 +146,11 @@ def _read_wifi_dbm(root: Path) -> float | None:
         name, _, facts = line.partition(":")
         with suppress(ValueError, IndexError):
             signals[name.strip()] = float(facts.split()[2])
-    routes = [line.split() for line in _read(root / "proc/net/route").splitlines()[1:]]
-    default = [(int(r[6]), r[0]) for r in routes if len(r) > 6 and r[1] == "00000000"]
+    default = []
+    for line in _read(root / "proc/net/route").splitlines()[1:]:
+        with suppress(ValueError, IndexError):
+            route = line.split()
+            default += [(int(route[6]), route[0])] if route[1] == "00000000" else []
     found = signals.get(min(default)[1]) if default else next(iter(signals.values()), None)
     return found if found is not None and found < 0 else None  # else no dBm, or no link
 

@@ -331,16 +331,22 @@ class RunningNode:
 
     async def _watch_vitals(self) -> None:
         """Read the vitals every few seconds, in a thread: a disk or a command may hang."""
-        warnings, begin_s = VitalsWarnings(), None
+        warnings, begin_s, reported = VitalsWarnings(), None, ""
         while True:
             bytes_per_s, now_s = None, time.monotonic()
             if begin_s is not None:
                 bytes_per_s = self._queued_bytes / (now_s - begin_s)
             begin_s, self._queued_bytes = now_s, 0
-            self._vitals = await asyncio.to_thread(
-                read_vitals, self._options.node_folder, bytes_per_s
-            )
-            self._vitals_warnings = warnings.update(self._vitals)
+            try:
+                self._vitals = await asyncio.to_thread(
+                    read_vitals, self._options.node_folder, bytes_per_s
+                )
+            except Exception as error:  # a machine's files may say anything; the next may be good
+                self._vitals = None
+                if (problem := f"the vitals of this machine cannot be read: {error}") != reported:
+                    self._report(problem)
+                reported = problem
+            self._vitals_warnings = warnings.update(self._vitals or Vitals())
             await asyncio.sleep(VITALS_INTERVAL_S)
 
     def _on_retention_request(

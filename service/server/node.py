@@ -23,6 +23,7 @@ from devices.errors import (
     StorageError,
 )
 from devices.frames import ArrayInfo, FrameBatch
+from devices.vitals import Vitals
 from service.protocol.link import Hello, StreamNumbers, is_stream_id
 from service.server.estimates.node_estimator import EstimatedBatch, NodeEstimator
 from service.server.streams import ServerStream
@@ -108,8 +109,8 @@ class ServerNode:
         """Faults of its array or disk, from its last status."""
         self.fault_counts: dict[str, dict[str, int]] = {}
         """Faults of the present stream by serial and reason, from its last status."""
-        self.vitals = hello.vitals
-        """Vitals of its machine, from its last hello or status; None: unknown."""
+        self.vitals: Vitals | None = None
+        """Vitals of its machine, from its last hello or status; None: unknown, or disconnected."""
         self.refused_ahead_frames = 0
         """Frames of the present stream that were refused because they are ahead of time."""
         self.received_frames = self.received_bytes = 0
@@ -312,7 +313,7 @@ class ServerNode:
 
     def mark_disconnected(self) -> None:
         """Mark the node as disconnected; its frames stay."""
-        self.is_connected = False
+        self.is_connected, self.vitals = False, None
         self._rate_meter.clear()
 
     def receive_frames(

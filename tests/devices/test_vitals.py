@@ -121,6 +121,15 @@ def test_the_signal_is_that_of_the_interface_in_use(pi: Pi) -> None:
     assert pi.read().wifi_dbm is None, "no link"
 
 
+def test_files_that_say_something_else_are_no_values(pi: Pi) -> None:
+    pi.vcgencmd(r"printf 'throttled=\377'")
+    pi.write("proc/net/wireless", WIRELESS)
+    odd = route("wlan1", 0).replace("\t0\t0\t0\t", "\t0\t0\tmany\t")
+    pi.write("proc/net/route", ROUTES + odd + "x\n" + route("wlan0", 1))
+    vitals = pi.read()
+    assert (vitals.is_undervolted, vitals.wifi_dbm) == (None, -56.0)
+
+
 def test_the_clock_is_as_the_kernel_states_it(pi: Pi, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("devices.vitals.read_clock_state", lambda: ClockState(True, 0.0125))
     found = pi.read()

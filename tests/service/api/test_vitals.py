@@ -59,3 +59,18 @@ def test_a_node_that_knows_no_vitals_says_none(running: Running) -> None:
     with session.reader() as file:
         assert not {"vitals_at_start", "vitals_at_stop"} & file.notes["session"].keys()
     node.close()
+
+
+def test_vitals_of_a_node_that_is_away_are_unknown(running: Running) -> None:
+    node = FakeNode(running)
+    node.connect(vitals=START)
+    node.deliver(30, alive=True)
+    session = node.record()
+    node.leave()
+    until(lambda: not running.node()["connected"])
+    assert running.node()["vitals"] is None
+    session.stop()
+    assert session.now()["vitals_at_stop"] is None
+    running.stop()
+    running.start()
+    assert running.node()["vitals"] is None
