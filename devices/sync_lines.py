@@ -14,27 +14,26 @@ from datetime import timedelta
 from typing import TYPE_CHECKING, Protocol
 
 from devices.acquisition import AcquiredFrame, FrameSink
-from devices.array.bus_recovery import translate_gpio_errors
-from devices.clock import Clock
 from devices.errors import require_extra
 from devices.frames import Edge
+from devices.gpio import translate_gpio_errors
 from devices.scene.hardware_sections import SyncSection
 
 if TYPE_CHECKING:
     from gpiod import LineRequest, LineSettings
 
-EDGES_PER_BATCH_MAX = 64
-"""Most edges of a batch, 2560 a second: further ones are dropped and counted."""
+EDGES_PER_S_MAX = 2560
+"""Edges that are stored a second, and as many as of 25 ms at once: others are dropped, counted."""
+_EDGES_AT_ONCE_MAX = EDGES_PER_S_MAX // 40
 _KERNEL_EDGES_MAX = 1024
 """Edges that wait in the kernel, its limit; it drops the oldest, as a gap in `line_seqno`."""
 _DROP_WARNING_NS = 1_000_000_000
 """Time for which dropped edges are a warning."""
 
 
-def _request_line(scene: SyncSection, line: int | None, settings: LineSettings) -> LineRequest:
+def _request_line(scene: SyncSection, line: int, settings: LineSettings) -> LineRequest:
     import gpiod
 
-    assert line is not None  # noqa: S101  # the caller has checked
     with translate_gpio_errors(scene.gpiochip, [line], "[sync]"):
         return gpiod.request_lines(
             scene.gpiochip,
@@ -57,22 +56,21 @@ class SyncInput:
     A line that fails later is a warning, and has no more edges.
 
     Args:
-        scene: its section; `input_line` is set.
-        clock: clock of the frames.
+        scene: its section.
+        line: its `input_line`.
 
     Raises:
         MissingExtraError: gpiod is not installed.
         BusSetupError: the line is not there, in use, or forbidden.
     """
 
-    def __init__(self, scene: SyncSection, clock: Clock) -> None:
-        self.sink: EdgeSink | None = None
-        """Sink of the present stream; None: frames and edges in flight are not stored."""
+    def __init__(self, scene: SyncSection, line: int) -> None:
         self.dropped_edges = 0
         """Number of edges that came faster than they can be stored."""
-        self._clock = clock
-        self._edges: list[Edge] = []
         self._number = 0
+        self._room = 0.0
+        """Edges that may be stored now."""
+        self._read_at_ns = 0
         self._problem = ""
         self._dropped_at_ns: float = -math.inf
         with require_extra("gpio", "the sync line"):
@@ -85,79 +83,106 @@ class SyncInput:
             bias=Bias[scene.bias.upper()],
             debounce_period=timedelta(microseconds=scene.debounce_us),
         )
-        self._request = _request_line(scene, scene.input_line, settings)
+        self._request = _request_line(scene, line, settings)
 
     @property
     def warning(self) -> str:
         """Warning about the line; empty if there is none."""
         if self._problem:
             return f"the sync line fails, and edges are lost until a restart: {self._problem}"
-        if self._clock.now_ns() - self._dropped_at_ns < _DROP_WARNING_NS:
+        if self._read_at_ns - self._dropped_at_ns < _DROP_WARNING_NS:
             return (
-                f"the sync line has more than {EDGES_PER_BATCH_MAX} edges in 25 ms; further ones "
-                "are dropped. Check cable and ground, or set sync.debounce_us"
+                f"edges of the sync line are dropped: there are more than {EDGES_PER_S_MAX} a "
+                f"second, or {_KERNEL_EDGES_MAX} from frame to frame. Check cable and ground, or "
+                "set sync.debounce_us"
             )
         return ""
 
-    def write_frame(self, frame: AcquiredFrame) -> None:
-        """Read the edges up to now, and write them and then the frame to the sink."""
-        edges = self._read_edges()
-        if self.sink is not None:
-            if edges:
-                self.sink.write_edges(edges)
-            self.sink.write_frame(frame)
-
-    def take_batch(self) -> tuple[Edge, ...]:
-        """Return the edges since the last call."""
-        edges, self._edges = tuple(self._edges), []
-        return edges
+    def read_edges(self, frame: AcquiredFrame) -> list[Edge]:
+        """Read the edges since the last frame; before the first of a stream they are discarded."""
+        elapsed_room = (frame.t_mono_ns - self._read_at_ns) * 1e-9 * EDGES_PER_S_MAX
+        # A stall leaves a backlog in the kernel, which is no storm.
+        self._room = max(min(self._room + elapsed_room, _EDGES_AT_ONCE_MAX), elapsed_room)
+        self._read_at_ns = frame.t_mono_ns
+        try:
+            if self._problem or not self._request.wait_edge_events(0.0):
+                return []
+            events = self._request.read_edge_events()
+        except OSError as error:
+            self._problem = error.strerror or str(error)
+            return []
+        new: list[Edge] = []
+        dropped = 0
+        for event in events:
+            # The kernel's number of 32 bits may wrap, and leaps over events that it dropped.
+            step = (event.line_seqno - self._number) % 2**32
+            self._number += step
+            if frame.seq or event.timestamp_ns >= frame.t_mono_ns:
+                is_rising = event.event_type is event.Type.RISING_EDGE
+                new.append(Edge(self._number, event.timestamp_ns, is_rising))
+                dropped += step - 1
+        kept = new[max(0, len(new) - int(self._room)) :]
+        self._room -= len(kept)
+        if dropped := dropped + len(new) - len(kept):
+            self.dropped_edges += dropped
+            self._dropped_at_ns = frame.t_mono_ns
+        return kept
 
     def close(self) -> None:
         """Release the line."""
         with suppress(OSError):
             self._request.release()
 
-    def _read_edges(self) -> list[Edge]:
-        new: list[Edge] = []
-        try:
-            if self._problem or not self._request.wait_edge_events(0.0):
-                return new
-            events = self._request.read_edge_events()
-        except OSError as error:
-            self._problem = error.strerror or str(error)
-            return new
-        for event in events:
-            # The kernel's number of 32 bits may wrap, and leaps over events that it dropped.
-            step = (event.line_seqno - self._number) % 2**32
-            self._number += step
-            is_kept = len(self._edges) + len(new) < EDGES_PER_BATCH_MAX
-            if is_kept:
-                is_rising = event.event_type is event.Type.RISING_EDGE
-                new.append(Edge(self._number, event.timestamp_ns, is_rising))
-            if dropped := step - is_kept:
-                self.dropped_edges += dropped
-                self._dropped_at_ns = self._clock.now_ns()
-        self._edges += new
-        return new
+
+class EdgeReader:
+    """Sink of a stream's frames that reads the edges before each.
+
+    Args:
+        line: line of the edges.
+        sink: sink of edges and frames; None: they are not stored in flight.
+    """
+
+    def __init__(self, line: SyncInput, sink: EdgeSink | None) -> None:
+        self._line = line
+        self._sink = sink
+        self._edges: list[Edge] = []
+
+    def write_frame(self, frame: AcquiredFrame) -> None:
+        """Read the edges up to now, and write them and then the frame to the sink."""
+        edges = self._line.read_edges(frame)
+        self._edges += edges
+        if self._sink is not None:
+            if edges:
+                self._sink.write_edges(edges)
+            self._sink.write_frame(frame)
+
+    def take_batch(self) -> tuple[Edge, ...]:
+        """Return the edges since the last call."""
+        edges, self._edges = tuple(self._edges), []
+        return edges
 
 
 class RecordingLine:
     """Output line that is high while a session is recorded.
+
+    Args:
+        scene: its section.
+        line: its `output_line`.
 
     Raises:
         MissingExtraError: gpiod is not installed.
         BusSetupError: the line is not there, in use, or forbidden.
     """
 
-    def __init__(self, scene: SyncSection) -> None:
+    def __init__(self, scene: SyncSection, line: int) -> None:
         self.warning = ""
         """Reason why the line may have another level; empty if it has the right one."""
         with require_extra("gpio", "the recording line"):
             from gpiod import LineSettings
             from gpiod.line import Direction
-        self._line = scene.output_line or 0
+        self._line = line
         low = LineSettings(direction=Direction.OUTPUT)
-        self._request = _request_line(scene, scene.output_line, low)
+        self._request = _request_line(scene, line, low)
 
     def drive(self, *, high: bool) -> None:
         """Drive the line; a failure is a warning."""

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
@@ -25,25 +25,11 @@ from devices.array.tile import Scan
 from devices.chips.tca9548a import MuxRouter
 from devices.clock import Clock
 from devices.errors import BusFaultError, BusSetupError, require_extra
+from devices.gpio import translate_gpio_errors
 from devices.scene.hardware_sections import RecoverySection
 
 if TYPE_CHECKING:
     from gpiod import LineRequest
-
-
-@contextmanager
-def translate_gpio_errors(chip: str, lines: Sequence[int], section: str) -> Iterator[None]:
-    """Context manager: turn errors of GPIO lines into `BusSetupError` while the block runs."""
-    try:
-        yield
-    except OSError as error:
-        raise BusSetupError(
-            f"GPIO lines cannot be used ({error.strerror or error})",
-            where=f"{chip}, lines {', '.join(map(str, lines))}",
-            remedy=f"Check {section}, that this user is in the group gpio, and that no other "
-            "program holds the lines (gpioinfo)",
-            errno=error.errno,
-        ) from error
 
 
 _TOOLS = ("pinctrl", "raspi-gpio")

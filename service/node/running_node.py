@@ -166,7 +166,7 @@ class RunningNode:
         sync = options.rig_options.scene.sync
         self._recording_line: RecordingLine | None = None
         if sync is not None and sync.output_line is not None:
-            self._recording_line = RecordingLine(sync)
+            self._recording_line = RecordingLine(sync, sync.output_line)
         self._vitals: Vitals | None = None
         self._vitals_warnings: tuple[str, ...] = ()
         self._queued_bytes = 0

@@ -37,7 +37,7 @@ from devices.frames import ArrayInfo, Edge, FrameBatch, ServoInfo, TileInfo
 from devices.realtime import is_clock_set, set_timer_slack, use_realtime_priority
 from devices.scene.hardware_sections import EMULATED, ReferenceSection, ScheduleName, ServoSection
 from devices.scene.scene_file import Scene
-from devices.sync_lines import SyncInput
+from devices.sync_lines import EdgeReader, SyncInput
 from service.rig.emulated_foot import RigOptions
 from service.version import SOFTWARE_VERSION
 from storage.journal.node.in_flight import InFlightWriter, try_create_in_flight_writer
@@ -312,8 +312,9 @@ class Rig:
             self._open_servo_source(scene.servo, world, stack) if scene.servo is not None else None
         )
         self._sync: SyncInput | None = None
+        self._edge_reader: EdgeReader | None = None
         if scene.sync is not None and scene.sync.input_line is not None:
-            self._sync = SyncInput(scene.sync, self._line_clock)
+            self._sync = SyncInput(scene.sync, scene.sync.input_line)
             stack.callback(self._sync.close)
         self._reidentify_at_ns = 0
         self._in_flight: InFlightWriter | None = None
@@ -347,7 +348,7 @@ class Rig:
         folder = None if streams is None else streams / self.info.stream_id
         self._in_flight = try_create_in_flight_writer(folder, self.info)
         if self._sync is not None:
-            self._sync.sink = self._in_flight
+            self._edge_reader = EdgeReader(self._sync, self._in_flight)
         if folder is not None and self._in_flight is None:
             self.startup_messages.append(
                 "no room for frames in flight: a crash may cost the last batches"
@@ -361,7 +362,7 @@ class Rig:
             expected_rate_hz=bus_hz,
             servo=self._servo_source,
             is_reidentified=is_reidentified,
-            frame_sink=self._in_flight if self._sync is None else self._sync,
+            frame_sink=self._edge_reader or self._in_flight,
             lead_end_ns=None if self._lead is None else self._lead.end_ns,
         )
         self._rate_monitor = FrameRateMonitor(self.info.nominal_rate_hz)
@@ -391,7 +392,7 @@ class Rig:
 
     def take_edges(self) -> tuple[Edge, ...]:
         """Return the edges of the sync line up to the last frame, since the last call."""
-        return () if self._sync is None else self._sync.take_batch()
+        return () if self._edge_reader is None else self._edge_reader.take_batch()
 
     def get_warnings(self) -> dict[str, str]:
         """Return the present warnings, by tile's serial or device."""

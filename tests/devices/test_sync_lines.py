@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 
-from devices.clock import VirtualClock
+from devices.acquisition import AcquiredFrame
 from devices.errors import BusSetupError, MissingExtraError
 from devices.frames import Edge
 from devices.scene.hardware_sections import SyncSection
-from devices.sync_lines import EDGES_PER_BATCH_MAX, RecordingLine, SyncInput
+from devices.sync_lines import EdgeReader, RecordingLine, SyncInput
 from tests.devices.array.gpio_chip import EMULATED_GPIOD, FileChip
 
 pytest.importorskip("gpiod", reason="sync lines need the extra `gpio`")
@@ -41,19 +41,32 @@ class Kept:
         self.given.append(frame)
 
 
+PERIOD_NS = 2_000_000
+AT_ONCE = 64
+
+
 class Line:
-    """An input line and its clock."""
+    """An input line, and the frames with which it is read."""
 
     def __init__(self, chip: FileChip, **keys: Any) -> None:
-        self.clock = VirtualClock()
-        self.input = SyncInput(
-            SyncSection(gpiochip=str(chip.path), input_line=17, **keys), self.clock
-        )
-        self.input.sink = self.kept = Kept()
+        scene = SyncSection(gpiochip=str(chip.path), input_line=17, **keys)
+        self.input = SyncInput(scene, 17)
+        self.seq, self.t_mono_ns = 0, 10**10
+        self.begin_stream()
 
-    def take(self, frame: str = "frame") -> tuple[Edge, ...]:
-        self.input.write_frame(frame)  # type: ignore[arg-type]
-        return self.input.take_batch()
+    def begin_stream(self) -> None:
+        self.kept = Kept()
+        self.reader = EdgeReader(self.input, self.kept)
+        self.seq = 0
+        self.take()
+
+    def take(self, after_ns: int = PERIOD_NS) -> tuple[Edge, ...]:
+        """Take a frame, and the edges up to it."""
+        self.t_mono_ns += after_ns
+        rest = (0, 0, 0, 0.0, 0, (), (), (), ())
+        self.reader.write_frame(AcquiredFrame(self.seq, self.t_mono_ns, *rest))
+        self.seq += 1
+        return self.reader.take_batch()
 
 
 @pytest.fixture
@@ -69,13 +82,11 @@ def test_edges_come_with_their_stamps_before_the_frame_after_them(
     chip.send_edge(100)
     chip.send_edge(250, is_rising=False)
     assert line.take() == (Edge(1, 100, True), Edge(2, 250, False))
-    assert line.take("another") == ()
+    assert line.take() == ()
     chip.send_edge(300)
     assert line.take() == (Edge(3, 300, True),)
-    assert line.kept.given == [
-        *(Edge(1, 100, True), Edge(2, 250, False), "frame", "another"),
-        *(Edge(3, 300, True), "frame"),
-    ]
+    given = [each if isinstance(each, Edge) else each.seq for each in line.kept.given]
+    assert given == [0, Edge(1, 100, True), Edge(2, 250, False), 1, 2, Edge(3, 300, True), 3]
 
 
 def test_only_the_edges_that_the_scene_names_count(chip: FileChip) -> None:
@@ -90,13 +101,42 @@ def test_a_storm_is_bounded_counted_and_said_until_it_is_over(chip: FileChip, li
     for t_ns in range(1000):
         chip.send_edge(t_ns)
     taken = line.take()
-    assert len(taken) == EDGES_PER_BATCH_MAX == len(line.kept.given) - 1
-    assert line.input.dropped_edges == 1000 - EDGES_PER_BATCH_MAX
-    assert "more than 64 edges in 25 ms" in line.input.warning
+    assert [edge.number for edge in taken] == list(range(1001 - AT_ONCE, 1001)), "the newest"
+    assert line.input.dropped_edges == 1000 - AT_ONCE
+    assert "edges of the sync line are dropped" in line.input.warning
     chip.send_edge(2000)
-    assert line.take() == (Edge(1001, 2000, True),), "the dropped ones are counted"
-    line.clock.sleep_until_ns(2_000_000_000)
+    assert line.take() == (Edge(1001, 2000, True),)
+    for _ in range(500):
+        chip.send_edge(5)
+        line.take()
+    assert line.input.dropped_edges == 1000 - AT_ONCE
     assert line.input.warning == ""
+
+
+def test_a_lasting_storm_keeps_2560_edges_a_second(chip: FileChip, line: Line) -> None:
+    kept = 0
+    for _ in range(500):
+        for _ in range(20):
+            chip.send_edge(5)
+        kept += len(line.take())
+    assert 2560 <= kept <= 2560 + AT_ONCE
+    assert line.input.dropped_edges == 10_000 - kept
+
+
+def test_a_backlog_of_a_stall_or_a_low_rate_is_kept(chip: FileChip, line: Line) -> None:
+    for _ in range(500):
+        chip.send_edge(5)
+    assert len(line.take(after_ns=500_000_000)) == 500
+    assert (line.input.dropped_edges, line.input.warning) == (0, "")
+
+
+def test_edges_from_before_a_stream_are_not_in_it(chip: FileChip, line: Line) -> None:
+    for number in range(1000):
+        chip.send_edge(number, lost_before=number % 2)
+    chip.send_edge(line.t_mono_ns + 2 * PERIOD_NS)
+    line.begin_stream()
+    assert [edge.number for edge in line.kept.given if isinstance(edge, Edge)] == [1501]
+    assert (line.input.dropped_edges, line.input.warning) == (0, "")
 
 
 def test_edges_that_the_kernel_dropped_are_counted(chip: FileChip, line: Line) -> None:
@@ -112,8 +152,8 @@ def test_a_line_that_goes_away_is_a_warning_and_frames_go_on(chip: FileChip, lin
     assert line.take() == ()
     assert "the sync line fails, and edges are lost" in line.input.warning
     os.mkfifo(chip.path / "line17")
-    assert line.take("another") == ()
-    assert line.kept.given == ["frame", "another"]
+    assert line.take() == ()
+    assert [frame.seq for frame in line.kept.given] == [0, 1, 2]
 
 
 def test_the_number_goes_on_where_the_kernels_wraps(chip: FileChip, line: Line) -> None:
@@ -132,7 +172,7 @@ def test_a_line_that_cannot_be_had_is_said_at_the_start(
 
     monkeypatch.setattr("gpiod.request_lines", refuse)
     scene = SyncSection(gpiochip="/dev/gpiochip0", input_line=17, output_line=27)
-    for begin in (lambda: SyncInput(scene, VirtualClock()), lambda: RecordingLine(scene)):
+    for begin in (lambda: SyncInput(scene, 17), lambda: RecordingLine(scene, 27)):
         with pytest.raises(BusSetupError, match=os.strerror(failure)) as caught:
             begin()
         assert caught.value.errno == failure
@@ -142,13 +182,13 @@ def test_a_line_that_cannot_be_had_is_said_at_the_start(
 def test_the_extra_is_named_without_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gpiod", None)
     with pytest.raises(MissingExtraError, match=r"'foottile\[gpio\]'"):
-        SyncInput(SyncSection(input_line=17), VirtualClock())
+        SyncInput(SyncSection(input_line=17), 17)
     with pytest.raises(MissingExtraError, match=r"'foottile\[gpio\]'"):
-        RecordingLine(SyncSection(output_line=17))
+        RecordingLine(SyncSection(output_line=17), 17)
 
 
 def test_the_recording_line_is_low_at_first_and_in_the_end(chip: FileChip) -> None:
-    line = RecordingLine(SyncSection(gpiochip=str(chip.path), output_line=27))
+    line = RecordingLine(SyncSection(gpiochip=str(chip.path), output_line=27), 27)
     assert (chip.path / "line27").read_text() == "0"
     line.drive(high=True)
     assert chip.is_high(27)
@@ -159,7 +199,7 @@ def test_the_recording_line_is_low_at_first_and_in_the_end(chip: FileChip) -> No
 def test_a_recording_line_that_fails_is_a_warning(
     chip: FileChip, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    line = RecordingLine(SyncSection(gpiochip=str(chip.path), output_line=27))
+    line = RecordingLine(SyncSection(gpiochip=str(chip.path), output_line=27), 27)
 
     def refuse(*_: object) -> None:
         raise OSError(errno.EIO, os.strerror(errno.EIO))

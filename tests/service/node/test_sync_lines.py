@@ -124,7 +124,7 @@ def test_a_node_alone_has_its_edges_in_its_session(
         assert not chip.is_high(27)
     (folder,) = (tmp_path / "node" / "sessions").iterdir()
     markers = read_existing_markers(folder / "markers.parquet")
-    assert [(m.t_mono_ns, m.bound_ns) for m in markers] == [(t, BOUND_NS) for t in sent]
+    assert [(m.t_mono_ns, m.bound_ns) for m in markers] == [(t, None) for t in sent]
     session = SessionsFolder(folder.parent).load(folder.name)
     assert session.problem is not None
     assert "3 edges of the sync line are lost" in session.problem
