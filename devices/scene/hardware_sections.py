@@ -247,7 +247,8 @@ class SyncSection(SceneSection):
     def bound_ns(self) -> int:
         """Bound of the error of an edge's time stamp: interrupt latency, and the debouncing.
 
-        A debounced edge is stamped at a tick of the kernel, of up to 10 ms, after that time.
+        The latency is assumed, not measured. A debounced edge is stamped at a tick of the kernel,
+        of up to 10 ms, after that time.
         """
         return 200_000 + (1000 * self.debounce_us + 10_000_000 if self.debounce_us else 0)
 

@@ -367,11 +367,16 @@ def load_adapted_scene(
 ) -> Scene:
     """Load a scene and replace its bus, the port of its servo, or its pressure chips.
 
+    A scene of real hardware that is emulated has no sync lines: their pins may be wired.
+
     Raises:
         SceneError: no such scene.
         UsageError: the scene has no servo.
     """
     scene = load_scene(name, chip)
+    if bus == EMULATED != scene.array.bus and scene.sync is not None:
+        remark("the lines of [sync] are not used: their pins are real, and the bus is emulated")
+        scene = scene.model_copy(update={"sync": None})
     if bus is not None:
         scene = scene.model_copy(update={"array": scene.array.model_copy(update={"bus": bus})})
     if servo == "none":
