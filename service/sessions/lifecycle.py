@@ -195,7 +195,7 @@ def apply_event(session: Session, event: Event, node: NodeFacts = _NO_FACTS) -> 
             # A person may have edited the session during sealing.
             user_fields = {name: getattr(session, name) for name in _EDITABLE}
             edges = (marker for marker in sealed.markers if marker.stream_id is not None)
-            user_fields["markers"] = session.with_edge_markers(edges).markers
+            user_fields["markers"] = session.with_replaced_edges(edges).markers
             has_other_markers = user_fields["markers"] != sealed.markers
             return Step(
                 sealed.model_copy(update=user_fields),

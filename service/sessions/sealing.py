@@ -81,7 +81,7 @@ def write_sealed_files(inputs: SessionInputs, folder: Path, ledger: Ledger) -> S
             f"{count} frames were sealed, the ledger has {ledger.recorded}", where=str(path)
         )
     edges = collect_edge_markers(inputs)
-    session = session.with_edge_markers(edges.markers)
+    session = session.with_replaced_edges(edges.markers)
     write_markers(session, folder)
     write_clock_file(folder / CLOCK_NAME, session.clock, inputs.stream_facts)
     sha256 = compute_sha256(path)

@@ -175,7 +175,7 @@ class Session(_Record):
     calibration_id: str | None = None
     absolute_scale: Literal["measured", "assumed"] | None = None
 
-    def with_edge_markers(self, edges: Iterable[Marker]) -> Session:
+    def with_replaced_edges(self, edges: Iterable[Marker]) -> Session:
         """Return the session with these markers as its edges; those of people stay."""
         others = (marker for marker in self.markers if marker.stream_id is None)
         return self.model_copy(update={"markers": (*others, *edges)})

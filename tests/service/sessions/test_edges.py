@@ -174,5 +174,5 @@ def test_edges_replace_edges_and_leave_the_markers_of_people() -> None:
         scene="x",
         markers=(old, person),
     )
-    assert session.with_edge_markers([new]).markers == (person, new)
-    assert np.all([marker.stream_id is None for marker in session.with_edge_markers([]).markers])
+    assert session.with_replaced_edges([new]).markers == (person, new)
+    assert np.all([marker.stream_id is None for marker in session.with_replaced_edges([]).markers])
