@@ -28,6 +28,8 @@ _ANSWER_TIMEOUT_MS = 700
 _BROWSE_AGAIN_S = 10.0
 """Interval of new questions while nothing is found; the library's own grows to an hour."""
 _NAMES_MAX = 100
+_TEXT_MAX, _ITEMS_MAX = 255, 32
+"""Bounds of a found service: letters of a text; texts, and addresses."""
 
 
 @dataclass(frozen=True)
@@ -153,10 +155,7 @@ class Discovery:
                             await self._announce(self._open)
                         self._interfaces, self._reported = found, ""
                 except Exception as error:  # of a network that changes, or a bug: never the end
-                    what = f"servers and nodes are not found by themselves: {error!r}"
-                    if what != self._reported:
-                        self._report(what)
-                    self._reported = what
+                    self._report_failure(error)
                     with suppress(Exception):
                         await self._close()
                 await asyncio.sleep(_POLL_S)
@@ -164,8 +163,21 @@ class Discovery:
             with suppress(Exception):
                 await self._close()
 
+    def _report_failure(self, error: Exception) -> None:
+        what = f"servers and nodes are not found by themselves: {error!r}"
+        if what != self._reported:
+            self._report(what)
+        self._reported = what
+
     async def list_found(self, kind: str) -> list[FoundService]:
-        """Return the services that answer now, the newest last."""
+        """Return the services that answer now, the newest last; none after a failure."""
+        try:
+            return await self._ask_all(kind)
+        except Exception as error:  # a node publishes and measures without it
+            self._report_failure(error)
+            return []
+
+    async def _ask_all(self, kind: str) -> list[FoundService]:
         from zeroconf.asyncio import AsyncServiceInfo
 
         opened = self._open
@@ -176,15 +188,18 @@ class Discovery:
             *(info.async_request(opened.zeroconf, _ANSWER_TIMEOUT_MS) for info in infos),
             return_exceptions=True,
         )
-        found = [_describe(info) for info, here in zip(infos, answers, strict=True) if here is True]
+        described = [
+            _describe(info) for info, here in zip(infos, answers, strict=True) if here is True
+        ]
+        found = [each for each in described if each is not None]
         now_s = asyncio.get_running_loop().time()
         if not found and now_s - self._browsed_s > _BROWSE_AGAIN_S and self._open is opened:
             await self._browse(opened)
         return found
 
     async def _browse(self, opened: AsyncZeroconf) -> None:
-        from zeroconf import ServiceStateChange
-        from zeroconf.asyncio import AsyncServiceBrowser
+        from zeroconf import BadTypeInNameException, ServiceStateChange
+        from zeroconf.asyncio import AsyncServiceBrowser, AsyncServiceInfo
 
         def on_change(
             zeroconf: object, service_type: str, name: str, state_change: ServiceStateChange
@@ -192,7 +207,9 @@ class Discovery:
             names = self._names[service_type]
             names.pop(name, None)  # a changed one is the newest
             if state_change is not ServiceStateChange.Removed and len(names) < _NAMES_MAX:
-                names[name] = None
+                with suppress(BadTypeInNameException):  # any machine may announce any bytes
+                    AsyncServiceInfo(service_type, name)
+                    names[name] = None
 
         if self._browser is not None:
             await self._browser.async_cancel()
@@ -281,7 +298,8 @@ async def _is_host_taken(opened: AsyncZeroconf, host: str) -> bool:
     return not set(resolver.parsed_addresses()) <= set(list_interface_addresses())
 
 
-def _describe(info: AsyncServiceInfo) -> FoundService:
+def _describe(info: AsyncServiceInfo) -> FoundService | None:
+    """Return a service as a terminal may show it; None: it has what no server or node announces."""
     own = [ip.network for _, ip in _list_adapters()]
 
     def is_near(address: str) -> bool:
@@ -289,10 +307,15 @@ def _describe(info: AsyncServiceInfo) -> FoundService:
         return any(ip.version == network.version and ip in network for network in own)
 
     addresses = info.parsed_scoped_addresses()
+    name, host = info.name.removesuffix(f".{info.type}"), str(info.server).rstrip(".")
     texts = {name: value or "" for name, value in info.decoded_properties.items()}
+    shown = [name, host, *texts, *texts.values()]
+    is_sound = all(each.isprintable() and len(each) <= _TEXT_MAX for each in shown)
+    if not is_sound or not 0 < len(addresses) <= _ITEMS_MAX or len(texts) > _ITEMS_MAX:
+        return None
     return FoundService(
-        name=info.name.removesuffix(f".{info.type}"),
-        host=str(info.server).rstrip("."),
+        name=name,
+        host=host,
         port=info.port or 0,
         addresses=tuple([*filter(is_near, addresses)] or addresses),
         texts=texts,

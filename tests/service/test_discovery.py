@@ -158,6 +158,56 @@ def test_a_refused_multicast_is_a_remark() -> None:
     ]
 
 
+_STRANGERS = r"""
+import asyncio
+from zeroconf import DNSOutgoing, DNSPointer
+from zeroconf.asyncio import AsyncServiceInfo, AsyncZeroconf
+from service.discovery import SERVERS, Discovery
+
+def announce(host, texts, *addresses):
+    return AsyncServiceInfo(
+        SERVERS, f"{host}.{SERVERS}", port=8000, properties=texts, server=f"{host}.local.",
+        parsed_addresses=[*addresses],
+    )
+
+async def main():
+    async with Discovery((SERVERS,), report=print) as discovery, AsyncZeroconf(["10.77.0.1"]) as other:
+        await asyncio.sleep(0.3)
+        out = DNSOutgoing(0x8400)
+        for name in (f"a\x07b.{SERVERS}", "x._FOOTTILE._tcp.local.", f"{30 * 'ü'}.{20 * 'a'}.{SERVERS}"):
+            out.add_answer_at_time(DNSPointer(SERVERS, 12, 1, 4500, name), 0)
+        other.zeroconf.async_send(out)
+        for each in (
+            announce("screen", {"machine": "\x1b[2J"}, "10.77.0.2"),
+            announce("right", {"machine": "\u202egnp"}, "10.77.0.2"),
+            announce("many", {"id": "m"}, *(f"10.77.0.{n}" for n in range(2, 60))),
+            announce("honest", {"id": "a"}, "10.77.0.2"),
+        ):
+            await other.async_register_service(each)
+        for _ in range(50):
+            found = [each.name for each in await discovery.list_found(SERVERS)]
+            if "honest" in found:
+                return print(found)
+            await asyncio.sleep(0.1)
+
+asyncio.run(main())
+"""
+
+
+@needs_networks
+def test_a_service_that_no_server_or_node_announces_is_left_out() -> None:
+    assert run_in_network({"near": "10.77.0.1/24"}, _STRANGERS) == "['honest']\n"
+
+
+@in_a_loop
+async def test_a_failure_finds_nothing_and_is_a_remark() -> None:
+    reports: list[str] = []
+    network = Discovery((discovery.SERVERS,), report=reports.append)
+    network._open = object()  # type: ignore[assignment]  # a bug, whatever it be
+    assert await network.list_found(discovery.SERVERS) == []
+    assert len(reports) == 1
+
+
 @pytest.mark.parametrize("known", [(), ("b",)])
 def test_a_person_chooses_on_a_terminal_unless_a_server_is_known(
     known: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
