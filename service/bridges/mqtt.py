@@ -130,6 +130,8 @@ class MqttOutlet(Outlet):
                         await client.publish(*self._bridge("offline"), timeout=1.0)
                         raise
             except aiomqtt.MqttError as error:
+                if (task := asyncio.current_task()) is not None and task.cancelling():
+                    raise asyncio.CancelledError from error  # the farewell has failed
                 self._reporter.report(self._subject, f"no connection: {error}")
             self._is_connected = False
             self._summaries.clear()
@@ -139,16 +141,13 @@ class MqttOutlet(Outlet):
         await client.publish(*self._bridge("online"))
         while True:
             while self._unsent_states:
-                topic = next(iter(self._unsent_states))
+                topic = self._unsent_states.pop()  # before: it may change meanwhile
                 await client.publish(topic, self._states[topic], _AT_LEAST_ONCE, retain=True)
-                self._unsent_states.discard(topic)
             while self._events:
-                event = self._events.popleft()
-                try:
-                    await client.publish(*event, _AT_LEAST_ONCE)
-                except aiomqtt.MqttError:
-                    self._events.appendleft(event)
-                    raise
+                event = self._events[0]
+                await client.publish(*event, _AT_LEAST_ONCE)
+                if self._events[0] is event:  # it was not dropped meanwhile
+                    self._events.popleft()
             for topic in tuple(self._summaries):
                 await client.publish(topic, self._summaries.pop(topic), _AT_MOST_ONCE)
             self._has_pending.clear()

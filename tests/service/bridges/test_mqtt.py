@@ -6,6 +6,7 @@ import asyncio
 import json
 import queue
 import signal
+import socket
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -20,7 +21,8 @@ from service.bridges.mqtt import MqttOutlet
 from tests.service.fake_node import FakeNode, Play
 from tests.service.process import Start
 from tests.service.running import Running, receive_live
-from tests.waiting import PATIENCE_S, until
+from tests.service.strangers import listening
+from tests.waiting import PATIENCE_S, in_a_loop, until
 
 pytestmark = pytest.mark.process
 
@@ -174,6 +176,67 @@ def test_of_a_slow_broker_only_the_newest_summary_waits_and_that_is_said_once() 
         outlet.write_summary({"node": "left", "seq": number})
     assert json.loads(outlet._summaries["foottile/left/summary"])["seq"] == 8
     assert len(said) == 1
+
+
+class SlowClient:
+    """A client of a broker that acknowledges one message, and others when it is told."""
+
+    def __init__(self) -> None:
+        self.published: list[tuple[str, str]] = []
+        self.left = asyncio.Semaphore(1)
+
+    async def publish(self, topic: str, text: str, *_: object, **__: object) -> None:
+        self.published.append((topic, text))
+        await self.left.acquire()
+
+
+@in_a_loop
+async def test_what_changes_while_the_broker_is_slow_is_published_after_it() -> None:
+    outlet, client = make_outlet("mqtt://127.0.0.1:1", []), SlowClient()
+    outlet.write_node("left", None)
+    publishing = asyncio.create_task(outlet._publish(client))  # type: ignore[arg-type]
+    while len(client.published) < 2:
+        await asyncio.sleep(0)
+    outlet._states.clear()
+    outlet.write_node("left", None)  # as after a change
+    for _ in range(9):
+        client.left.release()
+    while outlet._has_pending.is_set():
+        await asyncio.sleep(0)
+    states = [text for topic, text in client.published if topic.endswith("state")]
+    assert len(states) == 2
+    publishing.cancel()
+
+
+@in_a_loop
+async def test_an_event_waits_for_the_next_connection_until_it_is_acknowledged() -> None:
+    outlet, client = make_outlet("mqtt://127.0.0.1:1", []), SlowClient()
+    outlet.write_event(Event("marker", "left", "s", "stone", 1), LiveClock())
+    publishing = asyncio.create_task(outlet._publish(client))  # type: ignore[arg-type]
+    while len(client.published) < 2:
+        await asyncio.sleep(0)
+    publishing.cancel()
+    await asyncio.gather(publishing, return_exceptions=True)
+    assert len(outlet._events) == 1
+
+
+@in_a_loop
+async def test_it_ends_although_the_broker_hangs() -> None:
+    def accept_and_hang(connection: socket.socket, ended: threading.Event) -> None:
+        connection.recv(1 << 16)
+        connection.sendall(b"\x20\x02\x00\x00")
+        ended.wait(PATIENCE_S)
+
+    with listening(accept_and_hang) as port:
+        outlet = make_outlet(f"mqtt://127.0.0.1:{port}", [])
+        running = asyncio.create_task(outlet.run())
+        while not outlet._is_connected:
+            await asyncio.sleep(0.01)
+        running.cancel()
+        done, _ = await asyncio.wait([running], timeout=8.0)
+        running.cancel()  # of one that goes on
+    assert done
+    assert running.cancelled()
 
 
 def test_address_user_and_password_come_from_the_url_or_the_environment(
