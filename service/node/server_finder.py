@@ -7,7 +7,9 @@ of several others a person chooses.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+import math
+import time
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 from devices.errors import LinkError
@@ -16,6 +18,8 @@ from service.discovery import SERVERS, Discovery, FoundService
 
 LOCAL_URL = "http://127.0.0.1:8000"
 """Address of a server on this machine, if none is found."""
+_ABSENCE_S = 60.0
+"""Absence of the chosen server after which the others are named."""
 
 
 def list_candidates(
@@ -49,6 +53,7 @@ class ServerFinder:
 
     Args:
         discovery: running discovery, which looks for servers.
+        report: called with a message if the chosen server stays away and there are others.
         chosen_id: id of the server that a person has chosen.
         ca_path: with it, only servers with TLS count.
     """
@@ -56,15 +61,17 @@ class ServerFinder:
     def __init__(
         self,
         discovery: Discovery,
+        report: Callable[[str], None],
         *,
         chosen_id: str = "",
         ca_path: Path | None = None,
     ) -> None:
-        self._discovery = discovery
+        self._discovery, self._report = discovery, report
         self._chosen_id = chosen_id
         self._needs_tls = ca_path is not None
         self._last: FoundService | None = None
         self._attempts = 0
+        self._asked_s = self._others_named_s = -math.inf
 
     async def find(self, known_ids: Collection[str]) -> str:
         """Return the address of the server now; each attempt takes the next of its addresses.
@@ -82,12 +89,24 @@ class ServerFinder:
             return local.url
         if self._last is not None and self._last.server_id in known_ids:
             self._chosen_id = self._last.server_id
+        found = await self._discovery.list_found(SERVERS) if self._discovery.is_installed else []
+        needs_tls = self._needs_tls
         candidates = list_candidates(
-            await self._discovery.list_found(SERVERS) if self._discovery.is_installed else [],
-            known_ids,
-            chosen_id=self._chosen_id,
-            needs_tls=self._needs_tls,
+            found, known_ids, chosen_id=self._chosen_id, needs_tls=needs_tls
         )
+        now_s = time.monotonic()
+        if candidates or not self._chosen_id or now_s - self._asked_s > _ABSENCE_S:
+            self._others_named_s = now_s + _ABSENCE_S
+        elif now_s > self._others_named_s and (
+            others := list_candidates(found, (), needs_tls=needs_tls)
+        ):
+            self._others_named_s = math.inf
+            self._report(
+                "the server of this node is away, and others announce themselves: "
+                f"{', '.join(describe_candidates(others))}. If it was replaced, restart the node, "
+                "or name the server with --server"
+            )
+        self._asked_s = now_s
         if len(candidates) > 1:
             raise LinkError(
                 f"{len(candidates)} servers announce themselves: "

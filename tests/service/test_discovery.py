@@ -6,6 +6,7 @@ import asyncio
 import json
 import subprocess
 import sys
+import time
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
@@ -92,7 +93,7 @@ def _no_local_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @in_a_loop
 async def test_a_node_stays_with_the_server_that_accepted_it() -> None:
     network = Network()
-    finder = ServerFinder(network)
+    finder = ServerFinder(network, pytest.fail)
     assert await finder.find(()) == LOCAL_URL
     network.found = [server("a", "192.168.4.1")]
     assert await finder.find(()) == "http://192.168.4.1:8000"
@@ -105,8 +106,32 @@ async def test_a_node_stays_with_the_server_that_accepted_it() -> None:
 
 
 @in_a_loop
+async def test_after_a_minute_without_its_server_a_node_names_the_others_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now_s, said = 1000.0, list[str]()
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    network = Network(server("a", "192.168.4.1"))
+    finder = ServerFinder(network, said.append)
+    await finder.find(("a",))
+    network.found = [server("b", "192.168.4.2")]
+    now_s += 3600.0  # it was connected
+    for _ in range(5):
+        assert await finder.find(("a",)) == "http://192.168.4.1:8000"
+        now_s += 11.0
+    assert not said
+    for _ in range(5):
+        await finder.find(("a",))
+        now_s += 11.0
+    (line,) = said
+    assert "192.168.4.2" in line
+    assert "restart the node" in line
+    assert "--server" in line
+
+
+@in_a_loop
 async def test_a_server_of_this_user_on_this_machine_comes_first() -> None:
-    finder = ServerFinder(Network(server("a")))
+    finder = ServerFinder(Network(server("a")), pytest.fail)
     with publish_local_server(LocalServer(LOCAL_URL, "a-token-of-this-test")):
         assert await finder.find(("a",)) == LOCAL_URL
     assert await finder.find(("a",)) == "http://192.168.4.1:8000"
@@ -114,7 +139,7 @@ async def test_a_server_of_this_user_on_this_machine_comes_first() -> None:
 
 @in_a_loop
 async def test_with_a_ca_nothing_else_than_a_server_with_tls_is_asked(tmp_path: Path) -> None:
-    finder = ServerFinder(Network(server("a")), ca_path=tmp_path / "ca.crt")
+    finder = ServerFinder(Network(server("a")), pytest.fail, ca_path=tmp_path / "ca.crt")
     with pytest.raises(LinkError, match="not found"):
         await finder.find(("a",))
 
@@ -130,7 +155,7 @@ async def test_without_the_library_the_extra_is_named_and_nothing_is_found(
         while not reports:
             await asyncio.sleep(0.01)
         assert not missing.is_installed
-        assert await ServerFinder(missing).find(()) == LOCAL_URL
+        assert await ServerFinder(missing, pytest.fail).find(()) == LOCAL_URL
     assert "foottile[discovery]" in reports[0]
 
 
@@ -171,10 +196,12 @@ def announce(host, texts, *addresses):
     )
 
 async def main():
-    async with Discovery((SERVERS,), report=print) as discovery, AsyncZeroconf(["10.77.0.1"]) as other:
+    near = ["10.77.0.1"]
+    async with Discovery((SERVERS,), report=print) as discovery, AsyncZeroconf(near) as other:
         await asyncio.sleep(0.3)
         out = DNSOutgoing(0x8400)
-        for name in (f"a\x07b.{SERVERS}", "x._FOOTTILE._tcp.local.", f"{30 * 'ü'}.{20 * 'a'}.{SERVERS}"):
+        long = f"{30 * 'ü'}.{20 * 'a'}.{SERVERS}"
+        for name in (f"a\x07b.{SERVERS}", "x._FOOTTILE._tcp.local.", long):
             out.add_answer_at_time(DNSPointer(SERVERS, 12, 1, 4500, name), 0)
         other.zeroconf.async_send(out)
         for each in (

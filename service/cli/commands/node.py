@@ -176,7 +176,7 @@ async def _run_node(options: NodeOptions, chosen_id: str | None) -> NodeOutcome:
     discovery = Discovery(browsed, announced, report=remark)
     async with report_to_systemd(stop), discovery:
         if chosen_id is not None:
-            finder = ServerFinder(discovery, chosen_id=chosen_id, ca_path=options.ca_path)
+            finder = ServerFinder(discovery, remark, chosen_id=chosen_id, ca_path=options.ca_path)
             options = replace(options, find_server=finder.find)
         return await run_node(options, stop=stop, report=remark)
 
