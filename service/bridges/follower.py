@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Mapping
@@ -48,6 +49,8 @@ _CLOCK_FIELDS = ("t_mono_ns", "server_minus_node_ns", "uncertainty_ns")
 _SERVER_TIMES = tuple(column.name for column in SERVER_TIME_COLUMNS)
 _ROWS_MAX = 64
 """Clock measurements kept: of two minutes, or ten of a node's."""
+_MARKERS_PERIOD_S = 1.0
+"""Shortest time between two requests for the markers of a session: an answer has them all."""
 
 
 @dataclass(frozen=True)
@@ -182,6 +185,7 @@ class _KnownSession:
 
     state: str
     marker_ids: set[str] = field(default_factory=set)
+    asked_s: float = -math.inf
 
 
 @dataclass
@@ -219,6 +223,8 @@ class ServerFollower:
         self._nodes: dict[str, _KnownNode] = {}
         self._feeds: dict[str, asyncio.Task[None]] = {}
         self._sessions: dict[str, _KnownSession] = {}
+        self._late: dict[str, Mapping[str, Any]] = {}  # sessions whose markers are asked for later
+        self._has_connected = False
 
     async def run(self) -> None:
         """Follow the server until cancelled.
@@ -230,22 +236,18 @@ class ServerFollower:
         url = f"ws{self._server.url.removeprefix('http')}{LIVE_PATH}?rate_hz={self._outlet.rate_hz}"
         options: dict[str, Any] = {"additional_headers": self._server.headers, "proxy": None}
         options |= {"ssl": self._server.http.context, "max_size": None, "close_timeout": 1.0}
-        has_connected = False
         try:
             while True:
                 try:
                     await self._check_access()
                     async with connect(url, compression=None, **options) as socket:
-                        await run_until_first_ends(
-                            self._follow(socket, is_first=not has_connected), _ping(socket)
-                        )
+                        await run_until_first_ends(self._follow(socket), _ping(socket))
                 except (OSError, WebSocketException, ClientError) as error:
-                    if not has_connected and isinstance(error, ClientError):
+                    if not self._has_connected and isinstance(error, ClientError):
                         raise
                     self._reporter.report(self._server.url, f"no connection: {error}")
                     for name in self._nodes:
                         self._outlet.write_node(name, None)
-                has_connected = True
                 await asyncio.sleep(_RETRY_S)
         finally:
             for feed in self._feeds.values():
@@ -261,7 +263,7 @@ class ServerFollower:
                 remedy="Add --public if they may see it",
             )
 
-    async def _follow(self, socket: ClientConnection, *, is_first: bool) -> None:
+    async def _follow(self, socket: ClientConnection) -> None:
         async for text in socket:
             message = json.loads(text)
             match message["type"]:
@@ -271,6 +273,8 @@ class ServerFollower:
                         self._reporter.report(f"node {name}", "not known to the server yet")
                     for view in message["nodes"]:
                         self._update_node(view)
+                    self._late.clear()
+                    is_first, self._has_connected = not self._has_connected, True
                     await self._update_sessions(message["recording"], is_first=is_first)
                 case "node":
                     self._update_node(message["node"])
@@ -282,6 +286,7 @@ class ServerFollower:
                     sent_ns, now_ns = round(message["t_ms"] * 1e6), time.monotonic_ns()
                     middle_ns, half_ns = (sent_ns + now_ns) // 2, (now_ns - sent_ns) // 2 + 1
                     self.server_clock.add(middle_ns, message["t_ns"] - middle_ns, half_ns)
+                    await self._update_late_sessions()
 
     def _is_followed(self, node: str) -> bool:
         return not self._names or node in self._names
@@ -312,8 +317,13 @@ class ServerFollower:
         for view in present.values():
             await self._update_session(view, is_new=not is_first)
 
+    async def _update_late_sessions(self) -> None:
+        for view in tuple(self._late.values()):
+            await self._update_session(view, is_new=True)
+
     async def _update_session(self, view: Mapping[str, Any], *, is_new: bool) -> None:
         session_id, state = view["id"], view["state"]
+        self._late.pop(session_id, None)
         known = self._sessions.get(session_id)
         if not self._is_followed(view["node"]) or (known is None and state == "sealed"):
             return
@@ -329,8 +339,17 @@ class ServerFollower:
             if state == "recording":
                 write("recording_started", view["name"], view["started_t_ns"])
         if view["marker_count"] != len(known.marker_ids):
+            now_s = time.monotonic()
+            if known.state == state and now_s - known.asked_s < _MARKERS_PERIOD_S:
+                self._late[session_id] = view
+                return
+            known.asked_s = now_s
             path = f"/sessions/{session_id}/markers"
-            markers = (await asyncio.to_thread(self._server.http.get, path))["items"]
+            try:
+                markers = (await asyncio.to_thread(self._server.http.get, path))["items"]
+            except NotFoundError:  # it was deleted
+                del self._sessions[session_id]
+                return
             for marker in markers:
                 is_known = marker["stream_id"] is None or marker["bound_ns"] is not None  # its time
                 if is_known and marker["id"] not in known.marker_ids:
