@@ -49,7 +49,8 @@ def make_ca_page(certificate: bytes, fingerprint: str, port: int) -> ASGIApp:
         if request.method in SAFE_METHODS and request.url.path == f"/{CA_NAME}":
             return Response(certificate, media_type="application/x-x509-ca-cert", headers=_HEADERS)
         # Not for good: a laptop may serve plain HTTP on this port later.
-        target = f"{url}{request.scope['raw_path'].decode('latin-1')}"
+        path, query = request.scope["raw_path"], request.scope["query_string"]
+        target = f"{url}{(path + b'?' * bool(query) + query).decode('latin-1')}"
         return RedirectResponse(target, HTTPStatus.TEMPORARY_REDIRECT, headers=_HEADERS)
 
     async def answer(scope: Scope, receive: Receive, send: Send) -> None:

@@ -2,7 +2,8 @@
 
 A phone or a node trusts the CA once; the server's own certificate follows the machine's names and
 addresses. The CA is constrained to names and addresses of local networks, so that a thief of its
-key cannot pretend to be another site. Both begin a month early: clocks in the field are behind.
+key can pretend to be another machine there, and no site of the internet. Both begin a month early:
+clocks in the field are behind.
 """
 
 from __future__ import annotations
@@ -74,7 +75,11 @@ class OwnAuthority:
             self._key, self.certificate = _make_ca(names, now)
             _write_pair(path, self._key, self.certificate)
         if self.certificate.not_valid_after_utc < now:
-            raise DamagedFileError("the CA has expired", where=str(path), remedy=_NEW_CA)
+            raise DamagedFileError(
+                f"the CA has expired on {self.certificate.not_valid_after_utc:%Y-%m-%d}",
+                where=str(path),
+                remedy=f"Is the clock of this machine right? If it is: {_NEW_CA}",
+            )
         write_atomically(self.ca_path, self.certificate_pem, mode=0o644)
         found = self.certificate.extensions.get_extension_for_class(x509.NameConstraints)
         self._permitted = found.value.permitted_subtrees or ()
@@ -127,7 +132,6 @@ class OwnAuthority:
             .add_extension(x509.SubjectAlternativeName(sorted(names, key=str)), critical=False)
             .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
             .add_extension(_make_usage(digital_signature=True), critical=True)
-            .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
             .add_extension(identifier, critical=False)
             .sign(self._key, hashes.SHA256())
         )
@@ -226,6 +230,7 @@ def _begin(
         .not_valid_before(begins)
         .not_valid_after(ends)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+        .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
     )
 
 

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from devices.errors import FootTileError, LinkError, require_extra
+from devices.errors import LinkError, require_extra
 from service.api.address import (
     is_wildcard,
     list_addresses,
@@ -140,14 +140,17 @@ async def _renew_forever(
 ) -> None:
     """Renew the certificate when the names of the machine change, and when it ends."""
     before: tuple[list[str], int] | None = None
+    said = ""
     while True:
         await asyncio.sleep(_RENEWAL_PERIOD_S)
         now = datetime.now(UTC)
-        current = ([*_list_names(settings), *list_announced()], now.toordinal())
-        if current != before:
-            before = current
-            try:
+        try:
+            current = ([*_list_names(settings), *list_announced()], now.toordinal())
+            if current != before:
                 outside = await asyncio.to_thread(authority.certify, current[0], now)
                 _load_and_explain(authority, outside)
-            except (FootTileError, OSError) as error:
-                remark(f"the certificate is not renewed: {error}")
+                before = current
+        except Exception as error:  # a bug, too: it is tried again
+            if (what := f"the certificate is not renewed: {str(error) or repr(error)}") != said:
+                remark(what)
+            said = what

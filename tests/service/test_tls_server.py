@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 import signal
 import socket
@@ -20,6 +21,7 @@ import foottile
 from devices.errors import UsageError
 from service.api.certificates import OwnAuthority
 from service.api.settings import load_settings
+from service.cli import server_tls
 from tests.service.fake_node import FakeNode
 from tests.service.node.publishing import Publishing
 from tests.service.process import BIN, Process
@@ -95,7 +97,11 @@ def test_a_server_with_tls_is_trusted_by_its_user_and_by_whoever_has_its_ca(
             loaded = phone.get("/foottile-ca.crt")
             assert loaded.headers["content-type"] == "application/x-x509-ca-cert"
             assert loaded.content == ca.read_bytes()
-            for method, path in (("GET", "/sessions"), ("POST", "/api/v1/login"), ("POST", "/")):
+            for method, path in (
+                ("GET", "/sessions?a=%20b"),
+                ("POST", "/api/v1/login"),
+                ("POST", "/"),
+            ):
                 led = phone.request(method, path)
                 assert (led.status_code, led.headers["location"]) == (307, f"{url}{path}")
             assert phone.get("/", headers={"Host": "a b"}).status_code == 400
@@ -142,6 +148,30 @@ def test_a_certificate_is_given_or_made(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="both --tls-cert and --tls-key"):
         load_settings(None, tls_cert=tmp_path / "a")
     assert load_settings(None, **given).tls_key == tmp_path / "b"
+
+
+@in_a_loop
+async def test_a_failed_renewal_is_said_once_and_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    asked = 0
+
+    def list_announced() -> list[str]:
+        nonlocal asked
+        asked += 1
+        raise RuntimeError("interfaces change")
+
+    monkeypatch.setattr(server_tls, "_RENEWAL_PERIOD_S", 0.0)
+    monkeypatch.setattr(server_tls, "remark", said.append)
+    authority = OwnAuthority(tmp_path, ["localhost"], datetime.now(UTC))
+    settings = load_settings(None, tls=True, data=tmp_path)
+    renewing = asyncio.create_task(server_tls._renew_forever(authority, settings, list_announced))
+    while asked < 3 and not renewing.done():
+        await asyncio.sleep(0.01)
+    renewing.cancel()
+    assert asked >= 3
+    assert len(said) == 1
 
 
 @pytest.mark.process
