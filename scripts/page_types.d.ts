@@ -726,6 +726,7 @@ type TrialsView = {
   stop_after_s: number | null;
   is_armed: boolean;
   take: string | null;
+  running_name: string | null;
   stop_at_t_ns: number | null;
   problem: string | null;
 };

@@ -281,6 +281,9 @@ class TrialsView(View):
     stop_after_s: float | None
     is_armed: bool = Field(description="True: the next trial begins when a contact begins.")
     take: str | None = Field(description="Id of the take of the running trial.")
+    running_name: str | None = Field(
+        description="Name of the running trial, also of one that is no longer in the list."
+    )
     stop_at_t_ns: int | None = Field(description="Time at which that is stopped, server's UTC.")
     problem: PublicText | None = Field(
         description="Reason why a trial was not started, or not on every node."

@@ -118,6 +118,12 @@ def parse_trials(text: str) -> tuple[ListedTrial, ...]:
     return tuple(trials)
 
 
+def _place_by_name(trials: Sequence[ListedTrial]) -> dict[tuple[str, int], int]:
+    """Return the place of each row by its name and its number among rows of that name."""
+    names = [one.name for one in trials]
+    return {(name, names[:i].count(name)): i for i, name in enumerate(names)}
+
+
 def format_trials(trials: Sequence[ListedTrial]) -> str:
     """Return the text that `parse_trials` reads; subjects and notes are not in it."""
     return "".join(
@@ -168,9 +174,17 @@ class TrialRecorder:
             pass
         except FileFormatError as error:
             self.file_problems = [f"list of trials: {try_set_aside_and_describe(path, error)}"]
+        for session in store.list_unsealed():
+            # The server was killed after it began to record this row, before the list was saved.
+            is_next = session.state == "recording" and session.name == self._next_name
+            if is_next and session.take is not None and not self.is_in_list(session):
+                self._note_take(session.take, session.started_t_ns)
 
     def set_trials(self, trials: Sequence[ListedTrial]) -> None:
-        """Replace the list; equal rows at its beginning keep their recordings and the place.
+        """Replace the list, and keep the place; rows of equal names keep their recordings.
+
+        Fields that a new row does not set are those of the former row, as subject and notes of a
+        list that was read as text. Of rows with one name the first belongs to the first, and so on.
 
         Raises:
             UsageError: it is too long.
@@ -178,13 +192,25 @@ class TrialRecorder:
         """
         if len(trials) > TRIALS_MAX:
             raise UsageError(f"the list has {len(trials)} trials", expected=f"at most {TRIALS_MAX}")
-        rows = [_StoredTrial(**one.model_dump()) for one in trials]
-        kept = 0
-        for i, (old, new) in enumerate(zip(self._list.trials, rows, strict=False)):
-            if old.model_copy(update={"takes": ()}) != new:
-                break
-            rows[i], kept = old, i + 1
-        self._save(trials=tuple(rows), next_index=min(kept, self._list.next_index))
+        stored = self._list
+        former, present = _place_by_name(stored.trials), _place_by_name(trials)
+        rows = [
+            _StoredTrial.model_validate(
+                (stored.trials[former[key]] if key in former else one).model_dump()
+                | one.model_dump(exclude_unset=True)
+            )
+            for key, one in zip(present, trials, strict=True)
+        ]
+        at = stored.next_index
+        left = (
+            present[key]
+            for key, i in former.items()
+            if key in present and (i == at or (i > at and not stored.trials[i].takes))
+        )
+        place, keys = next(left, len(rows)), list(present)
+        while place and keys[place - 1] not in former:  # rows that were put in before the next one
+            place -= 1
+        self._save(trials=tuple(rows), next_index=place)
         self._on_change(())
 
     def change(self, changes: dict[str, object], *, disarm: bool = False) -> None:
@@ -267,7 +293,7 @@ class TrialRecorder:
         for session in self._store.iterate_newest_first() if wanted else ():
             if (i := wanted.get(session.take or "")) is not None:
                 sessions.setdefault(i, []).append(session)
-        is_running = bool(self._list_running())
+        running = self._list_running()
         return TrialsView(
             trials=[
                 self._make_trial_view(i, row, sessions.get(i, []))
@@ -278,16 +304,16 @@ class TrialRecorder:
             next_name=self._next_name,
             last_index=wanted.get(stored.take or ""),
             is_armed=self._is_armed,
-            take=stored.take if is_running else None,
-            stop_at_t_ns=stored.stop_at_t_ns if is_running else None,
+            take=stored.take if running else None,
+            running_name=running[0].name if running else None,
+            stop_at_t_ns=stored.stop_at_t_ns if running else None,
             problem=self._problem,
         )
 
     def is_in_list(self, session: Session) -> bool:
-        """Return whether a session is a trial of the list."""
-        return session.take is not None and any(
-            session.take in row.takes for row in self._list.trials
-        )
+        """Return whether a session is a trial of the list, or the latest trial."""
+        takes = (self._list.take, *(take for row in self._list.trials for take in row.takes))
+        return session.take is not None and session.take in takes
 
     def _make_trial_view(self, i: int, row: _StoredTrial, sessions: list[Session]) -> TrialView:
         states = {session.state for session in sessions}
@@ -333,8 +359,8 @@ class TrialRecorder:
             )
 
     def _start(self, pre_roll_s: float, request: IdempotencyRecord | None) -> None:
-        stored, place = self._list, self._list.next_index
-        row = stored.trials[place]
+        stored = self._list
+        row = stored.trials[stored.next_index]
         take: Take = self._takes.start_take_where_possible(
             str(self._next_name),
             None if stored.node is None else [stored.node],
@@ -347,22 +373,26 @@ class TrialRecorder:
         self._is_armed = False
         failed = [f"{node} is not recorded: {why}" for node, why in take.errors_by_node.items()]
         self._problem = ". ".join(failed) or None
+        self._note_take(take.id, server_utc_ns())
+        self._on_change(take.sessions)
+
+    def _note_take(self, take: str, started_t_ns: int) -> None:
+        stored, place = self._list, self._list.next_index
         rows = list(stored.trials)
-        rows[place] = row.model_copy(update={"takes": (*row.takes, take.id)})
+        rows[place] = rows[place].model_copy(update={"takes": (*rows[place].takes, take)})
         left = (i for i in range(place + 1, len(rows)) if not rows[i].takes)
         stop_ns = None if stored.stop_after_s is None else round(stored.stop_after_s * 1e9)
         changes = {
             "trials": tuple(rows),
             "next_index": next(left, len(rows)),
-            "take": take.id,
-            "stop_at_t_ns": None if stop_ns is None else server_utc_ns() + stop_ns,
+            "take": take,
+            "stop_at_t_ns": None if stop_ns is None else started_t_ns + stop_ns,
         }
         try:
             self._save(**changes)
         except StorageError as error:  # the trial is being recorded, whatever the file says
             self._list = stored.model_copy(update=changes)
             self._problem = f"the list of trials is not saved: {error}"
-        self._on_change(take.sessions)
 
     def _disarm(self, why: str) -> None:
         self._is_armed = False

@@ -57,15 +57,18 @@ async def get_trials(server: ServerState) -> TrialsView:
 
 @router.put("", summary="Set the list of trials", responses=problem_responses(FULL))
 async def set_trials(
+    server: ServerState,
     body: Annotated[
         TrialList | str,
         Body(
             description="As text, a trial a line: `name; tag, tag`, or names with commas between."
         ),
-    ],
-    server: ServerState,
+    ] = "",
 ) -> TrialsView:
-    """Replace the list. Unchanged rows at its beginning keep their recordings and the place."""
+    """Replace the list and keep the place; rows of equal names keep recordings and omitted fields.
+
+    No text clears the list.
+    """
     server.trials.set_trials(parse_trials(body) if isinstance(body, str) else body.trials)
     return server.trials.make_view()
 

@@ -100,6 +100,8 @@ def test_what_is_no_list_is_refused_with_its_line(running: Running) -> None:
     answer = running.http.post("/trials/record", json={})
     assert_refused(answer, 409, "no node is connected")
     assert get(running)["next_index"] == 0
+    assert put(running, "")["trials"] == []
+    put(running, "a")
     change(running, next_index=1)
     assert_refused(running.http.post("/trials/record", json={}), 409, "no trial is left")
 

@@ -44,7 +44,7 @@ class Stub:
             raise StateError("no node is connected")
         take = Take(f"{next(self.numbers):012x}")
         session = SimpleNamespace(id=take.id, name=name, node="bench", take=take.id)
-        session.state = "recording"
+        session.state, session.started_t_ns = "recording", 10**18
         self.sessions.append(session)
         return Take(take.id, cast("Any", [session]))
 
@@ -156,9 +156,77 @@ def test_a_longer_list_keeps_what_was_recorded(tmp_path: Path) -> None:
     view = trials.make_view()
     assert (view.next_name, [row.recordings for row in view.trials]) == ("b", [1, 0, 0])
     trials.set_trials(parse_trials("b, a"))
-    assert (trials.make_view().next_name, trials.make_view().last_index) == ("b", None)
+    view = trials.make_view()
+    assert (view.next_name, view.last_index, view.trials[1].recordings) == ("b", 1, 1)
     with pytest.raises(UsageError, match="at most 1000"):
         trials.set_trials([ListedTrial(name="x")] * 1001)
+
+
+def test_a_list_as_text_keeps_texts_recordings_and_place_of_rows_of_equal_names(
+    tmp_path: Path,
+) -> None:
+    stub = Stub()
+    trials = stub.make(tmp_path / "trials.json")
+    trials.set_trials(
+        [ListedTrial(name=name, subject="S1", notes=f"note {name}") for name in "abacd"]
+    )
+    for _ in range(3):
+        trials.record_next()
+        stub.stop()
+    for text, recordings, place in [
+        ("a, b, a, c, d, e", [1, 1, 1, 0, 0, 0], 3),
+        ("a\nb; slow\na, c, d, e", [1, 1, 1, 0, 0, 0], 3),  # a tag
+        ("a, b, a, x, c, d, e", [1, 1, 1, 0, 0, 0, 0], 3),
+        ("a, B, a, c, d, e", [1, 0, 1, 0, 0, 0], 3),
+        ("d, a, a", [0, 1, 1], 0),
+        ("a, a", [1, 1], 2),
+        ("a, a, f", [1, 1, 0], 2),
+    ]:
+        trials.set_trials(parse_trials(text))
+        view = trials.make_view()
+        assert ([row.recordings for row in view.trials], view.next_index) == (recordings, place)
+        for row in view.trials:
+            expected = ("S1", f"note {row.name}") if row.name in "abcd" else ("", "")
+            assert (row.subject, row.notes) == expected
+    assert len({row.sessions[0] for row in view.trials[:2]}) == 2
+    trials.set_trials([ListedTrial(name="a", notes="")])
+    (row,) = trials.make_view().trials
+    assert (row.subject, row.notes, row.recordings) == ("S1", "", 1)
+    trials.set_trials(parse_trials("g, h"))
+    assert trials.make_view().next_name == "g"
+
+
+def test_a_trial_that_ran_when_the_server_was_killed_before_the_list_was_saved_is_adopted(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "trials.json"
+    stub = Stub()
+    trials = stub.make(path)
+    trials.set_trials(parse_trials("a, b"))
+    trials.change({"stop_after_s": 60})
+    before = path.read_bytes()
+    trials.record_next()
+    ran = trials.make_view()
+    path.write_bytes(before)
+    view = stub.make(path).make_view()
+    assert (view.take, view.next_name, view.running_name) == (ran.take, "b", "a")
+    assert view.stop_at_t_ns == stub.sessions[0].started_t_ns + 60 * 10**9
+    assert stub.make(path).make_view() == view
+    path.write_bytes(before)
+    stub.sessions[0].take = None  # recorded by hand
+    assert stub.make(path).make_view().next_name == "a"
+
+
+def test_the_running_trial_has_its_name_in_a_list_without_it(tmp_path: Path) -> None:
+    stub = Stub()
+    trials = stub.make(tmp_path / "trials.json")
+    trials.set_trials(parse_trials("a, b"))
+    trials.record_next()
+    trials.set_trials(())
+    view = trials.make_view()
+    assert (view.running_name, view.last_index, view.trials) == ("a", None, [])
+    stub.stop()
+    assert trials.make_view().running_name is None
 
 
 def test_a_damaged_file_is_set_aside_and_named(tmp_path: Path) -> None:
