@@ -9,6 +9,7 @@ import pytest
 from playwright.sync_api import expect
 
 from tests.service.fake_node import Play
+from tests.waiting import until
 from tests.web.pages import (
     DESK,
     PHONE,
@@ -96,8 +97,11 @@ def test_an_armed_trial_begins_at_the_contact_and_can_be_disarmed(
         page.press("#trials-stop", "Tab")
         expect(page.locator("#trials-said")).to_be_empty()
         page.get_by_role("button", name="Close").click()
+        red = "element => getComputedStyle(element).backgroundColor"
+        red_rgb = page.locator("#trial-record").evaluate(red)
         page.click("#trial-record")
         expect(page.locator("#trial-place")).to_have_text("Waits for contact")
+        assert page.locator("#trial-record").evaluate(red) != red_rgb  # it records nothing
         assert complaints_at(page, *SIZES) == []
         page.click("#trial-record")
         expect(page.locator("#trial-place")).to_have_text("Next, 1 of 2")
@@ -107,6 +111,51 @@ def test_an_armed_trial_begins_at_the_contact_and_can_be_disarmed(
         expect(page.locator("#trial-place")).to_have_text(re.compile(r"^Recording, \d s left$"))
         expect(page.locator("#trial-name")).to_have_text("mud 2")  # stopped by the server
         expect(page.locator("#recordings")).to_be_hidden()
+
+
+def test_the_dialog_sends_one_setting_and_shows_what_another_page_has_changed(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    scripted.running.http.put(
+        "/trials", content=b"mud 1, mud 2", headers={"Content-Type": "text/plain"}
+    )
+    with Play(scripted.node, 0.0):
+        page = live(open_page(scripted.url))
+        page.click("#device")
+        page.get_by_role("menuitem", name="Trial list …").click()
+        expect(page.locator("#trials-text")).to_have_value("mud 1\nmud 2\n")
+        changes = {"stop_after_s": 300, "node": "bench"}
+        assert scripted.running.http.patch("/trials", json=changes).is_success
+        expect(page.locator("#trials-stop")).to_have_value("300")
+        expect(page.locator("#trials-node")).to_have_value("bench")
+        sent: list[object] = []
+        page.on(
+            "request",
+            lambda one: sent.append(one.post_data_json) if one.method == "PATCH" else None,
+        )
+        page.check("#trials-contact")
+        until(lambda: scripted.running.http.get("/trials").json()["start_at_contact"])
+        assert sent == [{"start_at_contact": True}]
+        page.fill("#trials-text", "mud 3")
+        scripted.running.http.post("/trials/record", json={}).raise_for_status()
+        expect(page.locator("#trials-text")).to_have_value("mud 3")  # what is being entered stays
+
+
+def test_a_running_trial_that_is_no_longer_in_the_list_keeps_its_name(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    http, headers = scripted.running.http, {"Content-Type": "text/plain"}
+    http.put("/trials", content=b"mud 1, mud 2", headers=headers)
+    with Play(scripted.node, 5.0):
+        page = live(open_page(scripted.url))
+        page.click("#trial-record")
+        expect(page.locator("#trial-place")).to_have_text("Recording")
+        for text in (b"plate 1", b""):
+            http.put("/trials", content=text, headers=headers)
+            expect(page.locator("#trial-repeat")).to_be_disabled()
+            expect(page.locator("#trial-name")).to_have_text("mud 1")
+        page.click("#stop")
+        expect(page.locator("#trials")).to_be_hidden()
 
 
 def test_a_viewer_sees_the_list_and_cannot_press(

@@ -1,7 +1,6 @@
 // Keeps the screen on: by the Screen Wake Lock API, or where it is missing (plain HTTP) by a silent video.
 
 import { isChosen, storeChoice } from "./choice.js";
-import { SILENT_VIDEO } from "./silent_video.js";
 
 const KEY = "foottile.awake";
 const REWIND_AT_S = 2; // Safari lets the screen go dark during a video with the attribute `loop`
@@ -19,6 +18,9 @@ export class Awake {
     this.video = null;
     this.isAsking = false;
     this.reason = "";
+    // Loaded now: when it is played, a tap must have been just before.
+    this.silent = "wakeLock" in navigator ? null : import("./silent_video.js");
+    this.silent?.catch(() => {}); // said by `hold`
     document.addEventListener("visibilitychange", () => this.hold());
     document.addEventListener("pointerup", () => this.hold()); // a video may need a tap
     this.hold();
@@ -74,6 +76,7 @@ export class Awake {
   }
 
   async playVideo() {
+    const { SILENT_VIDEO } = await this.silent;
     this.video?.remove();
     const video = this.video = document.createElement("video");
     video.className = "unseen";

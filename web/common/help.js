@@ -1,6 +1,6 @@
 // Help dialog of a page: opened by `?` or its button.
 
-import { byId, el, isInside } from "./text.js";
+import { byId, el, isShortcut } from "./text.js";
 
 /** Bind key and button of the help. @param {string} [text] last paragraph, shared by several pages */
 export function helpWithKeys(text) {
@@ -13,7 +13,7 @@ export function helpWithKeys(text) {
   };
   byId("help").addEventListener("click", open);
   document.addEventListener("keydown", (event) => {
-    if (event.key !== "?" || event.ctrlKey || event.metaKey || event.altKey || isInside(event, "input, textarea, select, dialog[open]")) return;
+    if (event.key !== "?" || !isShortcut(event)) return;
     event.preventDefault();
     open();
   });

@@ -23,6 +23,10 @@ export function byId(id, kind = HTMLElement) {
 /** Return true if an event occurred inside a selector. A closed dialog keeps the focus for a moment: use `dialog[open]`. @param {Event} event @param {string} selector */
 export const isInside = ({ target }, selector) => target instanceof Element && target.closest(selector) !== null;
 
+/** Return true if a key is meant for the page: without modifiers, and not for a field or dialog. @param {KeyboardEvent} event */
+export const isShortcut = (event) => !event.ctrlKey && !event.metaKey && !event.altKey
+  && !isInside(event, "input, textarea, select, dialog[open], [contenteditable]");
+
 // Control and format characters (direction, zero width) and lone surrogates.
 const UNPRINTABLE = /[\p{Cc}\p{Cf}\p{Cs}\u2028\u2029]/gu;
 const BLANK = /[\t\n\r]/; // shown as a space

@@ -4,7 +4,7 @@ import * as api from "../common/api.js";
 import { countLost, missedText } from "../common/losses.js";
 import { isOperator } from "../common/login.js";
 import { notice, showRefusal } from "../common/notices.js";
-import { byId, duration, el, isInside, localTime, setData, setText } from "../common/text.js";
+import { byId, duration, el, isShortcut, localTime, setData, setText } from "../common/text.js";
 
 const UNDO_KEY = "foottile.undo"; // survives a reload, not the tab
 const DOUBLE_TAP_MS = 1000; // a second press of Record or Stop within it is one press
@@ -62,10 +62,8 @@ export class Actions {
 
   /** Run the action of a key. */
   shortcut(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
-    if (isInside(event, "input, textarea, select, dialog[open], [contenteditable]")) return;
     const name = { t: "tare", r: "record", s: "stop", m: "marker", p: "pause" }[event.key];
-    if (!name) return;
+    if (!name || event.repeat || !isShortcut(event)) return;
     event.preventDefault();
     if (this[name]) this.run(name);
     else byId(name).click(); // button of another panel

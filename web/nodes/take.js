@@ -4,7 +4,7 @@ import * as api from "../common/api.js";
 import { isOperator } from "../common/login.js";
 import { countLost } from "../common/losses.js";
 import { notice, quietly, showRefusal, withdraw } from "../common/notices.js";
-import { byId, duration, isInside, localTime, setData, setText } from "../common/text.js";
+import { byId, duration, isShortcut, localTime, setData, setText } from "../common/text.js";
 import { MarkerQueue } from "../live/markers.js";
 
 const KEYS = { r: "record-all", m: "marker-all", s: "stop-all", t: "tare-all" };
@@ -40,8 +40,7 @@ export class Takes {
       });
     }
     document.addEventListener("keydown", (event) => {
-      if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
-      if (isInside(event, "input, dialog[open]") || !KEYS[event.key]) return;
+      if (event.repeat || !KEYS[event.key] || !isShortcut(event)) return;
       event.preventDefault();
       this.run(KEYS[event.key]);
     });

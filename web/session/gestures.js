@@ -1,6 +1,6 @@
 // Pointer, wheel, touch and keys over the plots, translated to actions. Independent of data.
 
-import { isInside } from "../common/text.js";
+import { isShortcut } from "../common/text.js";
 
 const CLICK_PX = 4;
 const SIDEWAYS_PX = 8; // of a finger; vertical motion scrolls the page
@@ -116,9 +116,7 @@ export function bindGestures(box, actions) {
   }, { passive: false });
 
   addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
-    if (isInside(event, "input, textarea, select, dialog[open]")) return;
-    if (actions.key(event)) event.preventDefault();
+    if (isShortcut(event) && actions.key(event)) event.preventDefault();
   });
 }
 
