@@ -40,27 +40,17 @@ _NAME_LENGTH_MAX = 200
 _RULE = "`name; tag, tag`, or names with commas between"
 
 
-def _check_trial_name(name: str) -> str:
-    if ";" in name or name.startswith("#"):
-        raise ValueError("has a `;`, or begins with `#`")
-    return check_user_name(name)
-
-
-def _check_trial_tag(tag: str) -> str:
-    if "," in tag:
-        raise ValueError("has a comma")
-    return check_user_name(tag)
-
-
 _TrialName = Annotated[
     str,
-    StringConstraints(strip_whitespace=True, min_length=1, max_length=_NAME_LENGTH_MAX),
-    AfterValidator(_check_trial_name),
+    StringConstraints(
+        strip_whitespace=True, min_length=1, max_length=_NAME_LENGTH_MAX, pattern="^[^;#][^;]*$"
+    ),
+    AfterValidator(check_user_name),
 ]
 _TrialTag = Annotated[
     str,
-    StringConstraints(strip_whitespace=True, min_length=1, max_length=100),
-    AfterValidator(_check_trial_tag),
+    StringConstraints(strip_whitespace=True, min_length=1, max_length=100, pattern="^[^,]*$"),
+    AfterValidator(check_user_name),
 ]
 
 
@@ -118,10 +108,10 @@ def parse_trials(text: str) -> tuple[ListedTrial, ...]:
     return tuple(trials)
 
 
-def _place_by_name(trials: Sequence[ListedTrial]) -> dict[tuple[str, int], int]:
-    """Return the place of each row by its name and its number among rows of that name."""
+def _number_names(trials: Sequence[ListedTrial]) -> list[tuple[str, int]]:
+    """Return each row's name and its number among rows of that name."""
     names = [one.name for one in trials]
-    return {(name, names[:i].count(name)): i for i, name in enumerate(names)}
+    return [(name, names[:i].count(name)) for i, name in enumerate(names)]
 
 
 def format_trials(trials: Sequence[ListedTrial]) -> str:
@@ -192,33 +182,27 @@ class TrialRecorder:
         """
         if len(trials) > TRIALS_MAX:
             raise UsageError(f"the list has {len(trials)} trials", expected=f"at most {TRIALS_MAX}")
-        stored = self._list
-        former, present = _place_by_name(stored.trials), _place_by_name(trials)
-        rows = [
-            _StoredTrial.model_validate(
-                (stored.trials[former[key]] if key in former else one).model_dump()
-                | one.model_dump(exclude_unset=True)
-            )
-            for key, one in zip(present, trials, strict=True)
-        ]
-        at = stored.next_index
-        left = (
-            present[key]
-            for key, i in former.items()
-            if key in present and (i == at or (i > at and not stored.trials[i].takes))
+        keys, stored = _number_names(trials), self._list
+        former = dict(zip(_number_names(stored.trials), stored.trials, strict=True))
+        rows = tuple(
+            _StoredTrial(**former.get(key, one).model_dump() | one.model_dump(exclude_unset=True))
+            for key, one in zip(keys, trials, strict=True)
         )
-        place, keys = next(left, len(rows)), list(present)
-        while place and keys[place - 1] not in former:  # rows that were put in before the next one
+        # The next row, or the first open one behind it that is still there.
+        ahead = list(former)[stored.next_index :]
+        left = ahead[:1] + [key for key in ahead[1:] if not former[key].takes]
+        places = {key: i for i, key in enumerate(keys)}
+        place = next((places[key] for key in left if key in places), len(rows))
+        while place and keys[place - 1] not in former:  # rows that were put in before it
             place -= 1
-        self._save(trials=tuple(rows), next_index=place)
+        self._save(trials=rows, next_index=place)
         self._on_change(())
 
-    def change(self, changes: dict[str, object], *, disarm: bool = False) -> None:
+    def change(self, changes: dict[str, object]) -> None:
         """Change settings or the place, and stop waiting for a contact.
 
         Args:
-            changes: values by field of the stored list.
-            disarm: True: do not wait for a contact any longer.
+            changes: values by field of the stored list; `is_armed`: do not wait any longer.
 
         Raises:
             UnknownError: the node does not exist.
@@ -232,8 +216,9 @@ class TrialRecorder:
                 f"there is no row {changes['next_index']}",
                 expected=f"0 to {len(self._list.trials)}",
             )
-        self._save(**changes)
-        self._is_armed &= not (disarm or changes.get("start_at_contact") is False)
+        disarms = "is_armed" in changes or changes.get("start_at_contact") is False
+        self._save(**{name: value for name, value in changes.items() if name != "is_armed"})
+        self._is_armed &= not disarms
         self._on_change(())
 
     def record_next(self, request: IdempotencyRecord | None = None) -> None:
@@ -248,11 +233,10 @@ class TrialRecorder:
         self._check_can_record()
         self._problem = None
         if not self._list.start_at_contact:
-            self._start(0.0, request)
-            return
+            return self._start(0.0, request)
         self._is_armed, self._armed_by = True, request
         self._contacts.clear()
-        self._on_change(())
+        return self._on_change(())
 
     def start_at_contact(self, node: ServerNode, batches: Sequence[EstimatedBatch]) -> None:
         """Start the next row if it waits for a contact and one begins in these frames."""
@@ -343,11 +327,10 @@ class TrialRecorder:
         return row.name[: _NAME_LENGTH_MAX - len(suffix)] + suffix
 
     def _list_running(self) -> list[Session]:
-        take = self._list.take
         return [
             one
             for one in self._store.list_unsealed()
-            if take is not None and one.take == take and one.state == "recording"
+            if one.state == "recording" and one.take and one.take == self._list.take
         ]
 
     def _check_can_record(self) -> None:
@@ -381,12 +364,11 @@ class TrialRecorder:
         rows = list(stored.trials)
         rows[place] = rows[place].model_copy(update={"takes": (*rows[place].takes, take)})
         left = (i for i in range(place + 1, len(rows)) if not rows[i].takes)
-        stop_ns = None if stored.stop_after_s is None else round(stored.stop_after_s * 1e9)
         changes = {
             "trials": tuple(rows),
             "next_index": next(left, len(rows)),
             "take": take,
-            "stop_at_t_ns": None if stop_ns is None else started_t_ns + stop_ns,
+            "stop_at_t_ns": stored.stop_after_s and started_t_ns + round(stored.stop_after_s * 1e9),
         }
         try:
             self._save(**changes)

@@ -78,9 +78,7 @@ async def set_trials(
 )
 async def change_trials(body: ChangeTrials, server: ServerState) -> TrialsView:
     """Choose the next row, change settings, or stop waiting for a contact."""
-    changes = body.model_dump(exclude_unset=True)
-    disarm = changes.pop("is_armed", None) is False
-    server.trials.change(changes, disarm=disarm)
+    server.trials.change(body.model_dump(exclude_unset=True))
     return server.trials.make_view()
 
 
