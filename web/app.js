@@ -55,7 +55,7 @@ const state = {
 inSunlight();
 const absence = new Absence();
 const trials = new Trials(() => link.serverNowMs(), () => state.cannotRecord);
-const alerts = addDeviceMenu(() => [trials.makeItem()]);
+const alerts = addDeviceMenu(absence, () => [trials.makeItem()]);
 const framePace = new FramePace();
 const pace = new Pace(draw);
 const redraw = () => {
@@ -120,7 +120,7 @@ const handlers = {
   },
 };
 
-const watchers = [absence, alerts, trials].map((one) => (message) => one.watch(message));
+const watchers = [alerts, absence, trials].map((one) => (message) => one.watch(message));
 const link = new Link({ handlers, watchers });
 const status = new Status(link);
 

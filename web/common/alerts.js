@@ -19,16 +19,16 @@ const GAP_S = 0.06;
 
 /** Alerts of this device. */
 export class Alerts {
-  constructor() {
+  /** @param {import("./absence.js").Absence} known what the page knew before each message: watches after this one */
+  constructor(known) {
+    this.known = known;
     /** @type {Record<"sound" | "vibration", boolean>} */
     this.on = { sound: isChosen("foottile.sound"), vibration: isChosen("foottile.vibration") };
     this.canVibrate = "vibrate" in navigator;
     this.audio = null;
     this.lastMs = {}; // latest alert by kind, and latest line by reason
     this.lines = []; // reasons, until the notice is dismissed
-    this.nodes = new Map(); // name -> latest description
     this.saturated = new Map(); // name of the node -> latest frame's `saturated`
-    this.recordings = new Map(); // id -> session
     // Browsers mute sound until the first tap or key.
     for (const type of ["pointerup", "keydown"]) document.addEventListener(type, () => { if (this.on.sound) this.unlock(); });
   }
@@ -91,22 +91,18 @@ export class Alerts {
 
   /** Compare a message of the server with the ones before. @param {PageMessage} message */
   watch(message) {
-    if (message.type === "hello") { // what changed meanwhile is not of now: absence.js
-      this.nodes = new Map(message.nodes.map((node) => [node.node, node]));
-      this.recordings = new Map(message.recording.map((session) => [session.id, session]));
-    } else if (message.type === "node") {
+    const { nodes, sessions } = this.known; // what changed before a hello is not of now: absence.js
+    if (message.type === "node") {
       const { node } = message;
-      if (this.nodes.get(node.node)?.connected && !node.connected) this.raise("lost", `Node ${node.node} is lost.`);
-      this.nodes.set(node.node, node);
+      if (nodes.get(node.node)?.connected && !node.connected) this.raise("lost", `Node ${node.node} is lost.`);
     } else if (message.type === "frame") {
       const before = this.saturated.get(message.node);
       this.saturated.set(message.node, message.saturated);
       const found = message.saturated.findIndex((is, i) => is && !before?.[i]);
-      if (found >= 0) this.raise("saturated", `Tile ${this.nodes.get(message.node)?.tiles[found]?.serial ?? found} of ${message.node} is saturated.`);
+      if (found >= 0) this.raise("saturated", `Tile ${nodes.get(message.node)?.tiles[found]?.serial ?? found} of ${message.node} is saturated.`);
     } else if (message.type === "session") {
       const { session } = message;
-      if (session.state === "recording") this.recordings.set(session.id, session);
-      else if (this.recordings.delete(session.id) && !ownStops.has(session.id) && !ownStops.has(session.take)) {
+      if (session.state !== "recording" && sessions.has(session.id) && !ownStops.has(session.id) && !ownStops.has(session.take)) {
         this.raise("ended", `Recording “${session.name}” of ${session.node} has ended.`);
       }
     }

@@ -1,6 +1,7 @@
 // Dialog of a node's calibration: current one, available ones, assign, upload. Loaded when opened.
 
 import * as api from "./api.js";
+import { unlessRefused } from "./request.js";
 import { el, localTime, setText } from "./text.js";
 
 const SHOWN_TILES = 4;
@@ -47,14 +48,8 @@ class CalibrationDialog {
   async run(action) {
     setText(this.message, "");
     this.element.setAttribute("aria-busy", "true");
-    try {
-      await action();
-    } catch (error) {
-      if (!(error instanceof api.Refusal)) throw error;
-      setText(this.message, `Not done: ${error.message}`);
-    } finally {
-      this.element.removeAttribute("aria-busy");
-    }
+    await unlessRefused(action(), ({ message }) => setText(this.message, `Not done: ${message}`))
+      .finally(() => this.element.removeAttribute("aria-busy"));
   }
 
   async load() {

@@ -8,10 +8,10 @@ import { byId, el, setText } from "./text.js";
 
 const ABOUT = "awake";
 
-/** Add the menu to the header; return the alerts. @param {() => HTMLElement[]} [more] further items */
-export function addDeviceMenu(more = () => []) {
+/** Add the menu to the header; return the alerts. @param {import("./absence.js").Absence} absence @param {() => HTMLElement[]} more further items */
+export function addDeviceMenu(absence, more) {
   let wasDark = false;
-  const alerts = new Alerts();
+  const alerts = new Alerts(absence);
   const screen = item("Keep screen on", () => awake.choose(!awake.chosen));
   const sound = item("Sound at alerts", () => alerts.choose("sound", !alerts.on.sound));
   const vibration = item("Vibration at alerts", () => alerts.canVibrate && alerts.choose("vibration", !alerts.on.vibration));

@@ -44,7 +44,7 @@ export async function edit(session) {
  * @param {{isRisky?: boolean}} [how] isRisky: Enter cancels
  * @returns {Promise<boolean>}
  */
-function showDialog(name, title, content, yes, { isRisky = false } = {}) {
+export async function showDialog(name, title, content, yes, { isRisky = false } = {}) {
   const no = el("button", { type: "submit", value: "", formnovalidate: "", text: "Cancel", ...(isRisky ? { autofocus: "" } : {}) });
   const dialog = el("dialog", { id: `${name}-dialog`, "aria-labelledby": `${name}-title` },
     el("form", { method: "dialog" },

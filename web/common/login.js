@@ -1,5 +1,6 @@
 // Login: a ticket or token in the URL, or a typed token, becomes a cookie that scripts cannot read.
 
+import { showDialog } from "./dialogs.js";
 import { parseResponse, Refusal, sendRequest } from "./request.js";
 import { el, setText } from "./text.js";
 
@@ -80,22 +81,11 @@ async function dialogUntilLogin() {
   }
 }
 
-function enterToken(why) {
+async function enterToken(why) {
   const field = el("input", { id: "token-field", type: "password", autocomplete: "off" });
-  const dialog = el("dialog", { id: "token-dialog", "aria-labelledby": "token-title" },
-    el("form", { method: "dialog" },
-      el("h2", { id: "token-title", text: "Log in" }), el("p", { id: "token-why", text: why }),
-      el("label", { text: "Token " }, field),
-      el("p", { cls: "row" }, el("button", { type: "submit", value: "ok", text: "Log in" }),
-        el("button", { type: "submit", value: "", text: "Cancel" }))));
-  document.body.append(dialog);
-  return new Promise((resolve) => {
-    dialog.addEventListener("close", () => {
-      dialog.remove();
-      resolve(dialog.returnValue === "ok" ? field.value.trim() : "");
-    }, { once: true });
-    dialog.showModal();
-  });
+  const content = [el("p", { id: "token-why", text: why }), el("label", { text: "Token " }, field)];
+  const entered = await showDialog("token", "Log in", content, el("button", { type: "submit", value: "ok", text: "Log in" }));
+  return entered ? field.value.trim() : "";
 }
 
 /** Return text with a full stop. @param {string} text */

@@ -13,18 +13,18 @@ export class Refusal extends Error {
 }
 
 /**
- * Resolve to `instead` after a Refusal.
+ * After a Refusal resolve to what `instead` makes of it.
  * @template T, U
  * @param {Promise<T>} pending
- * @param {U} [instead]
+ * @param {(refusal: Refusal) => U} [instead]
  * @returns {Promise<T | U>}
  */
-export async function unlessRefused(pending, instead = null) {
+export async function unlessRefused(pending, instead = () => null) {
   try {
     return await pending;
   } catch (error) {
     if (!(error instanceof Refusal)) throw error;
-    return instead;
+    return instead(error);
   }
 }
 

@@ -1,8 +1,8 @@
 // Panel of the list of trials in the action bar: the next one, or the running one, and buttons.
 
 import * as api from "./api.js";
-import { isOperator } from "./login.js";
 import { notice, quietly } from "./notices.js";
+import { press } from "./press.js";
 import { loadModule } from "./request.js";
 import { byId, el, isShortcut, roughly, setData, setText } from "./text.js";
 
@@ -16,7 +16,6 @@ export class Trials {
     this.list = null;
     /** @type {(() => void) | null} */
     this.drawDialog = null;
-    this.isBusy = false;
     this.place = el("span", { id: "trial-place" });
     this.name = el("strong", { id: "trial-name" });
     this.tags = el("span", { id: "trial-tags" });
@@ -30,13 +29,8 @@ export class Trials {
 
   makeButton(id, key, text, act) {
     const button = el("button", { type: "button", id: `trial-${id}` }, el("span", { text }), el("kbd", { text: key }));
-    const run = async () => {
-      if (!isOperator()) notice("viewers cannot record trials. To log in as operator, press “viewer” beside the title.", { bad: true });
-      else if (!this.isBusy && !button.disabled) {
-        this.isBusy = true;
-        await quietly(act).finally(() => { this.isBusy = false; });
-      }
-    };
+    // One at a time of the three: Skip during Record would skip another row.
+    const run = () => this.element.querySelector("[aria-busy]") ?? press(button, "record trials", act);
     button.addEventListener("click", run);
     document.addEventListener("keydown", (event) => {
       if (event.key !== key || event.repeat || !isShortcut(event) || this.element.hidden) return;

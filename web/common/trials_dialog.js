@@ -1,6 +1,7 @@
 // Dialog of the list of trials: all rows, the text of the list, and its settings.
 
 import * as api from "./api.js";
+import { unlessRefused } from "./request.js";
 import { el, setText } from "./text.js";
 
 const SIGNS = { open: "", skipped: "skipped", recording: "● recording", pending: "… pending", complete: "✓ complete", lossy: "⚠ lossy" };
@@ -43,12 +44,7 @@ export function openTrials(trials) {
   /** Run a change; a refusal is shown here, since the dialog covers the notices. @param {() => Promise<TrialsView>} send */
   async function tell(send) {
     setText(said, "");
-    try {
-      trials.show(await send());
-    } catch (error) {
-      if (!(error instanceof api.Refusal)) throw error;
-      setText(said, error.message);
-    }
+    await unlessRefused(send().then((list) => trials.show(list)), ({ message }) => setText(said, message));
   }
 
   /** Send the one setting that was changed: another page may have changed the others. */

@@ -2,8 +2,8 @@
 
 import * as api from "../common/api.js";
 import { countLost, missedText } from "../common/losses.js";
-import { isOperator } from "../common/login.js";
 import { notice, showRefusal } from "../common/notices.js";
+import { bindField, press } from "../common/press.js";
 import { byId, duration, el, isShortcut, localTime, setData, setText } from "../common/text.js";
 
 const UNDO_KEY = "foottile.undo"; // survives a reload, not the tab
@@ -25,7 +25,6 @@ export class Actions {
     this.state = state;
     this.markers = markers;
     this.onSession = onSession;
-    this.busy = new Set();
     this.recordedMs = -Infinity; // latest start, by performance.now()
     this.drawnNode = undefined;
     this.swappedMs = -Infinity; // Stop has replaced Record, or Record Stop
@@ -36,8 +35,8 @@ export class Actions {
       byId(name).addEventListener("click", () => { if (performance.now() - this.swappedMs >= DOUBLE_TAP_MS) this.run(name); });
     }
     byId("another").addEventListener("click", () => this.run("record"));
-    this.bindField("marker-label", "marker");
-    this.bindField("session-name", "record");
+    bindField("marker-label", () => this.run("marker"));
+    bindField("session-name", () => this.run("record"));
     document.addEventListener("keydown", (event) => this.shortcut(event));
     const bar = byId("actions");
     byId("fields").addEventListener("click", () => {
@@ -46,18 +45,6 @@ export class Actions {
       byId("fields").setAttribute("aria-expanded", String(open));
     });
     new ResizeObserver(() => document.documentElement.style.setProperty("--bar", `${bar.offsetHeight}px`)).observe(bar);
-  }
-
-  /** Bind keys of a text field: Enter runs the action, Escape clears; both leave it, so that shortcuts work again. */
-  bindField(id, name) {
-    const field = byId(id, HTMLInputElement);
-    field.addEventListener("keydown", (event) => {
-      if (event.isComposing) return;
-      if (event.key === "Escape") field.value = "";
-      else if (event.key !== "Enter") return;
-      field.blur();
-      if (event.key === "Enter") this.run(name);
-    });
   }
 
   /** Run the action of a key. */
@@ -71,27 +58,10 @@ export class Actions {
 
   /** Run an action, once at a time, and show its result. */
   async run(name) {
-    const button = byId(name, HTMLButtonElement);
-    if (!isOperator()) {
-      notice("viewers cannot tare, record or set markers. To log in as operator, press “viewer” beside the title.", { bad: true });
-      return;
-    }
-    if (button.disabled || this.busy.has(name)) {
+    await press(byId(name, HTMLButtonElement), "tare, record or set markers", () => this[name](this.state.node), () => {
       if (name === "marker" && !this.running().length) notice("no recording is running. Press Record first.", { bad: true });
       else if (["record", "tare"].includes(name) && this.state.cannotRecord) notice(this.state.cannotRecord, { bad: true });
-      return;
-    }
-    this.busy.add(name);
-    button.setAttribute("aria-busy", "true");
-    try {
-      await this[name](this.state.node);
-    } catch (error) {
-      showRefusal(error);
-    } finally {
-      this.busy.delete(name);
-      button.removeAttribute("aria-busy");
-      this.draw();
-    }
+    }).finally(() => this.draw());
   }
 
   async tare(node) {

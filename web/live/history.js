@@ -4,6 +4,7 @@
 // an offline node it ends with the stream.
 
 import * as api from "../common/api.js";
+import { unlessRefused } from "../common/request.js";
 
 /** Requests history when the trace has a hole. */
 export class History {
@@ -26,13 +27,9 @@ export class History {
     if (!this.isRequested || (node.connected && !frame)) return;
     this.isRequested = false;
     this.tiles = tiles;
-    try {
-      const recent = await api.recent(node.node, seconds, frame?.seq_first, tiles);
-      if (recent.stream_id !== this.currentStream()) return;
-      this.points.addHistory(recent, frame?.seq_first, nowMs);
-      if (recent.tiles) this.points.addTileHistory(recent.tiles, tiles, frame?.seq_first);
-    } catch (error) {
-      if (!(error instanceof api.Refusal)) throw error; // the trace starts empty
-    }
+    const recent = await unlessRefused(api.recent(node.node, seconds, frame?.seq_first, tiles)); // refused: the trace starts empty
+    if (!recent || recent.stream_id !== this.currentStream()) return;
+    this.points.addHistory(recent, frame?.seq_first, nowMs);
+    if (recent.tiles) this.points.addTileHistory(recent.tiles, tiles, frame?.seq_first);
   }
 }

@@ -17,20 +17,17 @@ const SLOW = 0.9;
 const WARNINGS_MAX = 3;
 const NODE_KEY = "foottile.node"; // node on the live page
 
-/**
- * Vitals in short, without unknown ones; whatever is bad is among the node's warnings.
- * @param {Partial<Vitals>} vitals
- */
-export function vitalsText(vitals) {
-  const known = (value, text) => value === null || value === undefined ? [] : [text(value)];
-  return [
-    ...known(vitals.cpu_celsius, (celsius) => `${celsius.toFixed(0)} °C`),
-    ...known(vitals.load_per_core, (load) => `load ${(100 * load).toFixed(0)} %`),
-    ...known(vitals.recording_left_s, (s) => `disk for ${roughly(s)}`),
-    ...known(vitals.wifi_dbm, (dbm) => `Wi-Fi ${dbm.toFixed(0)} dBm`),
-    ...known(vitals.is_clock_synchronised, (is) => is ? "clock synchronised" : "clock not synchronised"),
-  ].join(", ");
-}
+/** Text of each vital of a node. @type {Record<string, (value: any) => string>} */
+const VITALS = {
+  cpu_celsius: (celsius) => `${celsius.toFixed(0)} °C`,
+  load_per_core: (load) => `load ${(100 * load).toFixed(0)} %`,
+  recording_left_s: (s) => `disk for ${roughly(s)}`,
+  wifi_dbm: (dbm) => `Wi-Fi ${dbm.toFixed(0)} dBm`,
+  is_clock_synchronised: (is) => (is ? "clock synchronised" : "clock not synchronised"),
+};
+
+/** Vitals in short, without unknown ones; whatever is bad is among the node's warnings. @param {Partial<Vitals>} vitals */
+export const vitalsText = (vitals) => Object.keys(VITALS).filter((name) => (vitals[name] ?? null) !== null).map((name) => VITALS[name](vitals[name])).join(", ");
 
 /** Card of a node. */
 export class Card {

@@ -59,8 +59,8 @@ const handlers = {
 
 const absence = new Absence();
 const trials = new Trials(() => link.serverNowMs(), () => takes.page.cannotRecord());
-const alerts = addDeviceMenu(() => [trials.makeItem()]);
-const watchers = [absence, alerts, trials].map((one) => (message) => one.watch(message));
+const alerts = addDeviceMenu(absence, () => [trials.makeItem()]);
+const watchers = [alerts, absence, trials].map((one) => (message) => one.watch(message));
 const link = new Link({ handlers, watchers, rateHz: RATE_HZ });
 
 function updateNode(node) {

@@ -1,9 +1,9 @@
 // Record, marker and stop for all nodes: one request, with a result per node. Tare all: one request per node.
 
 import * as api from "../common/api.js";
-import { isOperator } from "../common/login.js";
 import { countLost } from "../common/losses.js";
-import { notice, quietly, showRefusal, withdraw } from "../common/notices.js";
+import { notice, quietly, withdraw } from "../common/notices.js";
+import { bindField, press } from "../common/press.js";
 import { byId, duration, isShortcut, localTime, setData, setText } from "../common/text.js";
 import { MarkerQueue } from "../live/markers.js";
 
@@ -22,7 +22,6 @@ export class Takes {
    */
   constructor(page) {
     this.page = page;
-    this.busy = new Set();
     this.markedNodes = 0; // nodes with the latest marker; 0 if it failed on one
     this.markers = new MarkerQueue(async (id, event) => {
       const take = await api.addTakeMarker(id, event);
@@ -30,15 +29,8 @@ export class Takes {
     });
     this.actions = { "record-all": () => this.record(), "marker-all": () => this.setMarker(), "stop-all": () => this.stop(), "tare-all": () => this.tare() };
     for (const id of Object.keys(this.actions)) byId(id).addEventListener("click", () => this.run(id));
-    for (const [field, id] of [["take-name", "record-all"], ["take-label", "marker-all"]]) {
-      const input = byId(field, HTMLInputElement);
-      input.addEventListener("keydown", (event) => {
-        if (event.isComposing || !["Enter", "Escape"].includes(event.key)) return;
-        if (event.key === "Escape") input.value = "";
-        input.blur();
-        if (event.key === "Enter") this.run(id);
-      });
-    }
+    bindField("take-name", () => this.run("record-all"));
+    bindField("take-label", () => this.run("marker-all"));
     document.addEventListener("keydown", (event) => {
       if (event.repeat || !KEYS[event.key] || !isShortcut(event)) return;
       event.preventDefault();
@@ -58,28 +50,11 @@ export class Takes {
 
   /** Run an action, once at a time, and show its result. */
   async run(id) {
-    const button = byId(id, HTMLButtonElement);
-    if (!isOperator()) {
-      notice("viewers cannot tare, record or set markers. To log in as operator, press “viewer” beside the title.", { bad: true });
-      return;
-    }
-    if (button.disabled || this.busy.has(id)) {
+    await press(byId(id, HTMLButtonElement), "tare, record or set markers", this.actions[id], () => {
       if (id === "tare-all") notice(this.page.cannotRecord(), { bad: true });
       else if (id === "record-all") notice(this.running() ? "stop the running recording first." : this.page.cannotRecord(), { bad: true });
       else notice("no recording on all nodes is running. Press Record all first.", { bad: true });
-      return;
-    }
-    this.busy.add(id);
-    button.setAttribute("aria-busy", "true");
-    try {
-      await this.actions[id]();
-    } catch (error) {
-      showRefusal(error);
-    } finally {
-      this.busy.delete(id);
-      button.removeAttribute("aria-busy");
-      this.draw();
-    }
+    }).finally(() => this.draw());
   }
 
   async record() {

@@ -3,7 +3,7 @@
 /** @typedef {import("./view.js").View} View */
 
 /** Return the first index of a sorted list whose element is not below `value`. */
-function lowerBound(list, value) {
+export function lowerBound(list, value) {
   let [low, high] = [0, list.length];
   while (low < high) {
     const middle = (low + high) >> 1;

@@ -1,7 +1,7 @@
 // Selection of the overlay: a reference of an earlier comparison, or another session.
 
 import * as api from "../common/api.js";
-import { notice, quietly, showRefusal } from "../common/notices.js";
+import { quietly, showRefusal } from "../common/notices.js";
 import { unlessRefused } from "../common/request.js";
 import { byId, el, localTime, number, roughly, setText } from "../common/text.js";
 import { Beside } from "./beside.js";
@@ -51,7 +51,7 @@ export class Compare {
   }
 
   async begin() {
-    const sessions = await unlessRefused(api.newestSessions(SESSIONS_MAX), { items: [] });
+    const sessions = await unlessRefused(api.newestSessions(SESSIONS_MAX), () => ({ items: [] }));
     const others = sessions.items.filter((one) => one.id !== this.session.id && one.state === "sealed" && one.sha256);
     const query = new URLSearchParams(location.search);
     const wanted = ["reference", "with"].filter((key) => query.has(key)).map((key) => `${key}:${query.get(key)}`)[0] ?? "";
@@ -78,13 +78,9 @@ export class Compare {
     byId("align-choice").hidden = true;
     this.showText("");
     this.updateUrl();
-    try {
-      if (wanted.startsWith("reference:")) await this.showReference(wanted.slice(10));
-      else if (wanted.startsWith("with:")) await this.showSession(wanted.slice(5), align);
-    } catch (error) {
-      if (!(error instanceof api.Refusal)) throw error;
-      this.showText(error.message);
-    }
+    const shown = wanted.startsWith("reference:") ? this.showReference(wanted.slice(10))
+      : wanted.startsWith("with:") ? this.showSession(wanted.slice(5), align) : Promise.resolve();
+    await unlessRefused(shown, ({ message }) => this.showText(message));
   }
 
   /** Show a reference; it has this session's time axis. */

@@ -2,6 +2,7 @@
 
 import * as api from "../common/api.js";
 import { frames, lossTexts } from "../common/losses.js";
+import { unlessRefused } from "../common/request.js";
 import { byId, bytes, el, localTime, setText } from "../common/text.js";
 
 /** Return the ledger as sentences. @returns {string[]} */
@@ -67,13 +68,7 @@ export class LedgerCard {
 
   async load() {
     if (!this.card.open) return;
-    let lines;
-    try {
-      lines = ledgerTexts(await api.ledgerOf(this.session.id), this.session);
-    } catch (error) {
-      if (!(error instanceof api.Refusal)) throw error;
-      lines = [error.message];
-    }
+    const lines = await unlessRefused(api.ledgerOf(this.session.id).then((found) => ledgerTexts(found, this.session)), ({ message }) => [message]);
     byId("ledger").replaceChildren(...lines.map((text) => el("li", { text })));
   }
 

@@ -1,6 +1,7 @@
 // Visible range as a table.
 
 import * as api from "../common/api.js";
+import { unlessRefused } from "../common/request.js";
 import { byId, el, setText } from "../common/text.js";
 import { Bins } from "./bins.js";
 import { flagTexts } from "./flags.js";
@@ -26,15 +27,9 @@ export class Numbers {
   }
 
   async load(view, key, panels) {
-    let answer;
-    try {
-      answer = await api.overview(this.id, { points: POINTS, start_s: view.from, end_s: view.to + 1e-6 });
-    } catch (error) {
-      if (!(error instanceof api.Refusal)) throw error;
-      setText(byId("numbers-problem"), error.message);
-      return;
-    }
-    if (key !== this.shown) return;
+    const answer = await unlessRefused(api.overview(this.id, { points: POINTS, start_s: view.from, end_s: view.to + 1e-6 }),
+      ({ message }) => setText(byId("numbers-problem"), message));
+    if (!answer || key !== this.shown) return;
     const bins = new Bins(answer, view);
     const rows = Array.from({ length: bins.count }, (_, i) => ({ readings: readingsOf(bins, i, panels), flags: flagTexts(bins, i).join(", ") }));
     const names = (rows[0]?.readings ?? []).map(([, name]) => name).concat("Notes");

@@ -119,7 +119,7 @@ export class Plotted {
 
   /** Offer an overlay; its modules load on request, or if there is a reference. */
   async showCompare(offset) {
-    const references = (await unlessRefused(api.listComparisons(this.session.id), { items: [] })).items;
+    const references = (await unlessRefused(api.listComparisons(this.session.id), () => ({ items: [] }))).items;
     const open = async () => {
       byId("compare").hidden = true;
       const { Compare } = await loadModule(() => import("./compare.js"));

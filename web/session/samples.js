@@ -1,6 +1,7 @@
 // Stored frames of a session in slices: prefetched, in bounded memory.
 
 import * as api from "../common/api.js";
+import { lowerBound } from "./bins.js";
 
 const VALUES_IN_SLICE = 20_000; // parsed within milliseconds
 const SLICE_MOST_S = 1;
@@ -50,17 +51,6 @@ function frameOf({ timeS, columns }, row, tiles) {
   [frame.force_max_n, frame.gauge_max_kpa] = [frame.force_n, frame.gauge_kpa]; // of this frame alone
   frame.timeS = timeS[row];
   return frame;
-}
-
-/** Return the first index of a sorted list whose element is not below `value`. */
-function lowerBound(list, value) {
-  let [low, high] = [0, list.length];
-  while (low < high) {
-    const middle = (low + high) >> 1;
-    if (list[middle] < value) low = middle + 1;
-    else high = middle;
-  }
-  return low;
 }
 
 /** Cache of slices. */

@@ -62,7 +62,7 @@ export class Sessions {
     else delete this.filter[name];
     const query = String(new URLSearchParams(this.filter));
     history.replaceState(null, "", location.pathname + (query ? `?${query}` : ""));
-    this.reload();
+    this.load();
   }
 
   /** Load the first page, or the one at `cursor`. Silent if the server is down: the link shows that. */
@@ -95,11 +95,6 @@ export class Sessions {
     this.cursor = page?.next_cursor ?? null;
     this.draw();
     return items;
-  }
-
-  /** Load again after a reconnection. */
-  reload() {
-    return this.load();
   }
 
   /** Add or replace a session. @param {SessionView} session */

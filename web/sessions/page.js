@@ -27,7 +27,7 @@ const sessions = new Sessions({ onSession: updateSession, onDeleted: removeSessi
 /** @type {import("../common/link.js").Handlers} */
 const handlers = {
   hello() {
-    sessions.reload();
+    sessions.load();
     trash.load();
     look(); // the login may have ended with the server
   },
