@@ -351,7 +351,8 @@ class ServerFollower:
                 del self._sessions[session_id]
                 return
             for marker in markers:
-                is_known = marker["stream_id"] is None or marker["bound_ns"] is not None  # its time
+                is_edge = marker.get("stream_id") is not None
+                is_known = not is_edge or marker["bound_ns"] is not None  # its server's time
                 if is_known and marker["id"] not in known.marker_ids:
                     write("marker", marker["label"], marker["t_ns"])
             known.marker_ids = {marker["id"] for marker in markers}
