@@ -185,7 +185,7 @@ class _KnownSession:
 
     state: str
     marker_ids: set[str] = field(default_factory=set)
-    asked_s: float = -math.inf
+    requested_s: float = -math.inf
 
 
 @dataclass
@@ -340,10 +340,10 @@ class ServerFollower:
                 write("recording_started", view["name"], view["started_t_ns"])
         if view["marker_count"] != len(known.marker_ids):
             now_s = time.monotonic()
-            if known.state == state and now_s - known.asked_s < _MARKERS_PERIOD_S:
+            if known.state == state and now_s - known.requested_s < _MARKERS_PERIOD_S:
                 self._late[session_id] = view
                 return
-            known.asked_s = now_s
+            known.requested_s = now_s
             path = f"/sessions/{session_id}/markers"
             try:
                 markers = (await asyncio.to_thread(self._server.http.get, path))["items"]

@@ -140,7 +140,7 @@ async def _renew_forever(
 ) -> None:
     """Renew the certificate when the names of the machine change, and when it ends."""
     before: tuple[list[str], int] | None = None
-    said = ""
+    reported = ""
     while True:
         await asyncio.sleep(_RENEWAL_PERIOD_S)
         now = datetime.now(UTC)
@@ -151,6 +151,6 @@ async def _renew_forever(
                 _load_and_explain(authority, outside)
                 before = current
         except Exception as error:  # a bug, too: it is tried again
-            if (what := f"the certificate is not renewed: {str(error) or repr(error)}") != said:
+            if (what := f"the certificate is not renewed: {str(error) or repr(error)}") != reported:
                 remark(what)
-            said = what
+            reported = what
