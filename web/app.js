@@ -9,7 +9,6 @@
 // A panel is a class that owns one element of index.html. This module creates it and passes server
 // messages to it. Panels do not import each other. No build step, no file from another host.
 
-import { Absence } from "./common/absence.js";
 import { addDeviceMenu } from "./common/device.js";
 import { Link } from "./common/link.js";
 import { LOSSES_HELP } from "./common/losses.js";
@@ -53,9 +52,8 @@ const state = {
 };
 
 inSunlight();
-const absence = new Absence();
 const trials = new Trials(() => link.serverNowMs(), () => state.cannotRecord);
-const alerts = addDeviceMenu(absence, () => [trials.makeItem()]);
+const watchers = addDeviceMenu(trials);
 const framePace = new FramePace();
 const pace = new Pace(draw);
 const redraw = () => {
@@ -120,7 +118,6 @@ const handlers = {
   },
 };
 
-const watchers = [alerts, absence, trials].map((one) => (message) => one.watch(message));
 const link = new Link({ handlers, watchers });
 const status = new Status(link);
 

@@ -33,8 +33,6 @@ _PREFERENCES = {
     "browser.dom.window.dump.enabled": True,
     "browser.download.folderList": 2,
     "browser.download.alwaysOpenPanel": False,
-    # A slow drawing that a test's next page interrupts is no fault of the page.
-    "dom.ipc.cancel_content_js_when_navigating": False,
 }
 _COMPLAINT = re.compile(r"console\.(?:warn|error): .*")
 _OF_BROWSER = "RSLoader"  # its list of experiments, which it does not get here

@@ -1,5 +1,6 @@
 // Menu of this device: screen, sound, vibration, and further entries of the page.
 
+import { Absence } from "./absence.js";
 import { Alerts } from "./alerts.js";
 import { Awake } from "./awake.js";
 import { menuButton } from "./menu.js";
@@ -8,21 +9,26 @@ import { byId, el, setText } from "./text.js";
 
 const ABOUT = "awake";
 
-/** Add the menu to the header; return the alerts. @param {import("./absence.js").Absence} absence @param {() => HTMLElement[]} more further items */
-export function addDeviceMenu(absence, more) {
+/**
+ * Add the menu to the header; return what watches the link's messages.
+ * @param {import("./trials.js").Trials} trials
+ * @returns {((message: PageMessage) => void)[]}
+ */
+export function addDeviceMenu(trials) {
+  const absence = new Absence();
   let wasDark = false;
   const alerts = new Alerts(absence);
   const screen = item("Keep screen on", () => awake.choose(!awake.chosen));
   const sound = item("Sound at alerts", () => alerts.choose("sound", !alerts.on.sound));
   const vibration = item("Vibration at alerts", () => alerts.canVibrate && alerts.choose("vibration", !alerts.on.vibration));
-  const button = menuButton("Screen and alerts of this device", () => { draw(); return [screen, sound, vibration, ...more()]; });
+  const button = menuButton("Screen and alerts of this device", () => { draw(); return [screen, sound, vibration, trials.makeItem()]; });
   const awake = new Awake(draw);
   for (const one of [screen, sound, vibration]) one.addEventListener("click", () => draw());
   navigator.serviceWorker?.register("/worker.js").catch(() => {}); // in secure contexts, where the browser allows it
   button.id = "device";
   byId("sun").after(button);
   draw();
-  return alerts;
+  return [alerts, absence, trials].map((one) => (message) => one.watch(message));
 
   function draw() {
     write(screen, awake.chosen, awake.state);

@@ -1,7 +1,8 @@
 // API reference, drawn by Swagger UI from files of this server; a private server requires a login first.
 
-import { call, Refusal } from "../common/api.js";
+import { call } from "../common/api.js";
 import { logInFromUrl, needsLogin, waitForLogin } from "../common/login.js";
+import { unlessRefused } from "../common/request.js";
 import { byId, setText } from "../common/text.js";
 
 const dark = matchMedia("(prefers-color-scheme: dark)");
@@ -12,15 +13,9 @@ setTheme();
 async function show() {
   await logInFromUrl();
   if (needsLogin()) await waitForLogin();
-  let spec;
-  try {
-    spec = await call("GET", "/openapi.json");
-  } catch (error) {
-    if (!(error instanceof Refusal)) throw error;
-    byId("message").hidden = false;
-    setText(byId("message"), error.message);
-    return;
-  }
+  const spec = await unlessRefused(call("GET", "/openapi.json"), ({ message }) => setText(byId("message"), message));
+  byId("message").hidden = Boolean(spec);
+  if (!spec) return;
   globalThis.SwaggerUIBundle({
     spec,
     domNode: byId("swagger"),

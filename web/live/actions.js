@@ -2,12 +2,14 @@
 
 import * as api from "../common/api.js";
 import { countLost, missedText } from "../common/losses.js";
-import { notice, showRefusal } from "../common/notices.js";
+import { notice } from "../common/notices.js";
 import { bindField, press } from "../common/press.js";
 import { byId, duration, el, isShortcut, localTime, setData, setText } from "../common/text.js";
 
 const UNDO_KEY = "foottile.undo"; // survives a reload, not the tab
 const DOUBLE_TAP_MS = 1000; // a second press of Record or Stop within it is one press
+
+const WHAT = "tare, record or set markers";
 
 /** Focus a button that replaced another one, unless something else has the focus. */
 function moveFocus(from, to) {
@@ -58,7 +60,7 @@ export class Actions {
 
   /** Run an action, once at a time, and show its result. */
   async run(name) {
-    await press(byId(name, HTMLButtonElement), "tare, record or set markers", () => this[name](this.state.node), () => {
+    await press(byId(name, HTMLButtonElement), WHAT, () => this[name](this.state.node), () => {
       if (name === "marker" && !this.running().length) notice("no recording is running. Press Record first.", { bad: true });
       else if (["record", "tare"].includes(name) && this.state.cannotRecord) notice(this.state.cannotRecord, { bad: true });
     }).finally(() => this.draw());
@@ -187,15 +189,7 @@ export class Actions {
   /** Make the row of a recording, with its own Stop button. */
   row(session) {
     const stop = el("button", { type: "button", cls: "small", text: "Stop", "aria-label": `Stop ${session.name}` });
-    stop.addEventListener("click", async () => {
-      stop.disabled = true;
-      try {
-        await this.stop(null, [session.id]);
-      } catch (error) {
-        showRefusal(error);
-        stop.disabled = false;
-      }
-    });
+    stop.addEventListener("click", () => press(stop, WHAT, () => this.stop(null, [session.id])));
     return el("li", { "data-session-id": session.id },
       el("span", { cls: "rec-dot", "aria-hidden": "true" }), el("span", { cls: "unseen", text: "Recording: " }),
       el("span", { cls: "recording-text" }, el("strong", { cls: "recording-name" }), " ", el("strong", { cls: "recording-time" }), " ",

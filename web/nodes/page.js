@@ -1,6 +1,5 @@
 // Page of all nodes: one card each, and recordings on all of them.
 
-import { Absence } from "../common/absence.js";
 import { addDeviceMenu } from "../common/device.js";
 import { helpWithKeys } from "../common/help.js";
 import { Link } from "../common/link.js";
@@ -57,10 +56,8 @@ const handlers = {
   frame: (frame) => cards.get(frame.node)?.addFrame(frame),
 };
 
-const absence = new Absence();
 const trials = new Trials(() => link.serverNowMs(), () => takes.page.cannotRecord());
-const alerts = addDeviceMenu(absence, () => [trials.makeItem()]);
-const watchers = [alerts, absence, trials].map((one) => (message) => one.watch(message));
+const watchers = addDeviceMenu(trials);
 const link = new Link({ handlers, watchers, rateHz: RATE_HZ });
 
 function updateNode(node) {

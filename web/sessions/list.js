@@ -6,6 +6,7 @@ import { frames } from "../common/losses.js";
 import { isOperator } from "../common/login.js";
 import { menuButton } from "../common/menu.js";
 import { notice, quietly } from "../common/notices.js";
+import { unlessRefused } from "../common/request.js";
 import { byId, el, setData, setText } from "../common/text.js";
 import { Chosen } from "./chosen.js";
 import { comparisonAddress, counts, head, makeRow, makeTakeRow } from "./row.js";
@@ -71,18 +72,11 @@ export class Sessions {
     this.loading = cursor;
     const number = cursor ? this.requests : ++this.requests;
     const since = cursor ? this.since : this.since = new Map();
-    let page;
-    try {
-      page = await api.listSessions({ limit: cursor ? MORE : FIRST, ...(cursor ? { cursor } : {}), ...this.filter });
-    } catch (error) {
-      if (!(error instanceof api.Refusal)) throw error;
-      if (cursor) notice(error.message, { bad: true });
-      return [];
-    } finally {
-      if (this.loading === cursor) this.loading = null;
-    }
-    if (number !== this.requests) return []; // the filter has changed
-    const items = page?.items ?? [];
+    const page = await unlessRefused(api.listSessions({ limit: cursor ? MORE : FIRST, ...(cursor ? { cursor } : {}), ...this.filter }),
+      ({ message }) => { if (cursor) notice(message, { bad: true }); })
+      .finally(() => { if (this.loading === cursor) this.loading = null; });
+    if (!page || number !== this.requests) return []; // the filter has changed
+    const { items } = page;
     if (!cursor) {
       this.sessions.clear();
       this.since = null;
@@ -92,7 +86,7 @@ export class Sessions {
       if (session) this.sessions.set(id, session);
       else this.sessions.delete(id);
     }
-    this.cursor = page?.next_cursor ?? null;
+    this.cursor = page.next_cursor ?? null;
     this.draw();
     return items;
   }
