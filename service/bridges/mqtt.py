@@ -30,6 +30,8 @@ from service.protocol.codec import run_until_first_ends
 
 USER_VARIABLE, PASSWORD_VARIABLE = "FOOTTILE_MQTT_USER", "FOOTTILE_MQTT_PASSWORD"  # names
 _EVENTS_MAX = 1000
+_FAREWELL_S = 5.0
+"""Timeout of the last message: without it `online` would stay, as a regular end sends no will."""
 _RETRY_S = 1.0
 _AT_MOST_ONCE, _AT_LEAST_ONCE = 0, 1
 _STATE_FIELDS = (
@@ -127,7 +129,7 @@ class MqttOutlet(Outlet):
                     try:
                         await run_until_first_ends(self._publish(client), _watch(client))
                     except asyncio.CancelledError:  # a regular end sends no last will
-                        await client.publish(*self._bridge("offline"), timeout=1.0)
+                        await client.publish(*self._bridge("offline"), timeout=_FAREWELL_S)
                         raise
             except aiomqtt.MqttError as error:
                 if (task := asyncio.current_task()) is not None and task.cancelling():
