@@ -22,6 +22,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from devices.errors import DamagedFileError, UsageError
+from devices.input_files import read_bytes
 from storage.durable_files import (
     make_synced_folder,
     read_small_file,
@@ -35,6 +36,7 @@ CA_NAME = "foottile-ca.crt"
 _CA_KEY_NAME = "ca.pem"
 """File of the CA's key, with its certificate: one file, so that one cannot be replaced alone."""
 _LEAF_NAME = "server.pem"
+_PEM_BYTES_MAX = 1 << 20
 _PRIVATE = 0o600
 _BACKDATED = timedelta(days=30)
 _CA_LIFE = timedelta(days=3652)
@@ -162,9 +164,9 @@ def load_given_context(certificate: Path, key: Path) -> tuple[ssl.SSLContext, li
     expected = "a PEM file of the certificate and its chain, and one of its key without a password"
     context = _make_context()
     try:
-        for path in (certificate, key):
-            path.open().close()  # the error of ssl does not name it
-        first, *_ = x509.load_pem_x509_certificates(certificate.read_bytes())
+        read_bytes(key, bytes_max=_PEM_BYTES_MAX)  # the error of ssl does not name it
+        content = read_bytes(certificate, bytes_max=_PEM_BYTES_MAX)
+        first, *_ = x509.load_pem_x509_certificates(content)
         context.load_cert_chain(certificate, key, password=b"")
         is_open = stat.S_IMODE(key.stat().st_mode) & 0o004
     except (OSError, ValueError) as error:
