@@ -8,6 +8,7 @@ import queue
 import signal
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -95,10 +96,11 @@ def broker() -> Iterator[RunningBroker]:
     broker.stop()
 
 
+@pytest.mark.soak  # the broker of tests sometimes fails beside other tests
 def test_summaries_states_and_events_of_a_node_are_on_the_broker(
     running: Running, tared: FakeNode, foottile: Start, broker: RunningBroker
 ) -> None:
-    bridge = foottile("bridge", "mqtt", broker.url, "--rate", 5, "--server", running.url)
+    foottile("bridge", "mqtt", broker.url, "--rate", 5, "--server", running.url)
     assert broker.receive("foottile/bridge").content == "online"
     state = broker.receive("foottile/bench/state").content
     assert (state["state"], state["tiles"]) == ("online", ["T01", "T02"])
@@ -124,9 +126,19 @@ def test_summaries_states_and_events_of_a_node_are_on_the_broker(
         assert broker.receive("foottile/bench/event").content["kind"] == "recording_stopped"
     tared.leave()
     broker.receive("foottile/bench/state", lambda each: each["state"] == "offline")
+
+
+@pytest.mark.soak  # the broker of tests sometimes fails beside other tests
+def test_a_bridge_that_is_ended_is_offline(
+    running: Running, tared: FakeNode, foottile: Start, broker: RunningBroker
+) -> None:
+    bridge = foottile("bridge", "mqtt", broker.url, "--server", running.url)
+    assert broker.receive("foottile/bridge").content == "online"
+    broker.receive("foottile/bench/state")
+    time.sleep(1.0)  # until no message waits for its acknowledgement
     bridge.process.send_signal(signal.SIGINT)
     assert broker.receive("foottile/bridge").content == "offline"
-    assert bridge.ended(20.0) == 0
+    assert bridge.ended(PATIENCE_S) == 0
 
 
 @pytest.mark.slow
