@@ -31,7 +31,7 @@ def _make_trial_or_none(name: str, tags: list[str]) -> ListedTrial | None:
 TRIALS = st.builds(_make_trial_or_none, _TEXT, st.lists(_TEXT, max_size=3)).filter(bool)
 
 
-class Stub:
+class FakeServer:
     """What a list of trials needs of a server."""
 
     def __init__(self) -> None:
@@ -102,15 +102,15 @@ def test_no_order_of_steps_loses_a_row_and_only_a_success_advances(
     tmp_path_factory: pytest.TempPathFactory, count: int, steps: list[str | int]
 ) -> None:
     path = tmp_path_factory.mktemp("trials") / "trials.json"
-    stub = Stub()
-    trials = stub.make(path)
+    fake = FakeServer()
+    trials = fake.make(path)
     names = [f"trial {i}" for i in range(count)]
     trials.set_trials([ListedTrial(name=name) for name in names])
     recorded = [0] * count
     for step in steps:
         before = trials.make_view()
         place = before.next_index
-        stub.refuses = step == "fail"
+        fake.refuses = step == "fail"
         if step in ("record", "fail"):
             if place == count or step == "fail":
                 with pytest.raises(StateError):
@@ -120,15 +120,15 @@ def test_no_order_of_steps_loses_a_row_and_only_a_success_advances(
             trials.record_next()
             recorded[place] += 1
             number = f" ({recorded[place]})" if recorded[place] > 1 else ""
-            assert stub.sessions[-1].name == names[place] + number
+            assert fake.sessions[-1].name == names[place] + number
             after = trials.make_view()
             assert (after.last_index, after.trials[place].state) == (place, "recording")
             assert place < after.next_index <= count
             with pytest.raises(StateError, match="is being recorded"):
                 trials.record_next()
-            stub.stop()
+            fake.stop()
         elif step == "reopen":
-            trials = stub.make(path)
+            trials = fake.make(path)
             assert trials.make_view() == before
         else:
             wanted = {"skip": place + 1, "repeat": before.last_index or 0}.get(str(step), step)
@@ -147,11 +147,11 @@ def test_no_order_of_steps_loses_a_row_and_only_a_success_advances(
 
 
 def test_a_longer_list_keeps_what_was_recorded(tmp_path: Path) -> None:
-    stub = Stub()
-    trials = stub.make(tmp_path / "trials.json")
+    fake = FakeServer()
+    trials = fake.make(tmp_path / "trials.json")
     trials.set_trials(parse_trials("a, b"))
     trials.record_next()
-    stub.stop()
+    fake.stop()
     trials.set_trials(parse_trials("a, b, c"))
     view = trials.make_view()
     assert (view.next_name, [row.recordings for row in view.trials]) == ("b", [1, 0, 0])
@@ -165,14 +165,14 @@ def test_a_longer_list_keeps_what_was_recorded(tmp_path: Path) -> None:
 def test_a_list_as_text_keeps_texts_recordings_and_place_of_rows_of_equal_names(
     tmp_path: Path,
 ) -> None:
-    stub = Stub()
-    trials = stub.make(tmp_path / "trials.json")
+    fake = FakeServer()
+    trials = fake.make(tmp_path / "trials.json")
     trials.set_trials(
         [ListedTrial(name=name, subject="S1", notes=f"note {name}") for name in "abacd"]
     )
     for _ in range(3):
         trials.record_next()
-        stub.stop()
+        fake.stop()
     for text, recordings, place in [
         ("a, b, a, c, d, e", [1, 1, 1, 0, 0, 0], 3),
         ("a\nb; slow\na, c, d, e", [1, 1, 1, 0, 0, 0], 3),  # a tag
@@ -200,39 +200,39 @@ def test_a_trial_that_ran_when_the_server_was_killed_before_the_list_was_saved_i
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "trials.json"
-    stub = Stub()
-    trials = stub.make(path)
+    fake = FakeServer()
+    trials = fake.make(path)
     trials.set_trials(parse_trials("a, b"))
     trials.change({"stop_after_s": 60})
     before = path.read_bytes()
     trials.record_next()
     ran = trials.make_view()
     path.write_bytes(before)
-    view = stub.make(path).make_view()
+    view = fake.make(path).make_view()
     assert (view.take, view.next_name, view.running_name) == (ran.take, "b", "a")
-    assert view.stop_at_t_ns == stub.sessions[0].started_t_ns + 60 * 10**9
-    assert stub.make(path).make_view() == view
+    assert view.stop_at_t_ns == fake.sessions[0].started_t_ns + 60 * 10**9
+    assert fake.make(path).make_view() == view
     path.write_bytes(before)
-    stub.sessions[0].take = None  # recorded by hand
-    assert stub.make(path).make_view().next_name == "a"
+    fake.sessions[0].take = None  # recorded by hand
+    assert fake.make(path).make_view().next_name == "a"
 
 
 def test_the_running_trial_has_its_name_in_a_list_without_it(tmp_path: Path) -> None:
-    stub = Stub()
-    trials = stub.make(tmp_path / "trials.json")
+    fake = FakeServer()
+    trials = fake.make(tmp_path / "trials.json")
     trials.set_trials(parse_trials("a, b"))
     trials.record_next()
     trials.set_trials(())
     view = trials.make_view()
     assert (view.running_name, view.last_index, view.trials) == ("a", None, [])
-    stub.stop()
+    fake.stop()
     assert trials.make_view().running_name is None
 
 
 def test_a_damaged_file_is_set_aside_and_named(tmp_path: Path) -> None:
     path = tmp_path / "trials.json"
-    Stub().make(path).set_trials(parse_trials("a"))
+    FakeServer().make(path).set_trials(parse_trials("a"))
     path.write_text(path.read_text().replace('"a"', '"b"'))
-    trials = Stub().make(path)
+    trials = FakeServer().make(path)
     assert trials.make_view().trials == []
     assert "list of trials" in trials.file_problems[0]
