@@ -44,6 +44,8 @@ log = logging.getLogger("foottile.nodes")
 
 _NODES_MAX = 1000
 """Limit on node names, so that ever new names fill neither memory nor disk."""
+_READABLE_PROTOCOLS = (5, PROTOCOL)
+"""Protocols of a stored hello that can be read: 6 only adds vitals, and an update is no damage."""
 _NODE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,63}")
 
 
@@ -64,6 +66,8 @@ class NodeRegistry:
         self._data = data
         self._nodes: dict[str, ServerNode] = {}
         self._problems: list[str] = []
+        self._left_out: dict[str, str] = {}
+        """Nodes of which nothing is known until they connect, by name: why, as text."""
         with translate_storage_errors(data):
             folders = sorted(path for path in (data / "nodes").glob("*") if path.is_dir())
         for folder in folders:
@@ -72,27 +76,23 @@ class NodeRegistry:
             except FileNotFoundError:
                 continue
             except DamagedFileError as error:
-                self._add_problem(
-                    f"node {folder.name}: {try_set_aside_and_describe(folder / HELLO_NAME, error)}"
-                )
+                aside = try_set_aside_and_describe(folder / HELLO_NAME, error)
+                self._problems.append(_log_problem(f"node {folder.name}: {aside}"))
                 continue
             except (FileFormatError, StorageError) as error:
-                self._add_problem(f"node {folder.name} is left out until it connects: {error}")
+                text = f"node {folder.name} is left out until it connects: {error}"
+                self._left_out[folder.name] = _log_problem(text)
                 continue
             try:
                 self._nodes[folder.name] = self._create_node(hello)
             except FootTileError as error:
-                self._add_problem(f"node {folder.name} is left out: {error}")
+                self._problems.append(_log_problem(f"node {folder.name} is left out: {error}"))
 
     @property
     def file_problems(self) -> list[str]:
         """Damage found in the files of nodes, and the consequence, as text."""
-        return self._problems + [text for node in self for text in node.file_problems]
-
-    def _add_problem(self, text: str) -> None:
-        text = escape_control_chars(text)
-        log.warning("%s", text)
-        self._problems.append(text)
+        left_out = [text for name, text in self._left_out.items() if name not in self._nodes]
+        return [*self._problems, *left_out, *(text for node in self for text in node.file_problems)]
 
     def __iter__(self) -> Iterator[ServerNode]:
         return iter(self._nodes.values())
@@ -147,6 +147,12 @@ class NodeRegistry:
         return ServerNode(self._data / "nodes" / name, self._data / "journal" / name, hello)
 
 
+def _log_problem(text: str) -> str:
+    text = escape_control_chars(text)
+    log.warning("%s", text)
+    return text
+
+
 def _read_hello(path: Path) -> Hello:
     """Read the last hello of a node.
 
@@ -157,7 +163,7 @@ def _read_hello(path: Path) -> Hello:
         StorageError: it cannot be read now.
     """
     hello = read_document(path, Hello)
-    if hello.protocol != PROTOCOL:
+    if hello.protocol not in _READABLE_PROTOCOLS:
         raise FileFormatError(
             f"written by another version, of protocol {hello.protocol}", where=str(path)
         )

@@ -95,7 +95,7 @@ export class Notes {
   draw(node, frame, nowMs, serverNowMs, problems = []) {
     const notes = [
       ...(node ? this.warnings.list(node, frame, nowMs, serverNowMs) : []),
-      ...problems.map((problem) => makeNote("damaged", sentence(`damaged on the server: ${problem}`), `damaged ${problem}`)),
+      ...problems.map((problem) => makeNote("damaged", sentence(`file problem on the server: ${problem}`), `damaged ${problem}`)),
     ];
     const items = new Map();
     for (const note of notes) {

@@ -37,7 +37,7 @@ const WARNINGS = {
   storage: {
     why: "The server cannot write to its disk. The display continues, but nothing is recorded until there is space again." },
   damaged: {
-    why: "Some files on the server's disk have changed since they were written. Damaged files are left in place, all others are served." },
+    why: "Some files on the server's disk cannot be used: they changed since they were written, or another version wrote them. They are left in place, all others are served." },
   clock: {
     why: "The node's clock has not been set since it was switched on. Time differences are correct, dates and comparisons with other instruments may be wrong." },
 };

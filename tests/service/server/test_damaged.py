@@ -169,6 +169,18 @@ def test_a_node_with_a_damaged_hello_is_unknown_until_it_connects(
     assert pending.clock() != {}
     assert running.node()["tare"] is not None
     read_checksummed_json(path)
+    assert "until it connects" not in list_problems(running)
+
+
+def test_a_hello_of_the_version_before_is_no_problem(running: Running, tared: FakeNode) -> None:
+    running.stop()
+    path = running.data / "nodes" / "bench" / "hello.json"
+    hello = json.loads(read_checksummed_json(path)) | {"protocol": 5}
+    del hello["vitals"]
+    write_checksummed_json(path, json.dumps(hello).encode())
+    running.start()
+    assert list_problems(running) == ""
+    assert running.node()["tare"] is not None
 
 
 def test_a_server_starts_beside_a_lock_and_a_probe_that_are_no_files(
