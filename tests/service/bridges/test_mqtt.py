@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import json
-import queue
 import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Iterator
 
-import aiomqtt
 import pytest
-from amqtt.broker import Broker
 
 from devices.errors import UsageError
 from service.bridges.follower import Event, LiveClock, Reporter
 from service.bridges.mqtt import MqttOutlet
+from tests.service.bridges.broker import RunningBroker
 from tests.service.fake_node import FakeNode, Play
 from tests.service.process import Start
 from tests.service.running import Running, receive_live
@@ -26,67 +23,6 @@ from tests.service.strangers import listening
 from tests.waiting import PATIENCE_S, in_a_loop, until
 
 pytestmark = pytest.mark.process
-
-
-class Received(NamedTuple):
-    """A message of the broker."""
-
-    topic: str
-    content: Any
-    is_retained: bool
-
-
-class RunningBroker:
-    """A broker in a thread, on loopback, with a client that receives all topics."""
-
-    def __init__(self) -> None:
-        self.port = 0
-        self.received: queue.Queue[Received] = queue.Queue()
-        self.start()
-
-    @property
-    def url(self) -> str:
-        return f"mqtt://127.0.0.1:{self.port}"
-
-    def start(self) -> None:
-        self._ready, self._stop = threading.Event(), threading.Event()
-        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), name="broker")
-        self._thread.start()
-        assert self._ready.wait(PATIENCE_S)
-
-    def stop(self) -> None:
-        self._stop.set()
-        self._thread.join(PATIENCE_S)
-
-    def receive(self, topic: str, is_wanted: Callable[[Any], bool] = lambda _: True) -> Received:
-        """The next message of a topic that is wanted; others are dropped."""
-        while True:
-            message = self.received.get(timeout=PATIENCE_S)
-            if message.topic == topic and is_wanted(message.content):
-                return message
-
-    async def _run(self) -> None:
-        listener = {"type": "tcp", "bind": f"127.0.0.1:{self.port}"}
-        plugins = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
-        broker = Broker({"listeners": {"default": listener}, "plugins": plugins})
-        await broker.start()
-        if not self.port:
-            (server,) = (each.instance for each in broker._servers.values())
-            self.port = server.sockets[0].getsockname()[1]
-        async with aiomqtt.Client("127.0.0.1", self.port) as client:
-            await client.subscribe("#", qos=1)
-            self._ready.set()
-            reader = asyncio.create_task(self._read(client))
-            await asyncio.to_thread(self._stop.wait)
-            reader.cancel()
-        await broker.shutdown()
-
-    async def _read(self, client: aiomqtt.Client) -> None:
-        async for message in client.messages:
-            assert isinstance(message.payload, bytes)
-            text = message.payload.decode()
-            content = json.loads(text) if text.startswith("{") else text
-            self.received.put(Received(str(message.topic), content, bool(message.retain)))
 
 
 @pytest.fixture
