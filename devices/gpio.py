@@ -1,4 +1,4 @@
-"""GPIO lines: what their errors mean, for the bus's recovery and for sync lines."""
+"""Errors of GPIO lines, for the bus's recovery and for sync lines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Vitals of a machine: disk, heat, supply, load, Wi-Fi, clock; and what to do about them.
+"""Vitals of a machine: disk, heat, supply, load, Wi-Fi, clock; and warnings with remedies.
 
 Read from Linux and, on a Raspberry Pi, from its firmware. What a machine does not state is None.
 The bits of `get_throttled` are those of the Raspberry Pi's documentation (`vcgencmd`).
@@ -12,7 +12,7 @@ import re
 import subprocess
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from pydantic import Field
 
@@ -140,7 +140,7 @@ def _read_load_per_core(root: Path) -> float | None:
 
 
 def _read_wifi_dbm(root: Path) -> float | None:
-    """Return the signal of the default route's interface; without a route, of the only one."""
+    """Return the signal of the default route's interface; without a route, of the first one."""
     signals = {}
     for line in _read(root / "proc/net/wireless").splitlines()[2:]:
         name, _, facts = line.partition(":")
@@ -156,25 +156,40 @@ def _read_wifi_dbm(root: Path) -> float | None:
 
 
 _SUPPLY = "use a 5 V 3 A supply and a short cable"
-_RULES: tuple[tuple[str, float, float, str], ...] = (
-    (
-        "recording_left_s",
-        -3600,
-        -7200,
-        "the journal's disk is full in less than an hour: free space on it",
+
+
+class _Rule(NamedTuple):
+    """Rule of a warning; between its thresholds the warning stays as it was.
+
+    Attributes:
+        name: field of `Vitals`.
+        bad: threshold of the warning.
+        good: threshold of its end: below `bad` if high values are bad, else above.
+        text: the warning.
+    """
+
+    name: str
+    bad: float
+    good: float
+    text: str
+
+
+_RULES = (
+    _Rule(
+        *("recording_left_s", 3600, 7200),
+        "the journal's disk has room for less than an hour of recording: free space on it",
     ),
-    ("cpu_celsius", 80, 75, "the CPU is at 80 °C, where a Raspberry Pi is slowed down: cool it"),
-    ("is_undervolted", 1, 0, f"the supply sags below 4.63 V: {_SUPPLY}"),
-    (
+    _Rule(
+        "cpu_celsius", 80, 75, "the CPU is at 80 °C, where a Raspberry Pi is slowed down: cool it"
+    ),
+    _Rule("is_undervolted", 1, 0, f"the supply sags below 4.63 V: {_SUPPLY}"),
+    _Rule(
         *("was_undervolted", 1, 0),
         f"the supply has sagged below 4.63 V since the machine was started: {_SUPPLY}, and restart",
     ),
-    ("is_throttled", 1, 0, f"the CPU is slowed down by heat or supply: cool it, or {_SUPPLY}"),
-    ("wifi_dbm", 75, 70, "the Wi-Fi signal is below -75 dBm: bring the access point nearer"),
+    _Rule("is_throttled", 1, 0, f"the CPU is slowed down by heat or supply: cool it, or {_SUPPLY}"),
+    _Rule("wifi_dbm", -75, -70, "the Wi-Fi signal is below -75 dBm: bring the access point nearer"),
 )
-"""Name, threshold of a warning, threshold of its end, text; values that are bad if low by their
-negative. Between the thresholds it stays as it was."""
-_NEGATIVE = ("recording_left_s", "wifi_dbm")
 
 
 class VitalsWarnings:
@@ -189,11 +204,12 @@ class VitalsWarnings:
         calm = self._calm_updates
         for name, bad, good, _ in _RULES:
             value = getattr(vitals, name)
-            level = -math.inf if value is None else -value if name in _NEGATIVE else value
-            if level >= bad:
+            sign = 1 if good < bad else -1
+            level = -math.inf if value is None else sign * value
+            if level >= sign * bad:
                 calm[name] = 0
             elif name in calm:
-                calm[name] = calm[name] + 1 if level <= good else 0
+                calm[name] = calm[name] + 1 if level <= sign * good else 0
                 if calm[name] >= _CALM_UPDATES:
                     del calm[name]
         present = calm.keys() - ({"was_undervolted"} if "is_undervolted" in calm else set())

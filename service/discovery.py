@@ -41,7 +41,7 @@ class Announcement:
         name: name of the service; a number is appended if it is taken.
         host: its host name, without `.local`, with the same number.
         port: TCP port; 0 for a node.
-        texts: its description.
+        texts: keys and values of its TXT record.
         find_addresses: returns the addresses of this machine to announce.
     """
 
@@ -62,7 +62,7 @@ class FoundService:
         host: host name.
         port: TCP port.
         addresses: addresses in networks of this machine; if there is none, all.
-        texts: its description.
+        texts: keys and values of its TXT record.
     """
 
     name: str
@@ -78,7 +78,7 @@ class FoundService:
 
     @property
     def is_tls(self) -> bool:
-        """True if the server says that it speaks TLS."""
+        """True if the server announces TLS."""
         return self.texts.get("tls") == "1"
 
     @property
@@ -242,6 +242,7 @@ class Discovery:
                 await opened.async_register_service(info)
                 self._on_announced(str(info.server).rstrip("."))
                 return
+        self._report("no name is free in this network: this machine is not announced")
 
     async def _close(self) -> None:
         opened, self._open = self._open, None

@@ -75,10 +75,10 @@ class EdgesInFlightWriter:
             if self._bytes > _FILE_BYTES_MAX:
                 self.close()
                 os.replace(self._folder / _FILE, self._folder / _OLDER_FILE)
+                self._bytes = 0
             if self._descriptor is None:
                 flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND
                 self._descriptor = os.open(self._folder / _FILE, flags, 0o666)
-                self._bytes = 0
             self._bytes += os.write(self._descriptor, content)
 
     def close(self) -> None:

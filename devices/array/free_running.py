@@ -1,7 +1,6 @@
-"""Tiles that convert by themselves: each conversion is read once, and its instant follows the part.
+"""Free-running tiles: each conversion is read once, at an instant estimated from the part's clock.
 
-Such a part stores its conversions without a time. Their number tells how its clock runs against
-ours.
+The part stores no times; the number of conversions gives the rate of its clock against ours.
 """
 
 from __future__ import annotations

@@ -128,7 +128,9 @@ def list_announced_addresses(listening: socket.socket) -> list[str]:
     """Return the addresses of a server that others in its networks can reach."""
     bound = listening.getsockname()[0]
     if is_wildcard(bound):
-        return list_addresses(include_ipv6=listening.family == socket.AF_INET6, is_real=True)
+        return list_addresses(
+            include_ipv6=listening.family == socket.AF_INET6, exclude_virtual=True
+        )
     return [] if is_loopback(bound) else [bound]
 
 
@@ -305,12 +307,12 @@ class InterfaceAddress:
         return _VIRTUAL.match(self.interface) is not None
 
 
-def list_addresses(*, include_ipv6: bool, is_real: bool = False) -> list[str]:
+def list_addresses(*, include_ipv6: bool, exclude_virtual: bool = False) -> list[str]:
     """Return the addresses of all interfaces that are up, the most useful one first.
 
     Args:
         include_ipv6: include IPv6 addresses.
-        is_real: leave out containers, virtual machines and VPNs.
+        exclude_virtual: leave out containers, virtual machines and VPNs.
     """
     families = {socket.AF_INET, socket.AF_INET6} if include_ipv6 else {socket.AF_INET}
     states = psutil.net_if_stats()
@@ -327,7 +329,9 @@ def list_addresses(*, include_ipv6: bool, is_real: bool = False) -> list[str]:
         # joins.
         if each.family in families and name in states and "up" in states[name].flags.split(",")
     ]
-    return [each.address for each in sort_addresses(found) if not (is_real and each.is_virtual)]
+    return [
+        each.address for each in sort_addresses(found) if not (exclude_virtual and each.is_virtual)
+    ]
 
 
 def sort_addresses(found: list[InterfaceAddress]) -> list[InterfaceAddress]:

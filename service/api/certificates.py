@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import ipaddress
 import ssl
-import stat
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -119,6 +118,15 @@ class OwnAuthority:
             _write_pair(self._leaf_path, key, self._sign(key, allowed, now))
         return [each for each, name in wanted.items() if name not in allowed]
 
+    def explain_outside(self, names: Iterable[str]) -> str:
+        """Return the consequence and the remedy of names that the CA may not certify."""
+        return (
+            f"the certificate does not cover {', '.join(names)}: the CA may certify only local "
+            "names and those of its first start. Use another address; or remove "
+            f"{str(self._folder / _CA_KEY_NAME)!r} and start again: then all phones and nodes "
+            "have to trust the new CA"
+        )
+
     def load(self) -> None:
         """Use the newest certificate for new connections."""
         self.context.load_cert_chain(self._leaf_path)
@@ -130,7 +138,7 @@ class OwnAuthority:
         issuer = self.certificate.extensions.get_extension_for_class(x509.SubjectKeyIdentifier)
         identifier = x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(issuer.value)
         return (
-            _begin("FootTile server", self.certificate.subject, key, now - _BACKDATED, ends)
+            _make_builder("FootTile server", self.certificate.subject, key, now - _BACKDATED, ends)
             .add_extension(x509.SubjectAlternativeName(sorted(names, key=str)), critical=False)
             .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
             .add_extension(_make_usage(digital_signature=True), critical=True)
@@ -142,16 +150,6 @@ class OwnAuthority:
 _NEW_CA = (
     "Remove this file and start again: a new CA is made, and phones and nodes have to trust it anew"
 )
-
-
-def explain_outside(names: Sequence[str], authority: OwnAuthority) -> str:
-    """Return the consequence and the remedy of names that a CA may not certify."""
-    return (
-        f"the certificate does not cover {', '.join(names)}: the CA may certify only local names "
-        "and those of its first start. Use another address; or remove "
-        f"{str(authority.ca_path.with_name(_CA_KEY_NAME))!r} and start again: all phones then "
-        "and nodes have to trust the new CA"
-    )
 
 
 def load_given_context(certificate: Path, key: Path) -> tuple[ssl.SSLContext, list[str]]:
@@ -168,7 +166,7 @@ def load_given_context(certificate: Path, key: Path) -> tuple[ssl.SSLContext, li
         content = read_bytes(certificate, bytes_max=_PEM_BYTES_MAX)
         first, *_ = x509.load_pem_x509_certificates(content)
         context.load_cert_chain(certificate, key, password=b"")
-        is_open = stat.S_IMODE(key.stat().st_mode) & 0o004
+        is_open = key.stat().st_mode & 0o004
     except (OSError, ValueError) as error:
         raise UsageError(
             f"--tls-cert {str(certificate)!r}, --tls-key {str(key)!r}: {error}", expected=expected
@@ -192,15 +190,14 @@ def _make_ca(names: Iterable[str], now: datetime) -> tuple[_Key, x509.Certificat
     permitted: list[x509.GeneralName] = [*map(x509.DNSName, _LOCAL_DOMAINS)]
     permitted += [x509.IPAddress(ipaddress.ip_network(each)) for each in _LOCAL_NETWORKS]
     for name in map(_to_general_name, names):
-        if name is None or _is_within(name, permitted):
-            continue
-        if isinstance(name, x509.IPAddress):
-            name = x509.IPAddress(ipaddress.ip_network(str(name.value)))  # noqa: PLW2901
-        permitted.append(name)
+        if name is not None and not _is_within(name, permitted):
+            is_address = isinstance(name, x509.IPAddress)
+            network = ipaddress.ip_network(str(name.value)) if is_address else None
+            permitted.append(name if network is None else x509.IPAddress(network))
     title = f"FootTile CA {now:%Y-%m-%d %H:%M}"
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, title)])
     certificate = (
-        _begin(title, subject, key, now - _BACKDATED, now + _CA_LIFE)
+        _make_builder(title, subject, key, now - _BACKDATED, now + _CA_LIFE)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(_make_usage(key_cert_sign=True), critical=True)
         .add_extension(x509.NameConstraints(permitted, None), critical=True)
@@ -219,7 +216,7 @@ def _is_within(name: x509.GeneralName, permitted: Iterable[x509.GeneralName]) ->
     return any(f".{name.value}".endswith(f".{domain}") for domain in domains)
 
 
-def _begin(
+def _make_builder(
     title: str, issuer: x509.Name, key: _Key, begins: datetime, ends: datetime
 ) -> x509.CertificateBuilder:
     """Return the parts that a CA and its certificates share."""
@@ -259,14 +256,13 @@ def _read_pair(path: Path) -> tuple[_Key, x509.Certificate]:
     try:
         key = serialization.load_pem_private_key(content, None)
         certificate = x509.load_pem_x509_certificate(content)
-        fits = isinstance(key, _Key) and key.public_key() == certificate.public_key()
+        public = certificate.public_key()
     except (ValueError, TypeError) as error:
         raise DamagedFileError(
             f"no key and certificate: {error}", where=str(path), remedy=_NEW_CA
         ) from error
-    if not fits:
+    if not isinstance(key, _Key) or key.public_key() != public:
         raise DamagedFileError("its key does not fit", where=str(path), remedy=_NEW_CA)
-    assert isinstance(key, _Key)  # noqa: S101  # `fits`
     return key, certificate
 
 

@@ -1,1 +1,1 @@
-"""Live outlets for other programs: Foxglove, LSL, MQTT, ROS 2; each a client of a server."""
+"""Live outlets for other programs: Foxglove, LSL, MQTT; each a client of a server."""

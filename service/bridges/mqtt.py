@@ -28,7 +28,7 @@ from foottile.environment import read_variable
 from service.bridges.follower import Event, LiveClock, Outlet, Reporter
 from service.protocol.codec import run_until_first_ends
 
-USER_VARIABLE, PASSWORD_VARIABLE = "FOOTTILE_MQTT_USER", "FOOTTILE_MQTT_PASSWORD"  # names
+USER_VARIABLE, PASSWORD_VARIABLE = "FOOTTILE_MQTT_USER", "FOOTTILE_MQTT_PASSWORD"
 _EVENTS_MAX = 1000
 _FAREWELL_S = 5.0
 """Timeout of the last message: without it `online` would stay, as a regular end sends no will."""
@@ -127,9 +127,13 @@ class MqttOutlet(Outlet):
                     self._unsent_states |= self._states.keys()
                     self._is_connected = True
                     try:
-                        await run_until_first_ends(self._publish(client), _watch(client))
+                        await run_until_first_ends(
+                            self._publish(client), _wait_for_disconnect(client)
+                        )
                     except asyncio.CancelledError:  # a regular end sends no last will
-                        await client.publish(*self._bridge("offline"), timeout=_FAREWELL_S)
+                        await client.publish(
+                            *self._make_bridge_message("offline"), timeout=_FAREWELL_S
+                        )
                         raise
             except aiomqtt.MqttError as error:
                 if (task := asyncio.current_task()) is not None and task.cancelling():
@@ -140,7 +144,7 @@ class MqttOutlet(Outlet):
             await asyncio.sleep(_RETRY_S)
 
     async def _publish(self, client: aiomqtt.Client) -> None:
-        await client.publish(*self._bridge("online"))
+        await client.publish(*self._make_bridge_message("online"))
         while True:
             while self._unsent_states:
                 topic = self._unsent_states.pop()  # before: it may change meanwhile
@@ -156,14 +160,14 @@ class MqttOutlet(Outlet):
             if not (self._unsent_states or self._events or self._summaries):
                 await self._has_pending.wait()
 
-    def _bridge(self, state: str) -> tuple[str, str, int, bool]:
+    def _make_bridge_message(self, state: str) -> tuple[str, str, int, bool]:
         return f"{self._topic}/bridge", state, _AT_LEAST_ONCE, True
 
     def _make_topic(self, node: str, kind: str) -> str:
         return f"{self._topic}/{re.sub('[+#/$]', '_', node)}/{kind}"
 
 
-async def _watch(client: aiomqtt.Client) -> None:
+async def _wait_for_disconnect(client: aiomqtt.Client) -> None:
     """Wait until the broker disconnects, which raises an error."""
     async for _ in client.messages:
         pass

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import socket
 import ssl
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -42,11 +42,13 @@ class ServerTls:
         context: context of the server.
         ca_path: certificate that a client of this user trusts.
         authority: the server's own CA; None: the certificate was given.
+        uncovered_names: names of the machine that its certificate does not cover.
     """
 
     context: ssl.SSLContext
     ca_path: Path
     authority: OwnAuthority | None = None
+    uncovered_names: Sequence[str] = ()
 
 
 def open_tls(settings: Settings) -> ServerTls | None:
@@ -67,8 +69,11 @@ def open_tls(settings: Settings) -> ServerTls | None:
         return ServerTls(context, settings.tls_cert)
     names, now = _list_names(settings), datetime.now(UTC)
     authority = OwnAuthority(settings.data, names, now)
-    _load_and_explain(authority, authority.certify(names, now))
-    return ServerTls(authority.context, authority.ca_path, authority)
+    outside = authority.certify(names, now)
+    authority.load()
+    if outside:
+        remark(authority.explain_outside(outside))
+    return ServerTls(authority.context, authority.ca_path, authority, outside)
 
 
 def _list_names(settings: Settings) -> list[str]:
@@ -78,14 +83,6 @@ def _list_names(settings: Settings) -> list[str]:
     if settings.advertise is not None:
         names.append(get_host(parse_advertised_url(settings.advertise, port=1)))
     return names if is_wildcard(settings.host) else [*names, settings.host]
-
-
-def _load_and_explain(authority: OwnAuthority, outside: list[str]) -> None:
-    from service.api.certificates import explain_outside
-
-    authority.load()
-    if outside:
-        remark(explain_outside(outside, authority))
 
 
 @asynccontextmanager
@@ -119,7 +116,9 @@ async def hand_out_ca(
             remark(f"a node trusts it by --ca and a copy of {authority.ca_path}")
             if is_reachable(url):
                 show_qr_code(url, purpose="for a phone, once, before it opens the page")
-            renewing = asyncio.create_task(_renew_forever(authority, settings, list_announced))
+            renewing = asyncio.create_task(
+                _renew_forever(authority, settings, list_announced, tls.uncovered_names)
+            )
             try:
                 yield
             finally:
@@ -136,7 +135,10 @@ def _open_next(host: str, port: int) -> socket.socket:
 
 
 async def _renew_forever(
-    authority: OwnAuthority, settings: Settings, list_announced: Callable[[], list[str]]
+    authority: OwnAuthority,
+    settings: Settings,
+    list_announced: Callable[[], list[str]],
+    remarked_names: Sequence[str],
 ) -> None:
     """Renew the certificate when the names of the machine change, and when it ends."""
     before: tuple[list[str], int] | None = None
@@ -148,8 +150,10 @@ async def _renew_forever(
             current = ([*_list_names(settings), *list_announced()], now.toordinal())
             if current != before:
                 outside = await asyncio.to_thread(authority.certify, current[0], now)
-                _load_and_explain(authority, outside)
-                before = current
+                authority.load()
+                if outside and outside != remarked_names:
+                    remark(authority.explain_outside(outside))
+                before, remarked_names = current, outside
         except Exception as error:  # a bug, too: it is tried again
             if (what := f"the certificate is not renewed: {str(error) or repr(error)}") != reported:
                 remark(what)

@@ -1,8 +1,8 @@
 """Finder of a node's server, where no address is given.
 
 A server of this user on this machine comes first, then the servers that announce themselves in the
-network. Any machine there may announce one: a server that shares a secret with the node wins, and
-of several others a person chooses.
+network. Any machine there may announce one: a server with the id of one that shares a secret with
+the node wins, although the id is not proven, and of several others a person chooses.
 """
 
 from __future__ import annotations

@@ -406,7 +406,7 @@ class Rig:
         return found
 
     def get_fault_counts(self) -> dict[str, dict[str, int]]:
-        """Return the fault counts of the stream, by serial and reason."""
+        """Return the fault counts of the stream by serial, `sync` for the sync line, and reason."""
         array = self._ready.array
         dropped = 0 if self._sync is None else self._sync.dropped_edges
         return ({"sync": {"dropped_edges": dropped}} if dropped else {}) | {

@@ -45,7 +45,7 @@ log = logging.getLogger("foottile.nodes")
 _NODES_MAX = 1000
 """Limit on node names, so that ever new names fill neither memory nor disk."""
 _READABLE_PROTOCOLS = (5, PROTOCOL)
-"""Protocols of a stored hello that can be read: 6 only adds vitals, and an update is no damage."""
+"""Protocols of a stored hello that can be read: 6 differs from 5 only by vitals."""
 _NODE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,63}")
 
 

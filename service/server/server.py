@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -317,6 +317,13 @@ class Server:
             with self._isolate_errors(f"node {node.name}, its view"):
                 self.broadcaster.queue_notice(NodeChanged(node=self.make_node_view(node)))
 
+    def notify_nodes_changed(self, sessions: Iterable[Session]) -> None:
+        """Send the present state of the nodes of sessions to all subscribers."""
+        for session in sessions:
+            node = self.nodes.find(session.node)  # its folder may be gone
+            if node is not None:
+                self.notify_node_changed(node)
+
     def _update_retention(self, link: NodeLink) -> None:
         """Notify a node if its retention request has changed."""
         with self._isolate_errors(f"node {link.node.name}, retention request"):
@@ -364,15 +371,10 @@ class Server:
             with self._isolate_errors(f"session {session.id}, its view"):
                 view = make_session_view(session, self.recorder)
                 self.broadcaster.queue_notice(SessionChanged(session=view))
-                if self.trials.is_in_list(session):
-                    self._notify_trials_changed()
 
     def _notify_trials_changed(self, sessions: Sequence[Session] = ()) -> None:
         """Send the list of trials, and the nodes of started or stopped sessions, to subscribers."""
-        for session in sessions:
-            node = self.nodes.find(session.node)
-            if node is not None:
-                self.notify_node_changed(node)
+        self.notify_nodes_changed(sessions)
         if self.broadcaster.subscriber_count:
             with self._isolate_errors("list of trials, its view"):
                 view = self.trials.make_view()
@@ -393,6 +395,7 @@ class Server:
         )
         for session in self.sessions.list_unsealed():
             self._notify_session_changed(session)
+        self._notify_trials_changed()  # their states are those of their sessions
 
     async def _sync_node(self, node: ServerNode) -> None:
         """Sync a node's journals to disk, then acknowledge the frames in them."""

@@ -7,9 +7,9 @@ a restart; that the server waits for a contact does not.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import AfterValidator, Field, StringConstraints, ValidationError
@@ -130,7 +130,7 @@ class TrialRecorder:
     Args:
         path: file of the list.
         takes: starts and stops the takes.
-        recorder: knows the sessions' ledgers.
+        recorder: computes the sessions' ledgers.
         store: all sessions.
         nodes: all nodes.
         on_change: called after a change, with the sessions that were started or stopped.
@@ -198,11 +198,13 @@ class TrialRecorder:
         self._save(trials=rows, next_index=place)
         self._on_change(())
 
-    def change(self, changes: dict[str, object]) -> None:
-        """Change settings or the place, and stop waiting for a contact.
+    def change(self, changes: Mapping[str, Any]) -> None:
+        """Change settings or the place.
+
+        `is_armed`, or `start_at_contact` false, also ends the waiting for a contact.
 
         Args:
-            changes: values by field of the stored list; `is_armed`: do not wait any longer.
+            changes: values by field of the stored list, or `is_armed`.
 
         Raises:
             UnknownError: the node does not exist.
@@ -211,7 +213,7 @@ class TrialRecorder:
         """
         if isinstance(node := changes.get("node"), str):
             self._nodes.get(node)
-        if int(str(changes.get("next_index", 0))) > len(self._list.trials):
+        if changes.get("next_index", 0) > len(self._list.trials):
             raise UsageError(
                 f"there is no row {changes['next_index']}",
                 expected=f"0 to {len(self._list.trials)}",
@@ -232,11 +234,12 @@ class TrialRecorder:
             return
         self._check_can_record()
         self._problem = None
-        if not self._list.start_at_contact:
-            return self._start(0.0, request)
-        self._is_armed, self._armed_by = True, request
-        self._contacts.clear()
-        return self._on_change(())
+        if self._list.start_at_contact:
+            self._is_armed, self._armed_by = True, request
+            self._contacts.clear()
+            self._on_change(())
+        else:
+            self._start(0.0, request)
 
     def start_at_contact(self, node: ServerNode, batches: Sequence[EstimatedBatch]) -> None:
         """Start the next row if it waits for a contact and one begins in these frames."""
@@ -272,10 +275,10 @@ class TrialRecorder:
     def make_view(self) -> TrialsView:
         """Return the present list, for answers and subscribers."""
         stored = self._list
-        wanted = {row.takes[-1]: i for i, row in enumerate(stored.trials) if row.takes}
+        row_by_take = {row.takes[-1]: i for i, row in enumerate(stored.trials) if row.takes}
         sessions: dict[int, list[Session]] = {}
-        for session in self._store.iterate_newest_first() if wanted else ():
-            if (i := wanted.get(session.take or "")) is not None:
+        for session in self._store.iterate_newest_first() if row_by_take else ():
+            if (i := row_by_take.get(session.take or "")) is not None:
                 sessions.setdefault(i, []).append(session)
         running = self._list_running()
         return TrialsView(
@@ -286,7 +289,7 @@ class TrialRecorder:
             **stored.model_dump(include={"next_index", "node", "start_at_contact", "stop_after_s"}),
             text=format_trials(stored.trials),
             next_name=self._next_name,
-            last_index=wanted.get(stored.take or ""),
+            last_index=row_by_take.get(stored.take or ""),
             is_armed=self._is_armed,
             take=stored.take if running else None,
             running_name=running[0].name if running else None,

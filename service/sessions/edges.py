@@ -1,7 +1,7 @@
 """Edges of a node's sync line as markers of its sessions.
 
-A session has every edge from its first to its last frame. The frames' journal has the edges, so a
-sealed session has each once, whatever was sent twice or was down meanwhile.
+A session has its first 10,000 edges between its first and last frame. They come from the journal of
+the frames, so each occurs once after resends and restarts.
 """
 
 from __future__ import annotations

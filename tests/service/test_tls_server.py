@@ -166,12 +166,46 @@ async def test_a_failed_renewal_is_said_once_and_tried_again(
     monkeypatch.setattr(server_tls, "remark", said.append)
     authority = OwnAuthority(tmp_path, ["localhost"], datetime.now(UTC))
     settings = load_settings(None, tls=True, data=tmp_path)
-    renewing = asyncio.create_task(server_tls._renew_forever(authority, settings, list_announced))
+    renewing = asyncio.create_task(
+        server_tls._renew_forever(authority, settings, list_announced, ())
+    )
     while asked < 3 and not renewing.done():
         await asyncio.sleep(0.01)
     renewing.cancel()
     assert asked >= 3
     assert len(said) == 1
+
+
+@in_a_loop
+async def test_names_that_the_certificate_does_not_cover_are_said_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    announced = ["robot.example.org"]
+    monkeypatch.setattr(server_tls, "_RENEWAL_PERIOD_S", 0.0)
+    monkeypatch.setattr(server_tls, "remark", said.append)
+    authority = OwnAuthority(tmp_path, ["localhost"], datetime.now(UTC))
+    settings = load_settings(None, tls=True, data=tmp_path)
+    names = [*server_tls._list_names(settings), *announced]
+    uncovered = authority.certify(names, datetime.now(UTC))
+    asked: list[None] = []
+
+    def list_announced() -> list[str]:
+        asked.append(None)
+        return announced
+
+    renewing = asyncio.create_task(
+        server_tls._renew_forever(authority, settings, list_announced, uncovered)
+    )
+    while len(asked) < 3:
+        await asyncio.sleep(0.01)
+    assert not said
+    announced = ["leg.example.org"]
+    while not said:
+        await asyncio.sleep(0.01)
+    assert "leg.example.org" in said[0]
+    renewing.cancel()
+    await asyncio.gather(renewing, return_exceptions=True)
 
 
 @pytest.mark.process

@@ -12,7 +12,10 @@ export function openTrials(trials) {
   const said = el("p", { id: "trials-said", role: "alert" });
   const text = el("textarea", { id: "trials-text", rows: 5, cls: "requires-operator", "aria-label": "List as text: a trial a line, name; tag, tag", placeholder: "mud 1; wet, deep\nmud 2, mud 3, plate 1" });
   const file = el("input", { type: "file", accept: ".txt,.csv,text/plain", "aria-label": "List from a file" });
-  file.addEventListener("change", async () => { text.value = await file.files[0].text(); });
+  file.addEventListener("change", async () => {
+    const [chosen] = file.files ?? [];
+    if (chosen) text.value = await chosen.text();
+  });
   const use = el("button", { type: "button", id: "trials-use", text: "Use this list" });
   use.addEventListener("click", () => tell(async () => {
     const list = await api.setTrials(text.value);

@@ -118,7 +118,7 @@ class _ServerCollector(Collector):
         )
         faults = CounterMetricFamily(
             "foottile_node_tile_faults",
-            "Faulty readings of a tile, by reason.",
+            "Faulty readings of a tile, or dropped edges of `sync`, by reason.",
             labels=["node", "tile", "reason"],
         )
         for node in nodes:

@@ -31,10 +31,11 @@ def find_command(as_json: JsonOption = False) -> None:
     nodes = [asdict(each) for each in found[NODES]]
     if as_json:
         print_json({"servers": servers, "nodes": nodes})
-    for each in [] if as_json else [*servers, *nodes]:
-        name = each["host"] if "urls" in each else f"node {each['name']}"
-        where = " ".join(each.get("urls") or each["addresses"])
-        echo(f"{name}: {where} ({', '.join(each['texts'].get(k, '') for k in _SHOWN)})")
+    else:
+        for each in [*servers, *nodes]:
+            name = each["host"] if "urls" in each else f"node {each['name']}"
+            where = " ".join(each.get("urls") or each["addresses"])
+            echo(f"{name}: {where} ({', '.join(each['texts'].get(k, '') for k in _SHOWN)})")
     if not (servers or nodes):
         remark("no server and no node announces itself in this network")
         raise typer.Exit(1)

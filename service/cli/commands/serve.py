@@ -186,30 +186,28 @@ async def _serve(
     context = tls.context if tls is not None else None
     async with serve_app(app, listening, settings, context), AsyncExitStack() as stack:
         freeze_garbage_collector()
-        is_stored = not settings.token
-        print_addresses(urls, settings.data, logins, is_stored=is_stored, is_demo=is_demo)
-        remark_unreachable(urls, settings.host)
+        # First what a phone needs first: a login is good for some minutes only.
         await stack.enter_async_context(
             hand_out_ca(tls, settings, listening, lambda: [get_host(url) for url in announced])
         )
+        is_stored = not settings.token
+        print_addresses(urls, settings.data, logins, is_stored=is_stored, is_demo=is_demo)
+        remark_unreachable(urls, settings.host)
         if not is_loopback(listening.getsockname()[0]):
-            discovery = _make_discovery(server.id, listening, on_announced, is_tls=tls is not None)
+            discovery = _make_discovery(listening_server, on_announced)
             await stack.enter_async_context(discovery)
         yield server
 
 
 def _make_discovery(
-    server_id: str,
-    listening: socket.socket,
-    on_announced: Callable[[str], None],
-    *,
-    is_tls: bool,
+    listening_server: _ListeningServer, on_announced: Callable[[str], None]
 ) -> Discovery:
     """Return the discovery that announces a server."""
     from service.api.address import list_announced_addresses
     from service.discovery import SERVER_HOST, SERVERS, Announcement, Discovery
 
-    texts = {"id": server_id, "tls": str(int(is_tls))}
+    server, listening, *_, tls = listening_server
+    texts = {"id": server.id, "tls": str(int(tls is not None))}
     texts |= {"version": SOFTWARE_VERSION, "machine": gethostname()}
     port, find_addresses = listening.getsockname()[1], partial(list_announced_addresses, listening)
     announcement = Announcement(SERVERS, SERVER_HOST, SERVER_HOST, port, texts, find_addresses)

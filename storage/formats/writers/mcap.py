@@ -126,9 +126,8 @@ def find_drawn_rows(t_ns: Array, last_turn: int) -> tuple[Array, int]:
         last_turn: turn of the last frame before them.
     """
     turns = t_ns // DRAWING_INTERVAL_NS
-    return np.flatnonzero(np.diff(turns, prepend=last_turn)), int(turns[-1]) if len(
-        turns
-    ) else last_turn
+    rows = np.flatnonzero(np.diff(turns, prepend=last_turn))
+    return rows, int(turns[-1]) if len(turns) else last_turn
 
 
 _CHUNK_BYTES = 1 << 20

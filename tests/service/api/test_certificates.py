@@ -16,7 +16,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from devices.errors import DamagedFileError, UsageError
 from foottile.connection import make_context, make_local_context
-from service.api.certificates import OwnAuthority, explain_outside, load_given_context
+from service.api.certificates import OwnAuthority, load_given_context
 from storage.permissions import set_umask_and_create_private_folder
 
 NAMES = ["foottile.local", "laptop", "localhost", "192.168.4.1", "fe80::1%eth0", "::1"]
@@ -88,7 +88,7 @@ def test_a_thief_of_the_key_cannot_pretend_to_be_another_site(
     from cryptography.hazmat.primitives import serialization
 
     private = serialization.load_pem_private_key(key, None)
-    forged = authority._sign(private, [name], NOW)  # type: ignore[arg-type]
+    forged = authority._sign(private, [name], NOW)  # type: ignore[arg-type]  # any key can be loaded
     pem = forged.public_bytes(serialization.Encoding.PEM)
     (data / "tls" / "server.pem").write_bytes(key + pem)
     authority.load()
@@ -156,7 +156,7 @@ def test_a_name_beyond_the_constraints_is_left_out_and_explained(data: Path) -> 
     authority = make(data)
     outside = authority.certify([*NAMES, "robot.example.org", "203.0.113.5", "schlüssel"], NOW)
     assert outside == ["robot.example.org", "203.0.113.5", "schlüssel"]
-    text = explain_outside(outside, authority)
+    text = authority.explain_outside(outside)
     assert "203.0.113.5" in text
     assert str(data / "tls" / "ca.pem") in text
     (data / "tls" / "ca.pem").unlink()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 from websockets.asyncio.server import ServerConnection, serve
@@ -27,7 +27,7 @@ class Events(Outlet):
 class Source:
     """A server of one session, which a test changes; it counts requests for markers."""
 
-    headers: dict[str, str] = {}  # noqa: RUF012
+    headers: ClassVar[dict[str, str]] = {}
     context = None
 
     def __init__(self) -> None:

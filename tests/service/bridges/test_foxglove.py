@@ -108,7 +108,7 @@ def test_a_node_that_comes_back_with_more_tiles_has_new_topics_in_place_of_the_o
 
 
 def fields(message: object) -> list[str]:
-    return [field.name for field in message.DESCRIPTOR.fields]  # type: ignore[attr-defined]
+    return [field.name for field in message.DESCRIPTOR.fields]  # type: ignore[attr-defined]  # of protobuf
 
 
 @pytest.mark.slow

@@ -142,7 +142,7 @@ class SlowClient:
 async def test_what_changes_while_the_broker_is_slow_is_published_after_it() -> None:
     outlet, client = make_outlet("mqtt://127.0.0.1:1", []), SlowClient()
     outlet.write_node("left", None)
-    publishing = asyncio.create_task(outlet._publish(client))  # type: ignore[arg-type]
+    publishing = asyncio.create_task(outlet._publish(client))  # type: ignore[arg-type]  # a SlowClient
     while len(client.published) < 2:
         await asyncio.sleep(0)
     outlet._states.clear()
@@ -160,7 +160,7 @@ async def test_what_changes_while_the_broker_is_slow_is_published_after_it() -> 
 async def test_an_event_waits_for_the_next_connection_until_it_is_acknowledged() -> None:
     outlet, client = make_outlet("mqtt://127.0.0.1:1", []), SlowClient()
     outlet.write_event(Event("marker", "left", "s", "stone", 1), LiveClock())
-    publishing = asyncio.create_task(outlet._publish(client))  # type: ignore[arg-type]
+    publishing = asyncio.create_task(outlet._publish(client))  # type: ignore[arg-type]  # a SlowClient
     while len(client.published) < 2:
         await asyncio.sleep(0)
     publishing.cancel()

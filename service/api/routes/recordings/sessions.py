@@ -162,9 +162,8 @@ async def stop_session(session_id: str, server: ServerState) -> SessionView:
     session is `pending`, and completes when the node is back.
     """
     session = server.recorder.stop_session(session_id)
+    server.notify_nodes_changed([session])
     node = server.nodes.find(session.node)  # its folder may be gone
-    if node is not None:
-        server.notify_node_changed(node)
     if node is not None and node.is_connected:
         session = await server.recorder.wait_until_sealed_or_timeout(session_id, SEAL_TIMEOUT_S)
     return make_session_view(session, server.recorder)

@@ -97,7 +97,7 @@ async def start_take(
         tags=body.tags,
         request=make_idempotency_record(idempotency_key, "take", body),
     )
-    _notify_nodes_changed(server, take)
+    server.notify_nodes_changed(take.sessions)
     response.headers["Location"] = f"/api/v1/takes/{take.id}"
     return TakeView.from_take(take, server)
 
@@ -117,7 +117,7 @@ async def stop_take(take_id: str, server: ServerState) -> TakeView:
     Stopped ones are unchanged, and are in the answer, too.
     """
     take = server.takes.stop_take(take_id)
-    _notify_nodes_changed(server, take)
+    server.notify_nodes_changed(take.sessions)
     connected = [node.name for node in server.nodes if node.is_connected]
     settled = [
         server.recorder.wait_until_sealed_or_timeout(session.id, one.SEAL_TIMEOUT_S)
@@ -141,13 +141,6 @@ async def mark_take(take_id: str, body: one.AddMarker, server: ServerState) -> T
         server.takes.add_marker_to_recording_sessions(take_id, body.label, body.t_ns, body.id),
         server,
     )
-
-
-def _notify_nodes_changed(server: Server, take: Take) -> None:
-    for session in take.sessions:
-        node = server.nodes.find(session.node)  # its folder may be gone
-        if node is not None:
-            server.notify_node_changed(node)
 
 
 data_router = APIRouter(prefix="/takes", tags=["data"])

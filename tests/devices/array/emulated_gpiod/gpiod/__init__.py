@@ -4,6 +4,7 @@ All names are the library's own but `request_lines`. A chip is a folder; an inpu
 with records as `tests.devices.array.gpio_chip` writes them; an output line a file with 0 or 1.
 """
 
+# Names of the library, which is executed below, are known to no checker.
 # ruff: noqa: F821
 # mypy: ignore-errors
 
@@ -18,7 +19,7 @@ _spec = importlib.machinery.PathFinder.find_spec(
     "gpiod", [p for p in sys.path if Path(p or ".").resolve() != Path(__file__).parents[1]]
 )
 __path__ = list(_spec.submodule_search_locations)
-exec(compile(Path(_spec.origin).read_text(), _spec.origin, "exec"))  # noqa: S102
+exec(compile(Path(_spec.origin).read_text(), _spec.origin, "exec"))  # noqa: S102  # the installed library
 
 RECORD = struct.Struct("<qIB")
 
