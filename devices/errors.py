@@ -79,7 +79,7 @@ def escape_control_chars(text: str, *, keep_line_breaks: bool = False) -> str:
 
 Extra = Literal[
     "server", "client", "emulation", "discovery", "tls", "plot",
-    "gpio", "rig", "archive", "mocap", "mcap", "bridges",
+    "gpio", "rig", "archive", "mocap", "mcap", "bridges", "video",
 ]  # fmt: skip  # two lines, not twelve
 
 OUR_PACKAGES = ("devices", "storage", "service", "studies", "foottile")

@@ -1,0 +1,191 @@
+"""Film in a file: its time stamps and pictures, read by PyAV.
+
+Times are those of the container: presentation stamps, after edit lists, in rising order, whatever
+the order in the file (B-frames). A picture's time is the begin of its display; cameras write the
+end or the middle of its exposure there, which the alignment cannot tell apart from its offset.
+
+A high-speed film that plays slowly states its capture rate in a tag of some cameras, else the user
+does: stamps are then shortened by play rate / capture rate.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.arrays import Floats
+from devices.errors import FileFormatError, UsageError, require_extra
+from storage.sessions.videos import FilmInfo
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
+    from av.video.stream import VideoStream
+
+Picture = npt.NDArray[np.uint8]
+"""Grey picture (height, width), or colours (height, width, 3) in the order blue, green, red."""
+
+_CAPTURE_RATE_TAGS = ("com.android.capture.fps",)
+"""Tags with the rate of a film that plays slower than it was taken."""
+_CAPTURE_RATES_HZ = (1.0, 1e6)
+_VARIABLE_BEYOND = 0.2
+"""A film's rate is variable if an interval differs by more than this part of their median."""
+_PIXELS_MAX = 8192 * 8192
+
+
+def read_film(path: Path, capture_rate_hz: float | None = None) -> tuple[FilmInfo, Floats]:
+    """Read what a film is, and the time of each picture in s from the first; nothing is decoded.
+
+    Args:
+        path: the film.
+        capture_rate_hz: rate at which it was taken, if the file does not say it.
+
+    Raises:
+        FileFormatError: the file is no film, or has no pictures.
+        UsageError: the rate is impossible.
+    """
+    with _open_container(path) as (container, stream):
+        times_s = _read_stamps(container, stream, path)
+        tagged = _find_capture_rate_hz(container, stream)
+        rotation_deg = _read_rotation_deg(path)
+        sideways = rotation_deg % 180 != 0
+        width, height = stream.codec_context.width, stream.codec_context.height
+        codec = stream.codec_context.name
+    intervals_s = np.diff(times_s)
+    play_rate_hz = 1.0 / float(np.median(intervals_s)) if len(intervals_s) else 0.0
+    captured_hz = capture_rate_hz or tagged
+    if captured_hz is not None:
+        low, high = _CAPTURE_RATES_HZ
+        if not (low <= captured_hz <= high) or not play_rate_hz:
+            raise UsageError(
+                f"{path} cannot have been taken at {captured_hz:g} pictures/s",
+                expected=f"a rate between {low:g} and {high:g}, and at least two pictures",
+            )
+        times_s = times_s * (play_rate_hz / captured_hz)
+        intervals_s = np.diff(times_s)
+    rate_hz = 1.0 / float(np.median(intervals_s)) if len(intervals_s) else 0.0
+    uneven = np.abs(intervals_s * rate_hz - 1.0) > _VARIABLE_BEYOND
+    return FilmInfo(
+        codec=codec,
+        width_px=height if sideways else width,
+        height_px=width if sideways else height,
+        rotation_deg=rotation_deg,
+        picture_count=len(times_s),
+        duration_s=float(times_s[-1]),
+        rate_hz=rate_hz,
+        is_variable=bool(uneven.any()),
+        capture_rate_hz=captured_hz,
+    ), times_s
+
+
+def iterate_pictures(
+    path: Path, *, is_grey: bool, begin: int = 0, end: int | None = None
+) -> Iterator[tuple[int, Picture]]:
+    """Yield pictures of a film, turned upright, with their index in order of time.
+
+    Args:
+        path: the film.
+        is_grey: True: brightness only.
+        begin: index of the first picture; decoding begins at the key picture before it.
+        end: index after the last one; None: the film's end.
+
+    Raises:
+        FileFormatError: the file is no film, or is damaged; pictures before are yielded.
+    """
+    import av
+
+    with _open_container(path) as (container, stream):
+        stamps = np.sort(_list_packet_stamps(container, stream))
+        end = len(stamps) if end is None else min(end, len(stamps))
+        if begin >= end:
+            return
+        first, last = int(stamps[begin]), int(stamps[end - 1])
+        container.seek(first, stream=stream, backward=True)
+        pixel_format = "gray" if is_grey else "bgr24"
+        shown = -1
+        try:
+            for frame in container.decode(stream):
+                if frame.pts is None or frame.pts < first:
+                    continue
+                if frame.pts > last:
+                    return
+                shown = int(np.searchsorted(stamps, frame.pts))
+                picture: Picture = frame.to_ndarray(format=pixel_format)
+                yield shown, np.rot90(picture, round(frame.rotation / 90) % 4)
+        except av.error.FFmpegError as error:
+            raise FileFormatError(
+                f"the film breaks off after picture {shown}: {error.strerror}",
+                where=str(path),
+                remedy="Copy the file from the camera again",
+            ) from error
+
+
+@contextmanager
+def _open_container(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
+    with require_extra("video", "a film"):
+        import av
+    # PyAV would open addresses, and playlists that name other files.
+    if not path.is_file():
+        raise FileFormatError("no such file", where=str(path), expected="a film")
+    try:
+        with path.open("rb") as file, av.open(file, metadata_errors="replace") as container:
+            if not container.streams.video:
+                raise FileFormatError("the file has no pictures", where=str(path))
+            stream = container.streams.video[0]
+            if stream.codec_context is None:  # a drawing, or a codec that is not there
+                raise FileFormatError("its pictures cannot be decoded", where=str(path))
+            if stream.codec_context.width * stream.codec_context.height > _PIXELS_MAX:
+                raise FileFormatError("its pictures are too large", where=str(path))
+            stream.thread_type = "AUTO"
+            yield container, stream
+    except (av.error.FFmpegError, OSError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise FileFormatError(
+            f"the file cannot be read as a film: {why}",
+            where=str(path),
+            expected="MP4, MOV, WebM, MKV or AVI",
+            remedy="Play it, or copy it from the camera again",
+        ) from error
+
+
+def _list_packet_stamps(container: InputContainer, stream: VideoStream) -> npt.NDArray[np.int64]:
+    found = [
+        packet.dts if packet.pts is None else packet.pts  # AVI has no order but that of decoding
+        for packet in container.demux(stream)
+        if not packet.is_discard and packet.size
+    ]
+    return np.array([stamp for stamp in found if stamp is not None], dtype=np.int64)
+
+
+def _read_stamps(container: InputContainer, stream: VideoStream, path: Path) -> Floats:
+    stamps = np.unique(_list_packet_stamps(container, stream))
+    if not len(stamps):
+        raise FileFormatError("the film has no picture with a time", where=str(path))
+    base = stream.time_base or Fraction(1, 1)
+    return np.asarray((stamps - stamps[0]) * float(base))
+
+
+def _find_capture_rate_hz(container: InputContainer, stream: VideoStream) -> float | None:
+    tags: dict[str, Any] = {**container.metadata, **stream.metadata}
+    for name in _CAPTURE_RATE_TAGS:
+        try:
+            rate_hz = float(tags[name])
+        except (KeyError, ValueError):
+            continue
+        if math.isfinite(rate_hz) and rate_hz > 0:
+            return rate_hz
+    return None
+
+
+def _read_rotation_deg(path: Path) -> int:
+    """Return the rotation of the first picture: it stands in no place before it is decoded."""
+    with _open_container(path) as (container, stream):
+        for frame in container.decode(stream):
+            return round(frame.rotation / 90) * 90 % 360
+    return 0

@@ -1,0 +1,297 @@
+"""Angle of the foot's segment in a film, from two markers along it.
+
+Markers are ArUco tags (4x4, of which any two pairs of numbers may be on the leg), or dots: bright
+ones, as of retro-reflective tape, or of a colour. The angle is that of the line from the lower to
+the upper marker against the picture's upright, positive as the foot rolls forward, and 0 where the
+user says: a camera is seldom level. It is known in the picture's plane; a camera that looks
+obliquely by `a` turns it by up to (1 / cos a - 1) of its sine.
+
+The uncertainty is measured on the film itself: what is left of each position after a parabola
+through its neighbours is noise of the detection (and motion faster than the film shows, which
+makes it greater, never less). A picture in which a marker is hidden has no angle.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from devices.arrays import Floats
+from devices.errors import FileFormatError, UsageError
+from service.video.container import Picture, iterate_pictures
+
+_TAG_SEARCH = 4.0
+"""Where a tag is looked for: its last place, and this many times its size around it."""
+_DOT_AREA_PX = (6.0, 0.02)
+"""Area of a dot: at least so many pixels, at most this part of the picture."""
+_DOT_ROUNDNESS = 0.6
+"""Least ratio of a dot's area to that of the circle around it."""
+_WINDOW = 7
+"""Pictures of the parabola that measures the noise."""
+_SIGMA_MIN_PX = 0.03
+"""Least uncertainty of a marker's place: no detection is better on real pictures."""
+_COLOURS_HUE = {"red": 0, "orange": 12, "yellow": 28, "green": 60, "blue": 112, "magenta": 150}
+"""Hues in OpenCV's half degrees."""
+_HUE_WITHIN = 11
+_SATURATION_MIN = 90
+_VALUE_MIN = 70
+_BRIGHT_MIN = 200
+_BOARDS_MIN = 5
+
+
+class Lens(NamedTuple):
+    """Camera matrix (3, 3) and distortion coefficients of OpenCV's model."""
+
+    matrix: Floats
+    distortion: Floats
+
+
+class Track(NamedTuple):
+    """Markers and angle of each picture; NaN where a marker is hidden.
+
+    Attributes:
+        lower_px: (pictures, 2), x to the right and y down.
+        upper_px: (pictures, 2).
+        angle_rad: (pictures,).
+        sigma_rad: (pictures,), standard deviation.
+    """
+
+    lower_px: Floats
+    upper_px: Floats
+    angle_rad: Floats
+    sigma_rad: Floats
+
+
+FindMarkers = Callable[[Picture], Floats | None]
+"""Finds both markers in a picture: (2, 2), the lower one first; None if not both are seen."""
+
+
+def track_angle(
+    path: Path,
+    picture_count: int,
+    find_markers: FindMarkers,
+    *,
+    is_grey: bool,
+    forward_is_right: bool = True,
+    zero_rad: float = 0.0,
+    lens: Lens | None = None,
+    on_picture: Callable[[int], None] = lambda _: None,
+) -> Track:
+    """Track the markers through a film.
+
+    Args:
+        path: the film.
+        picture_count: number of its pictures.
+        find_markers: finds them in a picture.
+        is_grey: whether it takes grey pictures.
+        forward_is_right: True if the foot rolls forward to the right.
+        zero_rad: angle in the picture at which the segment's is 0.
+        lens: of the camera, by a checkerboard.
+        on_picture: called with the number of each picture.
+
+    Raises:
+        FileFormatError: the film is damaged, or no picture shows both markers.
+    """
+    places_px = np.full((picture_count, 2, 2), math.nan)
+    for index, picture in iterate_pictures(path, is_grey=is_grey):
+        found = find_markers(picture)
+        if found is not None and index < picture_count:
+            places_px[index] = found
+        on_picture(index)
+    if np.isnan(places_px).all():
+        raise FileFormatError(
+            "no picture shows both markers",
+            where=str(path),
+            remedy="Look at the film: tags need a white border, and 5 pixels a square",
+        )
+    if lens is not None:
+        places_px = _undistort(places_px, lens)
+    return compute_track(places_px, forward_is_right=forward_is_right, zero_rad=zero_rad)
+
+
+def compute_track(
+    places_px: Floats, *, forward_is_right: bool = True, zero_rad: float = 0.0
+) -> Track:
+    """Compute the angle from the places of both markers, (pictures, 2, 2), the lower first."""
+    lower_px, upper_px = places_px[:, 0], places_px[:, 1]
+    along_px = upper_px - lower_px
+    forward_px = along_px[:, 0] if forward_is_right else -along_px[:, 0]
+    angle_rad = np.arctan2(forward_px, -along_px[:, 1]) - zero_rad
+    least_rad = math.sqrt(2.0) * _SIGMA_MIN_PX / np.hypot(along_px[:, 0], along_px[:, 1])
+    return Track(
+        lower_px, upper_px, angle_rad, np.maximum(least_rad, _measure_noise_rad(angle_rad))
+    )
+
+
+def _measure_noise_rad(angle_rad: Floats) -> float:
+    """Measure the noise of the angle over the whole film: the median residual of a parabola."""
+    if len(angle_rad) < _WINDOW:
+        return 0.0
+    x = np.arange(_WINDOW) - _WINDOW // 2
+    design = np.stack([np.ones(_WINDOW), x, x**2], axis=1)
+    weights = np.eye(_WINDOW)[_WINDOW // 2] - (design @ np.linalg.pinv(design))[_WINDOW // 2]
+    left_rad = np.convolve(angle_rad, weights[::-1], "valid")
+    seen_rad = left_rad[np.isfinite(left_rad)]
+    if not len(seen_rad):
+        return 0.0
+    # Of a normal distribution the median of absolute values is 0.6745 sigma.
+    return float(np.median(np.abs(seen_rad))) / 0.6745 / math.sqrt(float(weights @ weights))
+
+
+def make_tag_finder(lower_id: int, upper_id: int) -> FindMarkers:
+    """Make a finder of two ArUco tags (dictionary 4x4_50), by the middles of their squares.
+
+    Each is looked for near its last place first, which takes a tenth of the time.
+    """
+    import cv2
+
+    settings = cv2.aruco.DetectorParameters()
+    settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    detector = cv2.aruco.ArucoDetector(dictionary, settings)
+    last: dict[int, tuple[Floats, float]] = {}
+
+    def detect(picture: Picture, origin: Floats) -> dict[int, Floats]:
+        corners, ids, _ = detector.detectMarkers(np.ascontiguousarray(picture))
+        return {
+            int(number): corner[0].astype(np.float64) + origin
+            for number, corner in zip([] if ids is None else ids.ravel(), corners, strict=True)
+        }
+
+    def find(picture: Picture) -> Floats | None:
+        found: dict[int, Floats] = {}
+        for number, (middle, size) in last.items():
+            reach = _TAG_SEARCH * size
+            low = np.maximum(middle - reach, 0).astype(int)
+            high = (middle + reach).astype(int)
+            near = detect(picture[low[1] : high[1], low[0] : high[0]], low.astype(np.float64))
+            if number in near:
+                found[number] = near[number]
+        if not {lower_id, upper_id} <= found.keys():
+            found = detect(picture, np.zeros(2))
+        last.clear()
+        if not {lower_id, upper_id} <= found.keys():
+            return None
+        middles = []
+        for number in (lower_id, upper_id):
+            middle = _intersect_diagonals(found[number])
+            last[number] = middle, float(np.ptp(found[number], axis=0).max())
+            middles.append(middle)
+        return np.stack(middles)
+
+    return find
+
+
+def _intersect_diagonals(corners: Floats) -> Floats:
+    """Return the middle of a square in perspective: where its diagonals meet."""
+    first, second = corners[2] - corners[0], corners[3] - corners[1]
+    part = np.linalg.solve(np.stack([first, -second], axis=1), corners[1] - corners[0])
+    return np.asarray(corners[0] + part[0] * first)
+
+
+def make_dot_finder(colour: str) -> FindMarkers:
+    """Make a finder of two dots, the lower one first.
+
+    Args:
+        colour: `bright`, or a name of `_COLOURS_HUE`.
+
+    Raises:
+        UsageError: no such colour.
+    """
+    import cv2
+
+    if colour != "bright" and colour not in _COLOURS_HUE:
+        raise UsageError(
+            f"no dots of the colour {colour!r}", expected=", ".join(("bright", *_COLOURS_HUE))
+        )
+
+    def weigh(picture: Picture) -> Floats:
+        """Return how much each pixel belongs to a dot: its light, where the colour fits."""
+        if colour == "bright":
+            return np.where(picture >= _BRIGHT_MIN, picture.astype(np.float64), 0.0)
+        hsv = cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_BGR2HSV).astype(np.int16)
+        away = np.abs((hsv[..., 0] - _COLOURS_HUE[colour] + 90) % 180 - 90)
+        fits = (away <= _HUE_WITHIN) & (hsv[..., 2] >= _VALUE_MIN)
+        fits &= hsv[..., 1] >= _SATURATION_MIN
+        return np.where(fits, hsv[..., 1].astype(np.float64), 0.0)
+
+    def find(picture: Picture) -> Floats | None:
+        weights = weigh(picture)
+        count, labels, stats, _ = cv2.connectedComponentsWithStats((weights > 0).astype(np.uint8))
+        areas = stats[1:, cv2.CC_STAT_AREA].astype(np.float64)
+        sizes = stats[1:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)
+        least, most = _DOT_AREA_PX
+        is_dot = (areas >= least) & (areas <= most * weights.size)
+        is_dot &= areas >= _DOT_ROUNDNESS * math.pi / 4 * sizes**2
+        dots = np.flatnonzero(is_dot) + 1
+        if count < 3 or len(dots) < 2:
+            return None
+        dots = dots[np.argsort(-areas[dots - 1])][:2]
+        if len(np.flatnonzero(is_dot)) > 2 and areas[dots[1] - 1] < 2 * np.sort(areas[is_dot])[-3]:
+            return None  # a third one is as large: which two are meant is not known
+        places = np.stack([_weighted_middle(weights, labels, stats, dot) for dot in dots])
+        return np.asarray(places[np.argsort(-places[:, 1])])
+
+    return find
+
+
+def _weighted_middle(weights: Floats, labels: Floats, stats: Floats, dot: int) -> Floats:
+    x, y, width, height = (int(value) for value in stats[dot, :4])
+    part = slice(y, y + height), slice(x, x + width)
+    inside = np.where(labels[part] == dot, weights[part], 0.0)
+    total = inside.sum()
+    return np.array(
+        [
+            x + inside.sum(axis=0) @ np.arange(width) / total,
+            y + inside.sum(axis=1) @ np.arange(height) / total,
+        ]
+    )
+
+
+def _undistort(places_px: Floats, lens: Lens) -> Floats:
+    import cv2
+
+    shape = places_px.shape
+    points = places_px.reshape(-1, 1, 2)
+    seen = np.isfinite(points).all(axis=(1, 2))
+    if seen.any():
+        points[seen] = cv2.undistortPoints(
+            points[seen], lens.matrix, lens.distortion, P=lens.matrix
+        )
+    return points.reshape(shape)
+
+
+def calibrate_lens(pictures: Iterator[Picture], columns: int, rows: int) -> Lens:
+    """Compute a camera's lens from grey pictures of a checkerboard.
+
+    Args:
+        pictures: at least five in which the board lies differently.
+        columns: inner corners along a row.
+        rows: inner corners along a column.
+
+    Raises:
+        FileFormatError: the board is seen too rarely.
+    """
+    import cv2
+
+    board = np.zeros((columns * rows, 3), np.float32)
+    board[:, :2] = np.mgrid[:columns, :rows].T.reshape(-1, 2)
+    corners, size = [], (0, 0)
+    for picture in pictures:
+        is_found, places = cv2.findChessboardCornersSB(picture, (columns, rows))
+        if is_found:
+            corners.append(places.astype(np.float32))
+            size = picture.shape[1], picture.shape[0]
+    if len(corners) < _BOARDS_MIN:
+        raise FileFormatError(
+            f"the checkerboard of {columns} x {rows} inner corners is in {len(corners)} pictures",
+            expected=f"at least {_BOARDS_MIN}, tilted differently",
+        )
+    _, matrix, distortion, _, _ = cv2.calibrateCamera(
+        [board] * len(corners), corners, size, None, None
+    )
+    return Lens(np.asarray(matrix), np.asarray(distortion))

@@ -1,0 +1,184 @@
+"""Process that decodes a film, with limits: decoders crash, hang and take memory.
+
+It gets a request as JSON on its standard input, and prints a line of JSON for each step: progress,
+then the result or an error. It reads the film and writes nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from devices.errors import FileFormatError, FootTileError, StateError, UsageError
+
+_MEMORY_BYTES_MAX = 4 << 30
+_SILENT_S_MAX = 60.0
+"""Longest time without a line: a film of 4K shows several pictures a second."""
+_PROGRESS_PICTURES = 50
+_PART_PX = 16
+"""Size of the parts of a picture in which a lamp is looked for."""
+_ERRORS: dict[str, type[FootTileError]] = {
+    kind.__name__: kind for kind in (FileFormatError, UsageError, StateError)
+}
+
+
+def run_film_task(
+    task: str, path: Path, *, on_picture: Callable[[int], None] = lambda _: None, **options: Any
+) -> dict[str, Any]:
+    """Run a task on a film in a process of its own, and return its result.
+
+    Args:
+        task: name in `_TASKS`.
+        path: the film.
+        on_picture: called with the number of pictures done.
+        options: of the task.
+
+    Raises:
+        FileFormatError: the film cannot be decoded, or its decoder crashed or hung.
+        FootTileError: of the task.
+    """
+    request = json.dumps({"task": task, "path": str(path), "options": options})
+    process = subprocess.Popen(  # our own module
+        [sys.executable, "-c", "from service.video.worker import main; main()"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,  # Ctrl-C is for the parent, which ends it
+        text=True,
+    )
+    assert process.stdin is not None  # noqa: S101
+    assert process.stdout is not None  # noqa: S101
+    watchdog = threading.Timer(_SILENT_S_MAX, process.kill)
+    try:
+        process.stdin.write(request)
+        process.stdin.close()
+        watchdog.start()
+        for line in process.stdout:
+            watchdog.cancel()
+            watchdog = threading.Timer(_SILENT_S_MAX, process.kill)
+            watchdog.start()
+            message: dict[str, Any] = json.loads(line)
+            if "picture" in message:
+                on_picture(message["picture"])
+            elif "error" in message:
+                facts = message["error"]
+                raise _ERRORS[facts.pop("kind")](facts.pop("what"), **facts)
+            else:
+                result: dict[str, Any] = message["result"]
+                return result
+        code = process.wait()
+        raise FileFormatError(
+            f"its decoder ended with {'signal' if code < 0 else 'code'} {abs(code)}",
+            where=str(path),
+            expected="a film that a player shows",
+            remedy="Convert it, for example: ffmpeg -i FILM -c:v libx264 NEW.mp4",
+        )
+    finally:
+        watchdog.cancel()
+        process.kill()
+        process.stdout.close()
+        process.wait()
+
+
+def main() -> None:
+    """Run the task of the request on the standard input."""
+    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES_MAX, _MEMORY_BYTES_MAX))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    os.nice(10)
+    request = json.load(sys.stdin)
+    try:
+        _print({"result": _TASKS[request["task"]](Path(request["path"]), **request["options"])})
+    except FootTileError as error:
+        kind = next((name for name, k in _ERRORS.items() if isinstance(error, k)), "StateError")
+        facts = {"where": error.where, "expected": error.expected, "remedy": error.remedy}
+        known = {name: value for name, value in facts.items() if value}
+        _print({"error": {"kind": kind, "what": error.what, **known}})
+    except MemoryError:
+        text = f"it needs more than {_MEMORY_BYTES_MAX >> 30} GiB"
+        _print({"error": {"kind": "FileFormatError", "what": text, "where": request["path"]}})
+
+
+def _print(message: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(message) + "\n")
+    sys.stdout.flush()
+
+
+def _report(picture: int) -> None:
+    if picture % _PROGRESS_PICTURES == 0:
+        _print({"picture": picture})
+
+
+def _read(path: Path, capture_rate_hz: float | None = None) -> dict[str, Any]:
+    from service.video.container import iterate_pictures, read_film
+
+    film, times_s = read_film(path, capture_rate_hz)
+    next(iterate_pictures(path, is_grey=True))  # it can be decoded
+    return {"film": film.model_dump(), "times_s": times_s.tolist()}
+
+
+def _find_lamp(
+    path: Path, begin_ns: float, end_ns: float, capture_rate_hz: float | None = None
+) -> dict[str, Any]:
+    import cv2
+
+    from service.video.container import iterate_pictures, read_film
+    from service.video.light import find_lamp
+
+    film, times_s = read_film(path, capture_rate_hz)
+    size = max(1, film.width_px // _PART_PX), max(1, film.height_px // _PART_PX)
+    rows = np.full((len(times_s), size[0] * size[1]), np.nan, dtype=np.float32)
+    for index, picture in iterate_pictures(path, is_grey=True):
+        small = cv2.resize(picture.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        rows[index] = small.ravel()
+        _report(index)
+    seen = ~np.isnan(rows[:, 0])
+    pairs = find_lamp(times_s[seen], rows[seen].astype(np.float64), begin_ns, end_ns)
+    return {"pairs": [pair._asdict() for pair in pairs]}
+
+
+def _track(
+    path: Path,
+    marks: str,
+    tags: tuple[int, int] | None = None,
+    capture_rate_hz: float | None = None,
+    forward_is_right: bool = True,
+    zero_rad: float = 0.0,
+) -> dict[str, Any]:
+    from service.video.container import read_film
+    from service.video.tracking import make_dot_finder, make_tag_finder, track_angle
+
+    film, times_s = read_film(path, capture_rate_hz)
+    find = make_tag_finder(*tags) if tags is not None else make_dot_finder(marks)
+    track = track_angle(
+        path,
+        film.picture_count,
+        find,
+        is_grey=tags is not None or marks == "bright",
+        forward_is_right=forward_is_right,
+        zero_rad=zero_rad,
+        on_picture=_report,
+    )
+    columns = {"film_s": times_s, "angle_rad": track.angle_rad, "sigma_rad": track.sigma_rad}
+    for name, places in (("lower", track.lower_px), ("upper", track.upper_px)):
+        columns |= {f"{name}_x_px": places[:, 0], f"{name}_y_px": places[:, 1]}
+    return {
+        name: [None if np.isnan(v) else v for v in column.tolist()]
+        for name, column in columns.items()
+    }
+
+
+_TASKS: dict[str, Callable[..., dict[str, Any]]] = {
+    "read": _read,
+    "find_lamp": _find_lamp,
+    "track": _track,
+}
