@@ -80,7 +80,7 @@ class LampPair(NamedTuple):
     t_mono_ns: float
     sigma_ns: float
     correlation: float
-    """Of the brightness with the code, at most 1."""
+    """Correlation of the brightness with the code, at most 1."""
 
 
 def find_lamp(
