@@ -116,7 +116,7 @@ def iterate_pictures(
                 if frame.pts > last:
                     return
                 shown = int(np.searchsorted(stamps, frame.pts))
-                picture: Picture = frame.to_ndarray(format=pixel_format)
+                picture = np.asarray(frame.to_ndarray(format=pixel_format), dtype=np.uint8)
                 yield shown, np.rot90(picture, round(frame.rotation / 90) % 4)
         except av.error.FFmpegError as error:
             raise FileFormatError(
@@ -134,7 +134,7 @@ def _open_container(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     if not path.is_file():
         raise FileFormatError("no such file", where=str(path), expected="a film")
     try:
-        with path.open("rb") as file, av.open(file, metadata_errors="replace") as container:
+        with path.open("rb") as file, av.open(file, "r", metadata_errors="replace") as container:
             if not container.streams.video:
                 raise FileFormatError("the file has no pictures", where=str(path))
             stream = container.streams.video[0]

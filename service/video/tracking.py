@@ -6,9 +6,9 @@ the upper marker against the picture's upright, positive as the foot rolls forwa
 user says: a camera is seldom level. It is known in the picture's plane; a camera that looks
 obliquely by `a` turns it by up to (1 / cos a - 1) of its sine.
 
-The uncertainty is measured on the film itself: what is left of each position after a parabola
-through its neighbours is noise of the detection (and motion faster than the film shows, which
-makes it greater, never less). A picture in which a marker is hidden has no angle.
+The uncertainty is measured on the film itself: the distance of each angle from a parabola through
+its neighbours is noise of the detection (and motion faster than the film shows, which makes it
+greater, never less). A picture in which a marker is hidden has no angle.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from devices.arrays import Floats
 from devices.errors import FileFormatError, UsageError
@@ -157,9 +158,11 @@ def make_tag_finder(lower_id: int, upper_id: int) -> FindMarkers:
 
     def detect(picture: Picture, origin: Floats) -> dict[int, Floats]:
         corners, ids, _ = detector.detectMarkers(np.ascontiguousarray(picture))
+        if not len(corners):  # then some versions give no array of numbers
+            return {}
         return {
-            int(number): corner[0].astype(np.float64) + origin
-            for number, corner in zip([] if ids is None else ids.ravel(), corners, strict=True)
+            int(number): np.asarray(corner[0], dtype=np.float64) + origin
+            for number, corner in zip(ids.ravel(), corners, strict=True)
         }
 
     def find(picture: Picture) -> Floats | None:
@@ -233,13 +236,15 @@ def make_dot_finder(colour: str) -> FindMarkers:
         dots = dots[np.argsort(-areas[dots - 1])][:2]
         if len(np.flatnonzero(is_dot)) > 2 and areas[dots[1] - 1] < 2 * np.sort(areas[is_dot])[-3]:
             return None  # a third one is as large: which two are meant is not known
-        places = np.stack([_weighted_middle(weights, labels, stats, dot) for dot in dots])
+        places = np.stack([_weighted_middle(weights, labels, stats, int(dot)) for dot in dots])
         return np.asarray(places[np.argsort(-places[:, 1])])
 
     return find
 
 
-def _weighted_middle(weights: Floats, labels: Floats, stats: Floats, dot: int) -> Floats:
+def _weighted_middle(
+    weights: Floats, labels: npt.NDArray[Any], stats: npt.NDArray[Any], dot: int
+) -> Floats:
     x, y, width, height = (int(value) for value in stats[dot, :4])
     part = slice(y, y + height), slice(x, x + width)
     inside = np.where(labels[part] == dot, weights[part], 0.0)

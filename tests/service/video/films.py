@@ -128,6 +128,7 @@ def write_film(
     """Write pictures with their times."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream(camera.codec, rate=round(camera.rate_hz))
+        assert isinstance(stream, av.VideoStream)
         stream.width, stream.height = pictures[0].shape[1], pictures[0].shape[0]
         stream.pix_fmt = "yuv420p"
         stream.codec_context.time_base = stream.time_base = _TIME_BASE
