@@ -17,6 +17,7 @@ import logging
 import os
 import re
 import secrets
+import shutil
 import stat
 import tempfile
 import weakref
@@ -156,9 +157,9 @@ def make_temporary_path(path: Path) -> Path:
 
 
 def remove_dead_process_temporaries(folder_tree: Path) -> list[Path]:
-    """Delete half-written files of dead processes in a folder tree; return their paths.
+    """Delete half-written files and folders of dead processes in a tree; return their paths.
 
-    Files of living processes stay: they may still be written. If a process number was given to
+    Those of living processes stay: they may still be written. If a process number was given to
     another process since, the start time shows it.
 
     Raises:
@@ -168,9 +169,15 @@ def remove_dead_process_temporaries(folder_tree: Path) -> list[Path]:
     with translate_storage_errors(folder_tree):
         folder_tree.stat()  # fails if the folder is missing, where rglob just finds no files
         for path in sorted(folder_tree.rglob(".*.tmp")):
-            if is_dead_process_temporary(path.name) and path.is_file():
+            if not is_dead_process_temporary(path.name):
+                continue
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            elif path.is_file():
                 path.unlink(missing_ok=True)
-                removed.append(path)
+            else:
+                continue
+            removed.append(path)
         for parent in {path.parent for path in removed}:
             sync_folder(parent)
     return removed

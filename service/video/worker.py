@@ -13,22 +13,57 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from devices.errors import FileFormatError, FootTileError, StateError, UsageError
+from devices.errors import FileFormatError, FootTileError, StateError, UsageError, require_extra
+from storage.sessions.videos import FilmInfo
 
 _MEMORY_BYTES_MAX = 4 << 30
 _SILENT_S_MAX = 60.0
 """Longest time without a line: a film of 4K shows several pictures a second."""
+_READ_BYTES_PER_S_MIN = 10e6
+"""Rate of a slow disk: a film's time stamps are all over its file."""
 _PROGRESS_PICTURES = 50
 _PART_PX = 16
 """Size of the parts of a picture in which a lamp is looked for."""
 _ERRORS: dict[str, type[FootTileError]] = {
     kind.__name__: kind for kind in (FileFormatError, UsageError, StateError)
 }
+
+
+def check_extra_installed() -> None:
+    """Check that films can be read, before one is copied.
+
+    Raises:
+        MissingExtraError: a package is not installed.
+    """
+    with require_extra("video", "a film"):
+        if find_spec("av") is None:  # not imported: that is for the process of its own
+            raise ModuleNotFoundError(name="av")
+
+
+def describe_film(path: Path, name: str, capture_rate_hz: float | None = None) -> FilmInfo:
+    """Read what a film is, and that its first and last pictures can be decoded.
+
+    Args:
+        path: the film.
+        name: name for errors.
+        capture_rate_hz: rate at which it was taken, if the file does not say it.
+
+    Raises:
+        FileFormatError: it is no film, or broken.
+        UsageError: the rate is impossible.
+    """
+    try:
+        return FilmInfo(**run_film_task("read", path, capture_rate_hz=capture_rate_hz)["film"])
+    except (FileFormatError, UsageError) as error:
+        error.what = error.what.replace(str(path), name)
+        error.where = name
+        raise
 
 
 def run_film_task(
@@ -57,14 +92,15 @@ def run_film_task(
     )
     assert process.stdin is not None  # noqa: S101
     assert process.stdout is not None  # noqa: S101
-    watchdog = threading.Timer(_SILENT_S_MAX, process.kill)
+    silent_s_max = _SILENT_S_MAX + path.stat().st_size / _READ_BYTES_PER_S_MIN
+    watchdog = threading.Timer(silent_s_max, process.kill)
     try:
         process.stdin.write(request)
         process.stdin.close()
         watchdog.start()
         for line in process.stdout:
             watchdog.cancel()
-            watchdog = threading.Timer(_SILENT_S_MAX, process.kill)
+            watchdog = threading.Timer(silent_s_max, process.kill)
             watchdog.start()
             message: dict[str, Any] = json.loads(line)
             if "picture" in message:
@@ -76,8 +112,9 @@ def run_film_task(
                 result: dict[str, Any] = message["result"]
                 return result
         code = process.wait()
+        how = f"ended with {'signal' if code < 0 else 'code'} {abs(code)}"
         raise FileFormatError(
-            f"its decoder ended with {'signal' if code < 0 else 'code'} {abs(code)}",
+            f"its decoder {f'hung for {silent_s_max:g} s' if watchdog.finished.is_set() else how}",
             where=str(path),
             expected="a film that a player shows",
             remedy="Convert it, for example: ffmpeg -i FILM -c:v libx264 NEW.mp4",
@@ -122,7 +159,14 @@ def _read(path: Path, capture_rate_hz: float | None = None) -> dict[str, Any]:
     from service.video.container import iterate_pictures, read_film
 
     film, times_s = read_film(path, capture_rate_hz)
-    next(iterate_pictures(path, is_grey=True))  # it can be decoded
+    next(iterate_pictures(path, is_grey=True))
+    last = film.picture_count - 1
+    if last not in (index for index, _ in iterate_pictures(path, is_grey=True, begin=last)):
+        raise FileFormatError(
+            "the film's last picture cannot be decoded",
+            where=str(path),
+            remedy="Copy the file from the camera again",
+        )
     return {"film": film.model_dump(), "times_s": times_s.tolist()}
 
 

@@ -1,47 +1,59 @@
-"""Videos of a session: a folder for each, beside the session's frames, which they do not touch.
+"""Videos of a session: a folder for each in the session's, whose other files they do not touch.
 
-The file is kept as it came, under a fixed name. `video.json` says what it is, with its hash, and
-how its time is aligned with the session's. A folder's name is drawn, so it is looked up in the
-listing and never made into a path.
+The file is kept as it came, under a fixed name. `video.json` states facts of the film, its hash,
+and how its time is aligned with the session's. An incomplete folder has a temporary name, and is
+deleted at the next start of a server.
 """
 
 from __future__ import annotations
 
+import errno
+import hashlib
+import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterable
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
 from devices.arrays import Floats
-from devices.errors import DamagedFileError, FileFormatError, StorageError, UnknownError
+from devices.clock import server_utc_ns
+from devices.errors import (
+    DamagedFileError,
+    FileFormatError,
+    StorageError,
+    UnknownError,
+    escape_control_chars,
+)
 from devices.types import Count, Identifier, StrictModel, Text, TNs
 from storage.documents import read_document, write_document
-from storage.durable_files import (
-    make_synced_folder,
-    open_for_atomic_write,
-    sync_folder,
-    translate_storage_errors,
-)
+from storage.durable_files import make_temporary_path, sync_folder, translate_storage_errors
 from storage.parquet_hash import compute_sha256
-from storage.sessions.folder import DELETED_PREFIX
 
-VIDEOS_FOLDER = "videos"
 VIDEO_NAME = "video.json"
-FILM_STEM = "film"
-SUFFIXES = (".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi")
-"""Suffixes of films; others are refused before anything is read."""
-_VIDEO_ID = re.compile(r"[0-9a-f]{12}")
+FILM_MEDIA_TYPES = {
+    ".mp4": "video/mp4",
+    ".mov": "video/quicktime",
+    ".m4v": "video/mp4",
+    ".webm": "video/webm",
+    ".mkv": "video/x-matroska",
+    ".avi": "video/x-msvideo",
+}
+"""Media types of films by suffix; other files are refused before anything is read."""
+FREE_BYTES_MIN = 1 << 30
+"""Space of the disk that films leave to frames."""
+_VIDEO_ID = "[0-9a-f]{12}"
+_FOLDER = re.compile(f"video-({_VIDEO_ID})")
 
 AlignmentMethod = Literal["light", "clock page", "contact", "hand"]
 
 
 class FilmInfo(StrictModel):
-    """What a film is."""
+    """Facts of a film."""
 
     codec: Text
     width_px: Count
@@ -67,7 +79,7 @@ class Alignment(StrictModel):
     film_s: float
     """Instant of the film at which the line is fixed, in s from its first picture."""
     t_ns: TNs
-    """The same instant in the session's time."""
+    """Instant of `film_s` in the session's time."""
     drift: float
     """Session's time per film's time, less one."""
     sigma_ns: float
@@ -96,10 +108,10 @@ class Alignment(StrictModel):
 class Video(StrictModel):
     """Video of a session, as `video.json` describes it."""
 
-    id: Annotated[str, Field(pattern=f"^{_VIDEO_ID.pattern}$")]
+    id: Annotated[str, Field(pattern=f"^{_VIDEO_ID}$")]
     name: Identifier
     """Name of the file as it came."""
-    suffix: str
+    suffix: Annotated[str, Field(pattern=r"^\.[a-z0-9]{3,4}$")]
     size_bytes: Count
     sha256: str
     added_t_ns: TNs
@@ -109,34 +121,28 @@ class Video(StrictModel):
 
 
 def find_video_folders(session_folder: Path) -> dict[str, Path]:
-    """List a session's video folders by id, sorted.
+    """Return the folders of a session's videos by id, sorted.
 
     Raises:
-        StorageError: they cannot be read now.
+        StorageError: they cannot be listed now.
     """
     try:
-        found = sorted((session_folder / VIDEOS_FOLDER).iterdir())
-        return {
-            path.name: path
-            for path in found
-            if _VIDEO_ID.fullmatch(path.name) and path.is_dir() and not path.is_symlink()
-        }
-    except (FileNotFoundError, NotADirectoryError):
+        names = sorted(os.listdir(session_folder))
+    except FileNotFoundError:
         return {}
     except OSError as error:
         raise StorageError(
-            f"cannot be read: {error.strerror}",
-            where=str(session_folder / VIDEOS_FOLDER),
-            errno=error.errno,
+            f"cannot be read: {error.strerror}", where=str(session_folder), errno=error.errno
         ) from error
+    return {found[1]: session_folder / name for name in names if (found := _FOLDER.fullmatch(name))}
 
 
 def find_video_folder(session_folder: Path, video_id: str) -> Path:
-    """Find the folder of one video.
+    """Return the folder of one video.
 
     Raises:
         UnknownError: there is none with this id.
-        StorageError: it cannot be read now.
+        StorageError: they cannot be listed now.
     """
     found = find_video_folders(session_folder)
     if video_id not in found:
@@ -151,19 +157,22 @@ def read_video(folder: Path) -> Video:
     """Read the description of a video.
 
     Raises:
-        DamagedFileError: it is missing, or was changed.
+        UnknownError: the video was removed.
+        DamagedFileError: the description is missing, or was changed.
         FileFormatError: it is of another version.
         StorageError: it cannot be read now.
     """
     try:
         return read_document(folder / VIDEO_NAME, Video)
     except FileNotFoundError as error:
+        if not folder.exists():
+            raise UnknownError("the video was removed", where=str(folder)) from error
         raise DamagedFileError("the video has no description", where=str(folder)) from error
 
 
 def get_film_path(folder: Path, video: Video) -> Path:
     """Return the path of a video's file."""
-    return folder / f"{FILM_STEM}{video.suffix}"
+    return folder / f"film{video.suffix}"
 
 
 def write_video(folder: Path, video: Video) -> None:
@@ -175,73 +184,109 @@ def write_video(folder: Path, video: Video) -> None:
     write_document(folder / VIDEO_NAME, video)
 
 
-def check_suffix(name: str) -> str:
-    """Return the suffix of a film's name, in lower case.
-
-    Raises:
-        FileFormatError: films do not end so.
-    """
-    suffix = Path(name).suffix.lower()
-    if suffix not in SUFFIXES:
-        raise FileFormatError(f"{name[:80]!r} is no film", expected=", ".join(SUFFIXES))
-    return suffix
-
-
 class IncomingVideo:
-    """Folder of a video whose file is being written; without `finish` it is deleted.
+    """Video whose file is being written; as a context manager it is deleted unless it is kept.
 
     Args:
         session_folder: folder of the session.
-        name: name of the file as it came.
+        name: name of the file as it came; only shown.
+        size_bytes: its size, if known: a file that does not fit is refused before it is written.
 
     Raises:
         FileFormatError: films do not end so.
-        StorageError: the folder cannot be made.
     """
 
-    def __init__(self, session_folder: Path, name: str) -> None:
-        self.name, self.suffix = name, check_suffix(name)
-        self.id = secrets.token_hex(6)
-        self._final = session_folder / VIDEOS_FOLDER / self.id
-        # A name that no listing shows, and that a start of the server deletes.
-        self.folder = self._final.with_name(f"{DELETED_PREFIX}{self.id}")
-        self.film_path = self.folder / f"{FILM_STEM}{self.suffix}"
-        make_synced_folder(self.folder)
+    def __init__(self, session_folder: Path, name: str, size_bytes: int = 0) -> None:
+        self.name = escape_control_chars(Path(name).name)[-200:]
+        self._suffix = Path(self.name).suffix.lower()
+        if self._suffix not in FILM_MEDIA_TYPES:
+            raise FileFormatError(
+                f"{self.name!r} is no film", expected=f"a file in {', '.join(FILM_MEDIA_TYPES)}"
+            )
+        self._id = secrets.token_hex(6)
+        self._final = session_folder / f"video-{self._id}"
+        self._folder = make_temporary_path(self._final)
+        self._path = self._folder / f"film{self._suffix}"
+        self._size_bytes = size_bytes
+        self._hash = hashlib.sha256()
 
-    def write(self, chunks: Iterable[bytes]) -> None:
-        """Write the file.
+    def __enter__(self) -> Self:
+        """Create the file.
 
         Raises:
-            StorageError: the disk is full or not writable.
+            StorageError: it cannot be created, or does not fit.
         """
-        with open_for_atomic_write(self.film_path) as file:
-            for chunk in chunks:
-                file.write(chunk)
+        _check_space(self._final.parent, self._size_bytes)
+        with translate_storage_errors(self._final.parent):
+            self._folder.mkdir()
+            try:
+                self._file = open(self._path, "wb")
+            except OSError:
+                self._folder.rmdir()
+                raise
+        return self
 
-    def finish(self, film: FilmInfo, added_t_ns: int) -> Video:
-        """Describe the video and put its folder in place.
+    def __exit__(self, *_: object) -> None:
+        """Close the file; delete it unless it was kept."""
+        self._file.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def write(self, chunk: bytes) -> None:
+        """Append to the file, and wait for the disk: a backlog would delay the sync of journals.
 
         Raises:
+            StorageError: the disk is not writable, or would have too little space left.
+        """
+        with translate_storage_errors(self._path):
+            _check_space(self._folder, len(chunk))
+            self._file.write(chunk)
+            self._file.flush()
+            os.fdatasync(self._file.fileno())
+        self._hash.update(chunk)
+
+    def keep(self, describe: Callable[[Path], FilmInfo]) -> Video:
+        """Describe the film that is now complete, and put the video in place.
+
+        Args:
+            describe: reads a film in a process of its own; raises if it is none.
+
+        Raises:
+            UnknownError: the session was deleted meanwhile.
             StorageError: the disk is full or not writable.
         """
         video = Video(
-            id=self.id,
+            id=self._id,
             name=self.name,
-            suffix=self.suffix,
-            size_bytes=self.film_path.stat().st_size,
-            sha256=compute_sha256(self.film_path),
-            added_t_ns=added_t_ns,
-            film=film,
+            suffix=self._suffix,
+            size_bytes=self._file.tell(),
+            sha256=self._hash.hexdigest(),
+            added_t_ns=server_utc_ns(),
+            film=describe(self._path),
         )
-        write_video(self.folder, video)
+        if not self._folder.exists():
+            raise UnknownError("the session was deleted meanwhile", where=str(self._final.parent))
+        write_video(self._folder, video)
         with translate_storage_errors(self._final):
-            self.folder.rename(self._final)
-        sync_folder(self._final.parent)
+            self._folder.rename(self._final)
+            sync_folder(self._final.parent)
         return video
 
-    def discard(self) -> None:
-        """Delete what was written."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+
+def _check_space(folder: Path, size_bytes: int) -> None:
+    """Check that this much fits on the disk, with `FREE_BYTES_MIN` left.
+
+    Raises:
+        StorageError: it does not.
+    """
+    with translate_storage_errors(folder):
+        disk = os.statvfs(folder)
+    if disk.f_bavail * disk.f_frsize < FREE_BYTES_MIN + size_bytes:
+        raise StorageError(
+            f"no space for the film: {FREE_BYTES_MIN >> 20} MiB of the disk stay free for frames",
+            where=str(folder),
+            remedy="Free space on the disk",
+            errno=errno.ENOSPC,
+        )
 
 
 def remove_video(session_folder: Path, video_id: str) -> None:
@@ -252,22 +297,31 @@ def remove_video(session_folder: Path, video_id: str) -> None:
         StorageError: it cannot be deleted.
     """
     folder = find_video_folder(session_folder, video_id)
-    doomed = folder.with_name(f"{DELETED_PREFIX}{video_id}")
+    doomed = make_temporary_path(folder)
     with translate_storage_errors(folder):
         folder.rename(doomed)  # at once, for all readers
+        sync_folder(session_folder)
         shutil.rmtree(doomed)
 
 
 def verify_videos(session_folder: Path) -> list[str]:
-    """Verify the files of a session's videos by their hashes; return what is wrong, as text."""
+    """Verify the files of a session's videos by their hashes; return problems as text."""
     problems = []
     for video_id, folder in find_video_folders(session_folder).items():
         try:
             video = read_video(folder)
-            if compute_sha256(get_film_path(folder, video)) != video.sha256:
-                problems.append(f"video {video_id}: {video.name} was changed")
+            path = get_film_path(folder, video)
+            if path.stat().st_size != video.size_bytes:
+                what = f"has {path.stat().st_size} bytes, not {video.size_bytes}"
+            elif compute_sha256(path) != video.sha256:
+                what = "was changed: its SHA-256 is another one"
+            else:
+                continue
+            problems.append(f"video {video_id}: {video.name} {what}")
+        except UnknownError:
+            continue  # removed meanwhile
         except FileNotFoundError:
-            problems.append(f"video {video_id}: its file is missing")
-        except (FileFormatError, StorageError) as error:
-            problems.append(f"video {video_id}: {error.what}")
+            problems.append(f"video {video_id}: {video.name} is missing")
+        except (FileFormatError, OSError) as error:
+            problems.append(f"video {video_id}: {getattr(error, 'what', error)}")
     return problems

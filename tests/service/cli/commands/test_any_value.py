@@ -62,6 +62,7 @@ COMMANDS: dict[str, tuple[object, ...]] = {
     "stream": ("bench", "--server", "http://127.0.0.1:1"),
     "invite": ("--server", "http://127.0.0.1:1", "--data", "."),
     "verify": ("s.parquet",),
+    "video": ("add", "s.parquet", "film.mp4"),
 }
 """For each command, arguments with which it ends within a moment."""
 
@@ -193,6 +194,8 @@ READ: dict[tuple[str, str], tuple[object, ...]] = {
     ("simulate", "scene"): ("--scene", "{}", "--seconds", 1),
     ("simulate", "load"): ("--scene", "standing", "--load", "{}"),
     ("verify", "targets"): ("{}",),
+    ("video", "session"): ("list", "{}"),
+    ("video", "target"): ("add", "s.parquet", "{}"),
     ("verify", "manifest"): ("--manifest", "{}"),
     ("calibrate", "ca"): (
         *("--live", "--tile", "T01", "--out", "cal.json"),
@@ -237,6 +240,7 @@ IN_FOLDERS: dict[tuple[str, str], tuple[object, ...]] = {
     ("accept-node", "data"): ("bench", "--server", "http://127.0.0.1:1", "--data", "{}"),
     ("invite", "data"): ("--server", "http://127.0.0.1:1", "--data", "{}"),
     ("verify", "data"): ("20200101T000000Z-000000", "--data", "{}"),
+    ("video", "data"): ("list", "20200101T000000Z-000000", "--data", "{}"),
 }
 
 

@@ -71,6 +71,7 @@ COMMANDS: dict[str, tuple[tuple[object, ...], ...]] = {
     ),
     "recover": ((),),
     "sessions": ((), ("--node", HOSTILE), ("--from", HOSTILE)),
+    "video": (("list", ID), ("add", ID, f"{HOSTILE}.mp4"), ("list", HOSTILE), (HOSTILE, ID)),
     "verify": ((ID,), (), (HOSTILE,), ("--manifest", HOSTILE)),
     # What these print of names is the user's own, or a scene's, which has to be one of a few words.
     "benchmark": (("--scene", HOSTILE, "--out", "o"),),
@@ -86,7 +87,9 @@ COMMANDS: dict[str, tuple[tuple[object, ...], ...]] = {
     "stream": ((HOSTILE, "--server", "http://127.0.0.1:1"),),
     "invite": (("--server", HOSTILE),),
 }
-_IN_FOLDER = {"calibrate", "compare", "estimate", "export", "query", "sessions", "verify"}
+_IN_FOLDER = {
+    *("calibrate", "compare", "estimate", "export", "query", "sessions", "verify", "video"),
+}
 
 
 def test_every_command_is_tried() -> None:

@@ -1,0 +1,128 @@
+"""`foottile video` as a user meets it."""
+
+from __future__ import annotations
+
+import hashlib
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from storage.durable_files import remove_dead_process_temporaries
+from storage.journal.journal import Journal
+from storage.journal.stream_notes import StreamNotes
+from tests.builders.arrays import make_array
+from tests.builders.frames import make_frames
+from tests.service.cli.commands.test_any_value import PLACES
+from tests.service.cli.commands.test_verify import BOOT, ID, begun
+from tests.service.cli.outcome import Run
+from tests.service.video.short_film import PICTURES, short_film
+
+
+@pytest.fixture
+def folder(run: Run, tmp_path: Path) -> Path:
+    """The folder of a sealed session, in the data folder `data`."""
+    root, info = tmp_path / "data", make_array(stream_id=BOOT)
+    journal = Journal(root / "journal" / "bench" / BOOT, info)
+    journal.append_new_frames(make_frames(100))
+    journal.close()
+    StreamNotes(array_info=info, next_seq=100).save(root / "journal" / "bench" / BOOT)
+    begun(root)
+    run("recover", root).succeeds()
+    return root / "sessions" / ID
+
+
+@pytest.fixture
+def film(tmp_path: Path) -> Path:
+    path = tmp_path / "walk.mp4"
+    path.write_bytes(short_film())
+    return path
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_a_film_is_kept_as_it_is_and_the_session_unchanged(
+    run: Run, folder: Path, film: Path
+) -> None:
+    before = contents(folder)
+    added = run("video", "add", ID, film, "--data", "data", "--json").printed()
+    assert (added["name"], added["film"]["picture_count"]) == ("walk.mp4", PICTURES)
+    assert run("video", "list", folder, "--json").printed()["items"] == [added]
+    kept = folder / f"video-{added['id']}" / "film.mp4"
+    assert kept.read_bytes() == film.read_bytes() == short_film()
+    assert f"{added['id']} walk.mp4: 64 x 48, 0.22 s, 12" in run("video", "list", folder).out
+    assert added["film"]["rate_hz"] == pytest.approx(50.0)
+    run("verify", folder).succeeds()
+    run("video", "remove", folder, added["id"]).succeeds()
+    assert contents(folder) == before
+    run("video", "remove", folder, added["id"]).fails(1, "no video", "it has none")
+
+
+def test_a_capture_rate_shortens_the_times(run: Run, folder: Path, film: Path) -> None:
+    options = ("--capture-rate", 1000, "--json")
+    added = run("video", "add", folder, film, *options).printed()
+    assert added["film"]["rate_hz"] == pytest.approx(1000.0)
+    run("video", "add", folder, film, "--capture-rate", 1e9).fails(2, "walk.mp4", "1e+09")
+    run("video", "list", folder, "--capture-rate", 9).fails(2, "is for `foottile video add`")
+
+
+def test_what_no_decoder_can_read_is_refused_and_leaves_nothing(
+    run: Run, folder: Path, tmp_path: Path
+) -> None:
+    good = short_film()
+    wrong = {
+        "cut.mp4": good[: len(good) // 2],
+        "head.mp4": good[:40],
+        "noise.mp4": bytes(range(256)) * 40,
+        "list.mkv": b"#EXTM3U\nhttp://127.0.0.1/x.ts\n",
+        "concat.avi": b"ffconcat version 1.0\nfile /etc/passwd\n",
+        "picture.mov": b"\x89PNG\r\n\x1a\n" + bytes(40),
+    }
+    before = contents(folder)
+    for name, content in wrong.items():
+        (tmp_path / name).write_bytes(content)
+        refused = run("video", "add", folder, tmp_path / name)
+        refused.fails(1, name, "expected MP4, MOV")
+        assert ".tmp" not in refused.err
+    for name, make in PLACES.items():
+        place = tmp_path / f"{name}.mp4"
+        make(place)
+        refused = run("video", "add", folder, place)
+        assert refused.code in (1, 2)
+        assert f"{name}.mp4" in refused.err or (name == "hole" and "no space" in refused.err)
+    assert contents(folder) == before
+    assert {path.name for path in folder.iterdir()} == {*before}
+
+
+@pytest.mark.process
+def test_what_a_killed_add_leaves_is_no_video_and_is_deleted(
+    run: Run, folder: Path, tmp_path: Path
+) -> None:
+    before = contents(folder)
+    code = (
+        "import sys, time; from pathlib import Path\n"
+        "from storage.sessions.videos import IncomingVideo\n"
+        "with IncomingVideo(Path(sys.argv[1]), 'slow.mp4') as incoming:\n"
+        "    incoming.write(bytes(1000)); print('begun', flush=True); time.sleep(60)"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(folder)], stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        assert remove_dead_process_temporaries(folder) == []
+        assert run("video", "list", folder).out == ""
+        process.send_signal(signal.SIGKILL)
+    assert run("video", "list", folder).out == ""
+    run("verify", folder).succeeds()
+    assert contents(folder) != before
+    run("recover", "data").succeeds()
+    assert {path.name for path in folder.iterdir()} == {*before}
