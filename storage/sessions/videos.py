@@ -14,6 +14,7 @@ import re
 import secrets
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -214,6 +215,7 @@ class IncomingVideo:
         """Create the file.
 
         Raises:
+            UnknownError: the session was deleted meanwhile.
             StorageError: it cannot be created, or does not fit.
         """
         _check_space(self._final.parent, self._size_bytes)
@@ -228,13 +230,15 @@ class IncomingVideo:
 
     def __exit__(self, *_: object) -> None:
         """Close the file; delete it unless it was kept."""
-        self._file.close()
+        with suppress(OSError):  # what could not be written
+            self._file.close()
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def write(self, chunk: bytes) -> None:
         """Append to the file, and wait for the disk: a backlog would delay the sync of journals.
 
         Raises:
+            UnknownError: the session was deleted meanwhile.
             StorageError: the disk is not writable, or would have too little space left.
         """
         with translate_storage_errors(self._path):
@@ -263,8 +267,7 @@ class IncomingVideo:
             added_t_ns=server_utc_ns(),
             film=describe(self._path),
         )
-        if not self._folder.exists():
-            raise UnknownError("the session was deleted meanwhile", where=str(self._final.parent))
+        _check_space(self._folder, 0)
         write_video(self._folder, video)
         with translate_storage_errors(self._final):
             self._folder.rename(self._final)
@@ -273,13 +276,17 @@ class IncomingVideo:
 
 
 def _check_space(folder: Path, size_bytes: int) -> None:
-    """Check that this much fits on the disk, with `FREE_BYTES_MIN` left.
+    """Check that the folder is there, and that this much fits on its disk.
 
     Raises:
-        StorageError: it does not.
+        UnknownError: the session was moved or deleted.
+        StorageError: less than `FREE_BYTES_MIN` would be left.
     """
     with translate_storage_errors(folder):
-        disk = os.statvfs(folder)
+        try:
+            disk = os.statvfs(folder)
+        except FileNotFoundError as error:
+            raise UnknownError("the session was deleted meanwhile", where=str(folder)) from error
     if disk.f_bavail * disk.f_frsize < FREE_BYTES_MIN + size_bytes:
         raise StorageError(
             f"no space for the film: {FREE_BYTES_MIN >> 20} MiB of the disk stay free for frames",
@@ -321,7 +328,8 @@ def verify_videos(session_folder: Path) -> list[str]:
         except UnknownError:
             continue  # removed meanwhile
         except FileNotFoundError:
-            problems.append(f"video {video_id}: {video.name} is missing")
+            if folder.exists():
+                problems.append(f"video {video_id}: {video.name} is missing")
         except (FileFormatError, OSError) as error:
             problems.append(f"video {video_id}: {getattr(error, 'what', error)}")
     return problems

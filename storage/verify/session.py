@@ -1,4 +1,4 @@
-"""Verification of a session's folder by its files: description, frames, markers, clock, ledger.
+"""Verification of a session's folder by its files: description, frames, markers, clock, videos.
 
 Nothing is written and no lock is needed: a server may run meanwhile. If the session changes during
 a check that finds problems, the check is repeated.
@@ -31,6 +31,7 @@ from storage.sessions.metadata import (
 )
 from storage.sessions.overview import OVERVIEW_NAME, open_overview
 from storage.sessions.stances import STANCES_NAME, read_stances
+from storage.sessions.videos import verify_videos
 from storage.verify.journal import StreamReport, verify_journal
 from storage.verify.sealed_file import (
     SealedFileReport,
@@ -157,6 +158,7 @@ def _verify_once(
     report.ledger = metadata.ledger
     if report.state == "sealed":
         _check_sealed(report, folder, metadata)
+        report.problems += verify_videos(folder)
     elif metadata.session is not None:
         _count_ledger(report, data, metadata.session, streams)
     return report

@@ -26,11 +26,13 @@ from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
 from storage.sessions.folder import Marker, Part, Session, SessionsFolder
 from storage.sessions.ledger import StreamState, compute_ledger
+from storage.sessions.videos import IncomingVideo
 from storage.verify.data_folder import find_verdict, verify_path
 from storage.verify.sealed_file import verify_sealed_file
 from storage.verify.session import SessionReport, verify_session
 from tests.builders.arrays import UTC_NS, make_array
 from tests.builders.frames import make_frames
+from tests.storage.sessions.test_videos import INFO
 
 ID = "20200101T000000Z-00000a"
 OTHER_ID = "20200101T000000Z-00000b"
@@ -402,3 +404,14 @@ def test_a_damaged_table_beside_it_is_seen(folder: Path) -> None:
         pq.write_table(pq.read_table(folder / "frames.parquet").select(["seq"]), folder / name)
         assert name in problems(folder)
         (folder / name).write_bytes(whole)
+
+
+def test_videos_are_verified_with_their_session(folder: Path) -> None:
+    before = verify_session(folder).to_json_dict()
+    with IncomingVideo(folder, "walk.mp4") as incoming:
+        incoming.write(b"film")
+        video = incoming.keep(lambda _: INFO)
+    assert verify_session(folder).to_json_dict() == before
+    (folder / f"video-{video.id}" / "film.mp4").write_bytes(b"flim")
+    assert problems(folder) == f"video {video.id}: walk.mp4 was changed: its SHA-256 is another one"
+    assert find_verdict(verify_session(folder)) == "damaged"
