@@ -11,6 +11,7 @@ does: stamps are then shortened by play rate / capture rate.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from fractions import Fraction
@@ -37,6 +38,9 @@ _CAPTURE_RATES_HZ = (1.0, 1e6)
 _VARIABLE_BEYOND = 0.2
 """A film's rate is variable if an interval differs by more than this part of their median."""
 _PIXELS_MAX = 8192 * 8192
+_DURATION = re.compile(r"(\d{1,4}):(\d\d):(\d\d\.\d+)")
+_MISSING_INTERVALS_MAX = 5.0
+"""Longest part that may lack at the end, in the film's longest interval: it is shown longer."""
 
 
 def read_film(path: Path, capture_rate_hz: float | None = None) -> tuple[FilmInfo, Floats]:
@@ -47,11 +51,12 @@ def read_film(path: Path, capture_rate_hz: float | None = None) -> tuple[FilmInf
         capture_rate_hz: rate at which it was taken, if the file does not say it.
 
     Raises:
-        FileFormatError: the file is no film, or has no pictures.
+        FileFormatError: the file is no film, has no pictures, or is shorter than it says.
         UsageError: the rate is impossible.
     """
     with _open_container(path) as (container, stream):
         times_s = _read_stamps(container, stream, path)
+        _check_length(container, stream, times_s, path)
         tagged = _find_capture_rate_hz(container, stream)
         rotation_deg = _read_rotation_deg(path)
         sideways = rotation_deg % 180 != 0
@@ -64,7 +69,8 @@ def read_film(path: Path, capture_rate_hz: float | None = None) -> tuple[FilmInf
         low, high = _CAPTURE_RATES_HZ
         if not (low <= captured_hz <= high) or not play_rate_hz:
             raise UsageError(
-                f"{path} cannot have been taken at {captured_hz:g} pictures/s",
+                f"the film cannot have been taken at {captured_hz:g} pictures/s",
+                where=str(path),
                 expected=f"a rate between {low:g} and {high:g}, and at least two pictures",
             )
         times_s = times_s * (play_rate_hz / captured_hz)
@@ -108,7 +114,7 @@ def iterate_pictures(
         first, last = int(stamps[begin]), int(stamps[end - 1])
         container.seek(first, stream=stream, backward=True)
         pixel_format = "gray" if is_grey else "bgr24"
-        shown = -1
+        shown = begin - 1
         try:
             for frame in container.decode(stream):
                 if frame.pts is None or frame.pts < first:
@@ -169,6 +175,24 @@ def _read_stamps(container: InputContainer, stream: VideoStream, path: Path) -> 
         raise FileFormatError("the film has no picture with a time", where=str(path))
     base = stream.time_base or Fraction(1, 1)
     return np.asarray((stamps - stamps[0]) * float(base))
+
+
+def _check_length(
+    container: InputContainer, stream: VideoStream, times_s: Floats, path: Path
+) -> None:
+    """Check that a film is as long as its header says: formats without a table break off unseen."""
+    stated_s = 0.0
+    if found := _DURATION.fullmatch(stream.metadata.get("DURATION", "")):  # Matroska, WebM
+        stated_s = int(found[1]) * 3600 + int(found[2]) * 60 + float(found[3])
+    elif container.format.name == "avi" and stream.average_rate:
+        stated_s = float(stream.frames / stream.average_rate)
+    end_s = times_s[-1] + float((stream.start_time or 0) * (stream.time_base or 0))
+    if stated_s - end_s > _MISSING_INTERVALS_MAX * np.max(np.diff(times_s), initial=0.0):
+        raise FileFormatError(
+            f"the film breaks off after {end_s:.2f} s of {stated_s:.2f} s",
+            where=str(path),
+            remedy="Copy the file from the camera again",
+        )
 
 
 def _find_capture_rate_hz(container: InputContainer, stream: VideoStream) -> float | None:

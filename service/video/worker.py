@@ -6,9 +6,11 @@ then the result or an error. It reads the film and writes nothing.
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import resource
+import signal
 import subprocess
 import sys
 import threading
@@ -22,6 +24,8 @@ import numpy as np
 from devices.errors import FileFormatError, FootTileError, StateError, UsageError, require_extra
 from storage.sessions.videos import FilmInfo
 
+_CODE = "from service.video.worker import main; main()"
+_PR_SET_PDEATHSIG = 1  # prctl.h
 _MEMORY_BYTES_MAX = 4 << 30
 _SILENT_S_MAX = 60.0
 """Longest time without a line: a film of 4K shows several pictures a second."""
@@ -82,8 +86,8 @@ def run_film_task(
         FootTileError: of the task.
     """
     request = json.dumps({"task": task, "path": str(path), "options": options})
-    process = subprocess.Popen(  # our own module
-        [sys.executable, "-c", "from service.video.worker import main; main()"],
+    process = subprocess.Popen(  # noqa: S603  # our own module
+        [sys.executable, "-P", "-c", _CODE],  # -P: no module of the working folder
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
@@ -128,6 +132,7 @@ def run_film_task(
 
 def main() -> None:
     """Run the task of the request on the standard input."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)  # no decoder outlives who waits
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES_MAX, _MEMORY_BYTES_MAX))
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

@@ -1,0 +1,101 @@
+"""No film crashes, stops or fills the process that asks about it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from devices.errors import FileFormatError, MissingExtraError
+from service.video import worker
+from service.video.worker import check_extra_installed, describe_film
+from tests.service.video.short_film import PICTURES, RATE_HZ, short_film
+
+pytestmark = pytest.mark.process
+
+_TASK = (
+    "import os, time; from service.video import worker; "
+    "worker._TASKS['read'] = lambda path, **_: ({}); worker.main()"
+)
+"""Code of a process whose task is this expression."""
+
+
+@pytest.fixture
+def film(tmp_path: Path) -> Path:
+    path = tmp_path / "kept.mp4"
+    path.write_bytes(short_film())
+    return path
+
+
+@pytest.mark.parametrize(
+    ("suffix", "codec"), [(".mp4", "libx264"), (".webm", "libvpx-vp9"), (".mkv", "libx264")]
+)
+def test_a_whole_film_is_described_and_a_cut_one_refused(
+    tmp_path: Path, suffix: str, codec: str
+) -> None:
+    film, whole = tmp_path / f"film{suffix}", short_film(suffix, codec)
+    film.write_bytes(whole)
+    info = describe_film(film, "walk")
+    assert (info.picture_count, info.width_px, info.height_px) == (PICTURES, 64, 48)
+    assert info.rate_hz == pytest.approx(RATE_HZ, rel=0.05)
+    film.write_bytes(whole[: len(whole) * 2 // 5])
+    with pytest.raises(FileFormatError, match=r"walk: the f.* (breaks off after|be read as)"):
+        describe_film(film, "walk")
+
+
+@pytest.mark.parametrize(
+    ("act", "said"),
+    [
+        ("os.kill(os.getpid(), 11)", "ended with signal 11"),
+        ("os._exit(3)", "ended with code 3"),
+        ("bytearray(8 << 30)", "needs more than 4 GiB"),
+        ("open('/dev/null', 'wb') and open(path, 'ab').write(b'x' * 9999)", "ended with"),
+    ],
+)
+def test_a_decoder_that_crashes_is_an_error_that_names_the_film(
+    film: Path, monkeypatch: pytest.MonkeyPatch, act: str, said: str
+) -> None:
+    monkeypatch.setattr(worker, "_CODE", _TASK.format(act))
+    with pytest.raises(FileFormatError, match=said) as caught:
+        describe_film(film, "walk.mp4")
+    assert caught.value.where == "walk.mp4"
+    assert film.read_bytes() == short_film()
+
+
+def test_a_decoder_that_hangs_is_ended(film: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker, "_CODE", _TASK.format("time.sleep(60)"))
+    monkeypatch.setattr(worker, "_SILENT_S_MAX", 1.0)
+    begun_s = time.monotonic()
+    with pytest.raises(FileFormatError, match="hung for 1"):
+        describe_film(film, "walk.mp4")
+    assert time.monotonic() - begun_s < 30.0
+    assert psutil.Process().children() == []
+
+
+def test_a_decoder_ends_with_the_process_that_waits_for_it(film: Path) -> None:
+    begun = film.with_name("begun")
+    hang = _TASK.format(f"os.mkdir({str(begun)!r}), time.sleep(60)")
+    code = (
+        "import sys; from pathlib import Path; from service.video import worker\n"
+        f"worker._CODE = {hang!r}\n"
+        "worker.describe_film(Path(sys.argv[1]), 'x')"
+    )
+    with subprocess.Popen([sys.executable, "-c", code, str(film)]) as process:
+        while not begun.exists():
+            time.sleep(0.05)
+        children = psutil.Process(process.pid).children()
+        process.kill()
+    assert len(children) == 1
+    _, alive = psutil.wait_procs(children, timeout=20.0)
+    assert alive == []
+
+
+def test_without_the_extra_the_error_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    check_extra_installed()
+    monkeypatch.setattr(worker, "find_spec", lambda _: None)
+    with pytest.raises(MissingExtraError, match=r"a film needs av.*'foottile\[video\]'"):
+        check_extra_installed()
