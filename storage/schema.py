@@ -152,6 +152,13 @@ ESTIMATE_COLUMNS = (
 )
 """Columns that the estimator computes: `service.estimation.records.Estimates`."""
 
+ANGLE_COLUMNS = (
+    Column("angle_source", pa.string(), "1", "what measured angle_rad: video, or none"),
+    Column("angle_sigma_rad", _F32, "rad", "standard uncertainty of angle_rad"),
+    Column("cop_ground_sigma_x_m", _F32, "m", "standard uncertainty of cop_ground_x_m"),
+)
+"""Columns beside the estimates if their angle is from a table: `foottile estimate --angle`."""
+
 TRUTH_COLUMNS = (
     Column("true_force_n", pa.float64(), "N", "emulation: force on the dome along its axis", True),
     Column("true_grf_n", pa.float64(), "N", "emulation: vertical sum of the dome forces"),
@@ -202,6 +209,7 @@ COLUMNS_BY_NAME = {
         *MEASURED_COLUMNS,
         *PART_COLUMNS,
         *ESTIMATE_COLUMNS,
+        *ANGLE_COLUMNS,
         *TRUTH_COLUMNS,
         *INDENTER_COLUMNS,
         *SERVER_TIME_COLUMNS,

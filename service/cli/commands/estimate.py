@@ -76,6 +76,13 @@ def estimate_command(
         str | None,
         typer.Option(metavar="A,B", help="Unloaded interval in seconds from the first frame."),
     ] = None,
+    angle: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="TABLE",
+            help="Angle of the foot in place of the servo's, as `foottile video track` writes it.",
+        ),
+    ] = None,
     start_s: StartOption = None,
     end_s: EndOption = None,
     unquantized: UnquantizedOption = False,
@@ -101,6 +108,7 @@ def estimate_command(
     from service.offline.archive.locations import is_remote
     from service.offline.archive.tasks import EstimateTask
     from service.offline.estimate.session import estimate_session
+    from service.offline.estimate.table_angle import read_angle_track
     from service.offline.estimate_summary import (
         compute_estimate_change,
         read_stored_estimates,
@@ -127,6 +135,8 @@ def estimate_command(
         estimator=used,
     )
     if not is_single_session(sessions, batch.manifest) or is_remote(out):
+        if angle is not None:
+            raise UsageError("--angle is the table of one session", expected="one session")
         task = replace(task, calibration=_embed_calibration(calibration))
         summary = run_task(task, sessions, batch, out=out, as_json=as_json)
         if summary.states["failed"]:
@@ -135,12 +145,14 @@ def estimate_command(
     (session,) = map(Path, sessions or ())
     # The output may be the input: it is replaced atomically, and keeps all raw data.
     path = resolve_output_path(
-        _add_suffix(Path(out)), *(Path(name) for name in (calibration, scene) if name is not None)
+        _add_suffix(Path(out)),
+        *(Path(name) for name in (calibration, scene, angle) if name is not None),
     )
+    track = None if angle is None else read_angle_track(angle)
     source = session / FRAMES_NAME if session.is_dir() else session
     with show_progress(f"estimating {session}"):
         before = read_stored_estimates(source)
-        result = estimate_session(source, path, task, on_remark=remark)
+        result = estimate_session(source, path, task, on_remark=remark, angle=track)
         after = None if before is None else read_stored_estimates(path)
     change = None if before is None or after is None else compute_estimate_change(before, after)
     plan = result.plan

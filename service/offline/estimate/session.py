@@ -35,6 +35,7 @@ from service.offline.estimate.preparation import (
     prepare_estimate,
     select_tares_in_force,
 )
+from service.offline.estimate.table_angle import AngleTrack, TableServo
 from service.offline.estimate_summary import EstimateSummarizer, EstimateSummary
 from service.sessions.estimate_stream import EstimateOptions, EstimateStream, make_estimate_metadata
 from service.sessions.stances import StancesWriter
@@ -53,6 +54,8 @@ _WHOLE_SESSION_NOTES = frozenset({"session", "ledger"})
 """Notes of a session that do not hold for a part of it."""
 _ESTIMATOR_NOTE = "estimator"
 """Note of the estimator, if it is not that of the models."""
+_ANGLE_NOTE = "angle"
+"""Note of the table that the angle is from, if it is not the servo's."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,7 @@ def estimate_session(
     *,
     on_remark: Callable[[str], None],
     with_findings: bool = True,
+    angle: AngleTrack | None = None,
 ) -> EstimateResult:
     """Estimate a session.
 
@@ -98,6 +102,7 @@ def estimate_session(
         request: options of the estimate.
         on_remark: called with each remark.
         with_findings: True to compute findings, which doubles the run time.
+        angle: of the segment, in place of the servo's; None: the servo's.
 
     Raises:
         FootTileError: the session, scene, calibration or tare is not usable, or the part has no
@@ -111,8 +116,15 @@ def estimate_session(
         )
     with SealedFileReader(source, only_slices=not part.has_all_rows_and_columns) as session:
         what = prepare_estimate(session, request, on_remark)
-        begin_t_ns = session.read_span_on_axis_ns()[0] if session.footer.rows_by_group else 0
+        span_ns = session.read_span_on_axis_ns() if session.footer.rows_by_group else (0, 0)
         notes, stretch = dict(session.notes), EstimationRange()
+        notes.pop(_ANGLE_NOTE, None)  # of an earlier estimate
+        info, servo = what.info, None
+        if angle is not None:
+            servo = TableServo(info, request.scene, angle, session.time_axis)
+            servo.check_overlap(*span_ns)
+            what = replace(what, info=servo.info)
+            notes[_ANGLE_NOTE] = angle.origin
         if session.time_axis.is_shifted:  # the output may have no clock table beside it
             notes[TIME_AXIS_NOTE] = session.time_axis.to_json_list()
         if not part.has_all_rows_and_columns:
@@ -127,16 +139,21 @@ def estimate_session(
             session.read_batches(*what.kept_columns, row_groups=stretch.row_groups),
             where=str(source),
         )
+        if servo is not None:
+            ordered = servo.replace_positions(ordered)
         given = stretch.select_output(stream.estimate_batches(stretch.select_needed(ordered)))
         watched = given if judged is None else judged.observe(given, stream)
-        frames = _write_estimates(out, what, notes, stream, watched, on_remark)
+        if servo is not None:
+            watched = servo.restore_positions(watched)
+        written = replace(what, info=info)
+        frames = _write_estimates(out, written, notes, stream, watched, on_remark)
     if not frames or stream.plan is None:
         problem = "the session has no frames" + (
             "" if part.has_all_rows_and_columns else " in that time"
         )
         raise FileFormatError(problem, where=str(source))
     found = () if judged is None else judged.finish(stream.plan)
-    return EstimateResult(frames, stream.plan, begin_t_ns, *found)
+    return EstimateResult(frames, stream.plan, span_ns[0], *found)
 
 
 def _write_estimates(

@@ -1,0 +1,200 @@
+"""Angle of the foot segment from a table, in place of the servo's.
+
+The estimator gets it as the position of a fine servo that was read at the instant of each frame:
+so one estimator serves live, offline and films. Where the table states no angle there is none,
+whatever the servo measured. The frames themselves keep the servo's counts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.arrays import Columns, Floats, Times
+from devices.errors import FileFormatError, UsageError
+from devices.flags import FrameFlag
+from devices.frames import NO_SERVO_COUNTS, ArrayInfo, ServoInfo
+from devices.scene.scene_file import Scene
+from service.offline.estimate.preparation import BatchWithColumns
+from storage.formats.angle_table import UNKNOWN_ANGLE, VIDEO, read_angle_table
+from storage.parquet_hash import compute_sha256
+from storage.sessions.time_axis import TimeAxis
+from storage.sessions.videos import VIDEO_NAME, read_video
+
+GAP_MAX_NS = 100_000_000
+"""Longest time between two angles in which it is interpolated."""
+_COUNTS_PER_TURN = 1 << 24
+_UNKNOWN = np.uint8(FrameFlag.SERVO_STALE | FrameFlag.SERVO_TURN_UNKNOWN)
+_REPLACED = ("servo_counts", "servo_age_us", "frame_flags")
+
+
+class AngleTrack(NamedTuple):
+    """Known angles at n instants of a session, rising.
+
+    Attributes:
+        t_ns: (n,), on the session's time axis.
+        angle_rad: (n,).
+        sigma_rad: (n,), standard deviations.
+        sigma_ns: (n,), of the instants.
+        source: (n,), what measured them.
+        origin: name and hash of the table's file.
+    """
+
+    t_ns: Times
+    angle_rad: Floats
+    sigma_rad: Floats
+    sigma_ns: Floats
+    source: npt.NDArray[np.str_]
+    origin: Mapping[str, str]
+
+    def interpolate(self, t_ns: Times) -> tuple[Floats, Floats, npt.NDArray[np.str_]]:
+        """Interpolate to instants: angle and its standard deviation, NaN where unknown; source.
+
+        The deviation has three parts: of the angles, of their instants, and of the straight line
+        between them, by the bend of the angle there.
+        """
+        after = np.clip(np.searchsorted(self.t_ns, t_ns), 1, len(self.t_ns) - 1)
+        before = after - 1
+        step_ns = self.t_ns[after] - self.t_ns[before]
+        part = (t_ns - self.t_ns[before]) / step_ns
+        is_known = (part >= 0.0) & (part <= 1.0)
+        is_known &= (step_ns <= GAP_MAX_NS) | (part == 0.0) | (part == 1.0)
+        rise_rad = self.angle_rad[after] - self.angle_rad[before]
+        angle_rad = self.angle_rad[before] + part * rise_rad
+        since_s = (self.t_ns - self.t_ns[0]) * 1e-9
+        bends = np.abs(np.gradient(np.gradient(self.angle_rad, since_s), since_s))
+        bend = np.maximum(bends[before], bends[after])
+        sigma_rad = np.sqrt(
+            ((1.0 - part) * self.sigma_rad[before]) ** 2
+            + (part * self.sigma_rad[after]) ** 2
+            + (rise_rad / step_ns * self.sigma_ns[before]) ** 2
+            + (0.5e-18 * bend * part * (1.0 - part) * step_ns**2) ** 2
+        )
+        source = np.where(is_known, self.source[before], UNKNOWN_ANGLE)
+        nothing = np.full(len(t_ns), math.nan)
+        return (
+            np.where(is_known, angle_rad, nothing),
+            np.where(is_known, sigma_rad, nothing),
+            source,
+        )
+
+
+def read_angle_track(path: Path) -> AngleTrack:
+    """Read a table of angles; a film's times are converted by the alignment beside it.
+
+    Raises:
+        FileFormatError: as `read_angle_table`.
+        UsageError: the table has times of a film that is not aligned with the session.
+    """
+    table = read_angle_table(path)
+    t_ns, sigma_ns = table.t_ns, table.sigma_ns
+    if table.film_s is not None and (path.parent / VIDEO_NAME).exists():
+        alignment = read_video(path.parent).alignment  # the newest, also if the table is older
+        if alignment is not None:
+            t_ns = alignment.t_ns + np.rint(alignment.to_session_ns(table.film_s)).astype(np.int64)
+            sigma_ns = alignment.compute_sigma_ns(table.film_s)
+    if t_ns is None:
+        raise UsageError(
+            f"{path} has times of a film that is not aligned with the session",
+            expected="an aligned video beside it, or a column t_ns",
+            remedy="Align it: foottile video align, then track it again, or leave the table there",
+        )
+    is_known = ~np.isnan(table.angle_rad)
+    count = len(t_ns)
+    source = np.full(count, VIDEO) if table.angle_source is None else table.angle_source
+    return AngleTrack(
+        t_ns[is_known],
+        table.angle_rad[is_known],
+        table.sigma_rad[is_known],
+        (np.zeros(count) if sigma_ns is None else np.nan_to_num(sigma_ns))[is_known],
+        source.astype(np.str_)[is_known],
+        {"table": path.name, "sha256": compute_sha256(path)},
+    )
+
+
+class TableServo:
+    """Servo whose positions are a table's angles.
+
+    Args:
+        info: array of the session.
+        scene: its scene, for a session without a servo: how the ankle travels; None: not known.
+        track: angles.
+        axis: time axis of the session.
+
+    Attributes:
+        info: the array with this servo.
+    """
+
+    def __init__(
+        self, info: ArrayInfo, scene: Scene | None, track: AngleTrack, axis: TimeAxis
+    ) -> None:
+        servo = info.servo or (None if scene is None else scene.servo)
+        self._travel = None if servo is None else servo.ankle_travel_m_per_rad
+        self._track, self._axis = track, axis
+        self.info = info.model_copy(
+            update={
+                "servo": ServoInfo(
+                    model="table of angles",
+                    counts_per_turn=_COUNTS_PER_TURN,
+                    zero_counts=0,
+                    sign=1,
+                    ratio=1.0,
+                    ankle_travel_m_per_rad=self._travel,
+                )
+            }
+        )
+
+    def check_overlap(self, first_ns: int, last_ns: int) -> None:
+        """Refuse a table without an angle in the session.
+
+        Raises:
+            FileFormatError: it lies before or after these instants.
+        """
+        begin_s, end_s = ((int(self._track.t_ns[i]) - first_ns) * 1e-9 for i in (0, -1))
+        if end_s < 0.0 or begin_s * 1e9 > last_ns - first_ns:
+            raise FileFormatError(
+                f"the table's angles are from {begin_s:.1f} to {end_s:.1f} s of the session, which "
+                f"is {(last_ns - first_ns) * 1e-9:.1f} s long",
+                expected="a table of this session",
+                remedy="Check the video's alignment",
+            )
+
+    def replace_positions(self, pieces: Iterable[BatchWithColumns]) -> Iterator[BatchWithColumns]:
+        """Yield frames with the table's angle as the servo's; their own is in the columns."""
+        for frames, columns in pieces:
+            t_ns = self._axis.shift_to_axis(frames.t_ns, columns.get("part"))
+            angle_rad, sigma_rad, source = self._track.interpolate(t_ns)
+            counts = np.rint(angle_rad * (_COUNTS_PER_TURN / (2.0 * math.pi)))
+            given = replace(
+                frames,
+                servo_counts=np.where(np.isnan(counts), NO_SERVO_COUNTS, counts).astype(np.int32),
+                servo_age_us=np.zeros_like(frames.servo_age_us),
+                frame_flags=frames.frame_flags & ~_UNKNOWN,
+            )
+            kept = {name: getattr(frames, name) for name in _REPLACED}
+            yield given, {**columns, **kept, "angle_source": source, "angle_sigma_rad": sigma_rad}
+
+    def restore_positions(self, pieces: Iterable[BatchWithColumns]) -> Iterator[BatchWithColumns]:
+        """Yield estimated frames with their own servo, and the uncertainty on the ground."""
+        for frames, columns in pieces:
+            own = {name: columns[name] for name in _REPLACED}
+            others = {name: values for name, values in columns.items() if name not in own}
+            others["cop_ground_sigma_x_m"] = self._compute_ground_sigma_m(columns)
+            yield replace(frames, **own), others
+
+    def _compute_ground_sigma_m(self, columns: Columns) -> Floats:
+        """Compute the standard deviation of the COP's x on the ground."""
+        z_m = np.array([tile.z_m for tile in self.info.tiles])
+        force_n = np.nan_to_num(columns["force_n"])
+        total_n = force_n.sum(axis=1)
+        at_z_m = force_n @ z_m / np.where(total_n == 0.0, math.nan, total_n)
+        angle_rad, x_m = columns["angle_rad"], columns["cop_x_m"]
+        travel_m = math.nan if self._travel is None else self._travel
+        slope_m = travel_m - x_m * np.sin(angle_rad) + at_z_m * np.cos(angle_rad)
+        return np.asarray(np.hypot(columns["cop_sigma_x_m"], slope_m * columns["angle_sigma_rad"]))

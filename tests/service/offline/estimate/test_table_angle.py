@@ -1,0 +1,203 @@
+"""A session estimated with the angle of a table in place of the servo's."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from devices.errors import FileFormatError, UsageError
+from devices.flags import FrameFlag
+from devices.frames import NO_SERVO_COUNTS, ServoInfo
+from service.offline.estimate.preparation import EstimateRequest
+from service.offline.estimate.session import estimate_session
+from service.offline.estimate.table_angle import AngleTrack, read_angle_track
+from storage.formats.angle_table import ANGLE_NAME, AngleTable
+from storage.formats.slice import Slice
+from storage.schema import ANGLE_COLUMNS, ESTIMATE_COLUMNS, MEASURED_COLUMNS
+from storage.sessions.reader import SealedFileReader
+from storage.sessions.videos import Alignment, FilmInfo, Video, write_video
+from storage.sessions.writer import SealedFileWriter
+from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array, make_servo
+from tests.service.sessions.pieces import calibration, frames, hopping
+
+N = 3000
+INTERVAL_NS = 20_000_000
+_NAMES = [column.name for column in (*MEASURED_COLUMNS, *ESTIMATE_COLUMNS)]
+_ANGLE_NAMES = [column.name for column in ANGLE_COLUMNS]
+
+
+def swing(t_ns: np.ndarray) -> np.ndarray:
+    return 0.3 * np.sin(2.0 * math.pi * 0.7e-9 * (t_ns - UTC_NS))
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session whose servo stands still and is stale half of the time."""
+    return write_session(tmp_path_factory.mktemp("raw") / "raw.parquet", make_servo())
+
+
+def write_session(path: Path, servo: ServoInfo | None) -> Path:
+    notes = {"calibration": calibration().model_dump(mode="json")}
+    batch = frames(hopping(N, loaded_from=300), lead=200, servo_counts=2048, servo_age_us=500)
+    batch.frame_flags[N // 2 :] |= np.uint8(FrameFlag.SERVO_STALE)
+    with SealedFileWriter(path, make_array(servo=servo), notes) as writer:
+        writer.append_frames(batch, {})
+    return path
+
+
+def make_track(sigma_rad: float = 1e-3, sigma_ns: float = 0.0) -> AngleTrack:
+    t_ns = np.arange(UTC_NS, UTC_NS + N * PERIOD_NS, INTERVAL_NS)
+    count = len(t_ns)
+    noise_rad = np.random.default_rng(3).normal(0.0, sigma_rad, count)
+    return AngleTrack(
+        t_ns,
+        swing(t_ns) + noise_rad,
+        np.full(count, sigma_rad),
+        np.full(count, sigma_ns),
+        np.full(count, "video"),
+        {"table": "angle.csv"},
+    )
+
+
+def estimate(
+    source: Path, out: Path, angle: AngleTrack | None, part: Slice | None = None
+) -> dict[str, np.ndarray]:
+    request = EstimateRequest(
+        calibration=None,
+        models=("static", "denoise"),
+        lag_ms=100.0,
+        scene=None,
+        tare_s=None,
+        part=part or Slice(),
+        unquantized=True,
+    )
+    estimate_session(source, out, request, on_remark=lambda _: None, angle=angle)
+    with SealedFileReader(out) as session:
+        names = [*_NAMES, *(_ANGLE_NAMES if angle is not None else ())]
+        assert session.has_columns(*_ANGLE_NAMES) == (angle is not None)
+        assert ("angle" in session.notes) == (angle is not None)
+        pieces = list(session.read_quantities(*names))
+    return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
+
+
+def test_the_tables_angle_moves_the_ground_and_nothing_else(raw: Path, tmp_path: Path) -> None:
+    by_servo = estimate(raw, tmp_path / "servo.parquet", None)
+    by_table = estimate(raw, tmp_path / "table.parquet", make_track())
+    for name in set(_NAMES) - {"angle_rad", "cop_ground_x_m", "cop_ground_y_m"}:
+        np.testing.assert_array_equal(by_table[name], by_servo[name], err_msg=name)
+    known = by_table["angle_source"] == "video"
+    assert known.sum() > 0.99 * N
+    off_rad = by_table["angle_rad"] - swing(by_table["t_ns"])
+    ratio = off_rad[known] / by_table["angle_sigma_rad"][known]
+    assert 0.7 < np.sqrt(np.mean(ratio**2)) < 1.2
+    # In the COP on the ground, too, also where the servo was stale.
+    on_ground = ~np.isnan(by_table["cop_ground_x_m"])
+    assert on_ground[N // 2 :].any()
+    assert np.all(
+        by_table["cop_ground_sigma_x_m"][on_ground] >= by_table["cop_sigma_x_m"][on_ground]
+    )
+    x_m, angle_rad = by_table["cop_x_m"], by_table["angle_rad"]
+    expected_m = 0.15 * angle_rad + x_m * np.cos(angle_rad) - 0.15 * np.sin(angle_rad)
+    np.testing.assert_allclose(
+        by_table["cop_ground_x_m"][on_ground], expected_m[on_ground], atol=1e-6
+    )
+
+
+def test_where_the_table_has_a_gap_the_angle_is_unknown_and_never_the_servos(
+    raw: Path, tmp_path: Path
+) -> None:
+    whole = make_track()
+    seen = np.ones(len(whole.t_ns), dtype=np.bool_)
+    seen[[50, *range(100, 110)]] = False  # one picture is no gap
+    track = AngleTrack(
+        whole.t_ns[seen],
+        whole.angle_rad[seen],
+        whole.sigma_rad[seen],
+        whole.sigma_ns[seen],
+        whole.source[seen],
+        whole.origin,
+    )
+    found = estimate(raw, tmp_path / "out.parquet", track)
+    t_ns = found["t_ns"]
+    unknown = (t_ns > whole.t_ns[99]) & (t_ns < whole.t_ns[110])
+    unknown |= t_ns > whole.t_ns[-1]
+    np.testing.assert_array_equal(found["angle_source"] == "none", unknown)
+    for name in ("angle_rad", "angle_sigma_rad", "cop_ground_x_m", "cop_ground_sigma_x_m"):
+        assert np.isnan(found[name][unknown]).all(), name
+    assert not np.isnan(found["angle_rad"][~unknown]).any()
+
+
+def test_a_part_has_the_values_of_the_whole(raw: Path, tmp_path: Path) -> None:
+    whole = estimate(raw, tmp_path / "whole.parquet", make_track())
+    part = estimate(raw, tmp_path / "part.parquet", make_track(), Slice(2.0, 3.0))
+    inside = np.isin(whole["seq"], part["seq"])
+    assert inside.sum() == 500
+    for name in ("angle_rad", "angle_sigma_rad", "angle_source"):
+        np.testing.assert_array_equal(part[name], whole[name][inside])
+
+
+def test_a_session_without_a_servo_gets_the_angle_alone(tmp_path: Path) -> None:
+    raw = write_session(tmp_path / "raw.parquet", None)
+    found = estimate(raw, tmp_path / "out.parquet", make_track())
+    assert np.isfinite(found["angle_rad"]).sum() > 0.99 * N
+    assert np.isnan(found["cop_ground_x_m"]).all()
+    assert (found["servo_counts"] == 2048).all()
+    assert NO_SERVO_COUNTS not in found["servo_counts"]
+
+
+def test_an_uncertain_instant_makes_a_fast_angle_uncertain() -> None:
+    track = make_track(sigma_rad=1e-6, sigma_ns=10e6)
+    t_ns = track.t_ns[:200] + INTERVAL_NS // 2
+    _, sigma_rad, _ = track.interpolate(t_ns)
+    rate_rad_s = np.abs(np.gradient(swing(t_ns), INTERVAL_NS * 1e-9))
+    np.testing.assert_allclose(sigma_rad, 0.010 * rate_rad_s, atol=6e-4)
+
+
+def test_a_table_of_another_time_is_refused(raw: Path, tmp_path: Path) -> None:
+    track = make_track()
+    other = track._replace(t_ns=track.t_ns + 3_600_000_000_000)
+    with pytest.raises(
+        FileFormatError, match=r"from 3600.0 to 3606.0 s of the session.*6.0 s long"
+    ):
+        estimate(raw, tmp_path / "out.parquet", other)
+    assert not (tmp_path / "out.parquet").exists()
+
+
+def test_a_films_table_takes_the_alignment_beside_it(tmp_path: Path) -> None:
+    film_s = np.array([0.0, 0.02, 0.04, 0.06])
+    table = AngleTable(np.zeros(4), np.full(4, 1e-3), film_s=film_s)
+    table.write(tmp_path / ANGLE_NAME)
+    with pytest.raises(UsageError, match="not aligned"):
+        read_angle_track(tmp_path / ANGLE_NAME)
+    alignment = Alignment(
+        method="hand",
+        film_s=0.0,
+        t_ns=UTC_NS,
+        drift=1e-3,
+        sigma_ns=2e6,
+        sigma_drift=0.0,
+        pair_count=1,
+        rejected_count=0,
+    )
+    film = FilmInfo(
+        codec="h264",
+        width_px=2,
+        height_px=2,
+        rotation_deg=0,
+        picture_count=4,
+        duration_s=0.06,
+        rate_hz=50.0,
+        is_variable=False,
+        capture_rate_hz=None,
+    )
+    video = Video(
+        id="0" * 12, name="a.mp4", suffix=".mp4", size_bytes=1, sha256="0" * 64, added_t_ns=1,
+        film=film, alignment=alignment,
+    )  # fmt: skip
+    write_video(tmp_path, video)
+    found = read_angle_track(tmp_path / ANGLE_NAME)
+    np.testing.assert_array_equal(found.t_ns, UTC_NS + np.arange(4) * 20_020_000)
+    assert found.sigma_ns.tolist() == [2e6] * 4
