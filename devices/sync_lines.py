@@ -1,4 +1,4 @@
-"""Sync lines of a Raspberry Pi: edges of other instruments, and a signal while recording.
+"""Sync lines of a Raspberry Pi: edges of other instruments, and a signal or lamp while recording.
 
 The kernel stamps each edge with CLOCK_MONOTONIC, the clock of the frames. Edges are read with each
 frame, without waiting, so that those before a frame are known when it is stored. They have not
@@ -8,15 +8,19 @@ been run on a Raspberry Pi by this project: tests cover the calls of libgpiod wi
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import timedelta
+from threading import Thread
 from typing import TYPE_CHECKING, Protocol
 
 from devices.acquisition import AcquiredFrame, FrameSink
+from devices.clock import Clock, SystemClock
 from devices.errors import require_extra
 from devices.frames import Edge
 from devices.gpio import translate_gpio_errors
+from devices.lamp_code import BIT_NS, LAMP_LATE_NS, is_lamp_on, make_code
 from devices.scene.hardware_sections import SyncSection
 
 if TYPE_CHECKING:
@@ -29,6 +33,8 @@ _KERNEL_EDGES_MAX = 1024
 """Edges that wait in the kernel, its limit; it drops the oldest, as a gap in `line_seqno`."""
 _DROP_WARNING_NS = 1_000_000_000
 """Time for which dropped edges are a warning."""
+_LATE_SWITCHES = 64
+"""Number of switches over which their lateness is averaged."""
 
 
 def _request_line(scene: SyncSection, line: int, settings: LineSettings) -> LineRequest:
@@ -163,39 +169,82 @@ class EdgeReader:
 
 
 class RecordingLine:
-    """Output line that is high while a session is recorded.
+    """Output line that is high while a session is recorded, or switches a lamp by its code.
+
+    A thread switches the lamp at the edges of the code's bits, late as the system is busy.
 
     Args:
         scene: its section.
         line: its `output_line`.
+        clock: clock of the code.
 
     Raises:
         MissingExtraError: gpiod is not installed.
         BusSetupError: the line is not there, in use, or forbidden.
     """
 
-    def __init__(self, scene: SyncSection, line: int) -> None:
-        self.warning = ""
-        """Reason why the line may have another level; empty if it has the right one."""
+    def __init__(
+        self,
+        scene: SyncSection,
+        line: int,
+        clock: Clock = SystemClock(),  # noqa: B008
+    ) -> None:
         with require_extra("gpio", "the recording line"):
             from gpiod import LineSettings
             from gpiod.line import Direction
         self._line = line
+        self._clock = clock
+        self._problem = ""
+        self._is_recording = self._is_closed = False
+        self._late_ns = deque[int](maxlen=_LATE_SWITCHES)
         low = LineSettings(direction=Direction.OUTPUT)
         self._request = _request_line(scene, line, low)
+        self._blinking: Thread | None = None
+        if scene.output == "code":
+            make_code()  # not at the first edge
+            self._blinking = Thread(target=self._blink, name="lamp", daemon=True)
+            self._blinking.start()
+
+    @property
+    def warning(self) -> str:
+        """Reason why the line may have another level; empty if it has the right one."""
+        if self._problem:
+            return f"the recording line cannot be driven: {self._problem}"
+        late_ns = sum(self._late_ns) / max(1, len(self._late_ns))
+        if self._is_recording and late_ns > LAMP_LATE_NS:
+            return (
+                f"the lamp is switched late; {late_ns * 1e-6:.0f} ms on average: films aligned by "
+                "it are as much too early. Run less beside the node"
+            )
+        return ""
 
     def drive(self, *, high: bool) -> None:
-        """Drive the line; a failure is a warning."""
+        """Drive the line, the lamp from its next bit; a failure is a warning."""
+        self._is_recording = high
+        if self._blinking is None:
+            self._set_level(high=high)
+
+    def _blink(self) -> None:
+        while not self._is_closed:
+            edge_ns = (self._clock.now_ns() // BIT_NS + 1) * BIT_NS
+            self._clock.sleep_until_ns(edge_ns)
+            self._set_level(high=self._is_recording and is_lamp_on(self._clock.now_ns()))
+            self._late_ns.append(self._clock.now_ns() - edge_ns)
+
+    def _set_level(self, *, high: bool) -> None:
         from gpiod.line import Value
 
         try:
             self._request.set_value(self._line, Value.ACTIVE if high else Value.INACTIVE)
-            self.warning = ""
+            self._problem = ""
         except OSError as error:
-            self.warning = f"the recording line cannot be driven: {error.strerror or error}"
+            self._problem = error.strerror or str(error)
 
     def close(self) -> None:
         """Drive the line low and release it."""
-        self.drive(high=False)
+        self._is_closed = True
+        if self._blinking is not None:
+            self._blinking.join()
+        self._set_level(high=False)
         with suppress(OSError):
             self._request.release()

@@ -1,11 +1,5 @@
-"""Code of a lamp on the robot, and the lamp in a film.
+"""Lamp of the node in a film: the part of the picture whose brightness follows its code.
 
-While a session is recorded, the node switches a lamp by a pseudo-random code, a function
-of its clock alone: a maximum length sequence of 2^15 - 1 bits (x^15 + x^14 + 1) of 93 ms each,
-which repeats after 51 minutes. 93 ms is a multiple of no usual picture's interval, so edges of the
-code fall on all phases of it.
-
-In the film the lamp is the part of the picture whose brightness follows the code at some offset.
 A picture shows the mean of the code over its exposure, which is unknown. So for each window of the
 film the misfit is computed over a grid of offsets and exposures, and offset and uncertainty are the
 moments of its posterior: without a difference between pictures of one interval the offset is
@@ -18,14 +12,9 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from devices.arrays import Floats
-
-BIT_NS = 93_000_000
-"""Duration of a bit."""
-_ORDER = 15
-CODE_BITS = 2**_ORDER - 1
+from devices.lamp_code import BIT_NS, CODE_BITS, make_code
 
 _WINDOW_S = 6.0
 """Length of a window: 64 bits."""
@@ -35,20 +24,6 @@ _SHARE_OF_INTERVAL = 1.0 / 24.0
 """Step of the offsets in the fine grid, in intervals of pictures."""
 _EXPOSURES = np.linspace(0.0, 1.0, 9)[1:]
 """Exposures of the grid, in intervals of pictures."""
-
-
-@cache
-def make_code() -> npt.NDArray[np.int8]:
-    """Make the code, (`CODE_BITS`,), of 0 and 1."""
-    bits = np.ones(CODE_BITS, dtype=np.int8)
-    for i in range(_ORDER, CODE_BITS):
-        bits[i] = bits[i - _ORDER] ^ bits[i - _ORDER + 1]
-    return bits
-
-
-def is_lamp_on(t_mono_ns: int) -> bool:
-    """Return whether the lamp is on at an instant of the node's CLOCK_MONOTONIC."""
-    return bool(make_code()[t_mono_ns // BIT_NS % CODE_BITS])
 
 
 @cache

@@ -5,15 +5,19 @@ from __future__ import annotations
 import errno
 import os
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from devices.acquisition import AcquiredFrame
 from devices.errors import BusSetupError, MissingExtraError
 from devices.frames import Edge
+from devices.lamp_code import BIT_NS, LAMP_LATE_NS, is_lamp_on
 from devices.scene.hardware_sections import SyncSection
 from devices.sync_lines import EdgeReader, RecordingLine, SyncInput
 from tests.devices.array.gpio_chip import EMULATED_GPIOD, FileChip
@@ -215,3 +219,91 @@ def test_a_recording_line_that_fails_is_a_warning(
 def test_the_bound_contains_what_debouncing_delays() -> None:
     assert SyncSection(input_line=1).bound_ns == 200_000
     assert SyncSection(input_line=1, debounce_us=500).bound_ns == 10_700_000
+
+
+class LateClock:
+    """A clock whose sleeps end late, and block after some of them."""
+
+    def __init__(self, late_ns: list[int]) -> None:
+        self.late_ns = late_ns
+        self.edges_ns: list[int] = []
+        self.is_over = threading.Event()
+        self._t_ns = 10**13
+
+    def now_ns(self) -> int:
+        return self._t_ns
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        if len(self.edges_ns) == len(self.late_ns):
+            self.is_over.set()
+            threading.Event().wait(0.01)
+            return
+        self._t_ns = t_ns + self.late_ns[len(self.edges_ns)]
+        self.edges_ns.append(t_ns)
+
+
+@pytest.fixture
+def lamp_scene(chip: FileChip) -> SyncSection:
+    return SyncSection(gpiochip=str(chip.path), output_line=27, output="code")
+
+
+def test_the_lamp_has_the_level_of_each_bit_from_its_edge_while_recording(
+    chip: FileChip, lamp_scene: SyncSection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    generator = np.random.default_rng(4)
+    clock = LateClock(generator.integers(0, LAMP_LATE_NS, 400).tolist())
+    driven: list[tuple[int, bool]] = []
+
+    def drive(line: RecordingLine, *, high: bool) -> None:
+        driven.append((clock.now_ns(), high))
+
+    monkeypatch.setattr(RecordingLine, "_set_level", drive)
+    line = RecordingLine(lamp_scene, 27, clock)
+    line.drive(high=True)
+    assert clock.is_over.wait(5.0)
+    assert line.warning == ""
+    line.close()
+    begun = next(row for row, (_, high) in enumerate(driven) if high)
+    for (t_ns, high), edge_ns in zip(driven[begun:300], clock.edges_ns[begun:300], strict=True):
+        assert edge_ns % BIT_NS == 0
+        assert 0 <= t_ns - edge_ns <= LAMP_LATE_NS
+        assert high == is_lamp_on(edge_ns)
+    assert np.diff(clock.edges_ns).tolist() == [BIT_NS] * 399
+    assert driven[-1][1] is False
+
+
+def test_a_lamp_that_is_late_is_a_warning_until_it_is_not(
+    chip: FileChip, lamp_scene: SyncSection
+) -> None:
+    for late_ns, is_warned in ((3 * LAMP_LATE_NS, True), (LAMP_LATE_NS // 2, False)):
+        clock = LateClock([late_ns] * 70)
+        line = RecordingLine(lamp_scene, 27, clock)
+        line.drive(high=True)
+        assert clock.is_over.wait(5.0)
+        assert ("the lamp is switched late" in line.warning) == is_warned
+        line.close()
+        assert not chip.is_high(27)
+
+
+@pytest.mark.real_time
+def test_the_lamp_of_an_emulated_chip_follows_the_clock(
+    chip: FileChip, lamp_scene: SyncSection
+) -> None:
+    line = RecordingLine(lamp_scene, 27)
+    time.sleep(0.3)
+    assert not any(high for _, high in chip.read_levels(27)), "dark before a recording"
+    line.drive(high=True)
+    begin_ns = time.monotonic_ns() + BIT_NS
+    time.sleep(2.0)
+    end_ns, warning = time.monotonic_ns(), line.warning
+    line.drive(high=False)
+    time.sleep(0.3)
+    assert not chip.is_high(27)
+    line.close()
+    times_ns, levels = map(np.array, zip(*chip.read_levels(27), strict=True))
+    late_ns = times_ns[1:-1] % BIT_NS
+    assert late_ns.mean() <= LAMP_LATE_NS or "the lamp is switched late" in warning
+    during = (times_ns > begin_ns) & (times_ns < end_ns)
+    follows = levels[during] == [is_lamp_on(t_ns) for t_ns in times_ns[during].tolist()]
+    assert follows.mean() >= 0.9
+    assert len(follows) >= 15

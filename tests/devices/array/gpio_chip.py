@@ -52,3 +52,8 @@ class FileChip:
         """Return the level of an output line."""
         path = self.path / f"line{line}"
         return path.exists() and path.read_text() == "1"
+
+    def read_levels(self, line: int) -> list[tuple[int, bool]]:
+        """Return when an output line was driven, and to which level."""
+        rows = (self.path / f"line{line}.log").read_text().splitlines()
+        return [(int(t_ns), level == "1") for t_ns, level in map(str.split, rows)]

@@ -1,7 +1,8 @@
 """`gpiod` on a chip of files, for processes that have this folder on their PYTHONPATH.
 
 All names are the library's own but `request_lines`. A chip is a folder; an input line a FIFO in it
-with records as `tests.devices.array.gpio_chip` writes them; an output line a file with 0 or 1.
+with records as `tests.devices.array.gpio_chip` writes them; an output line a file with 0
+or 1, beside a log of all its levels with their times.
 """
 
 # Names of the library, which is executed below, are known to no checker.
@@ -13,6 +14,7 @@ import os
 import select
 import struct
 import sys
+import time
 from pathlib import Path
 
 _spec = importlib.machinery.PathFinder.find_spec(
@@ -53,7 +55,10 @@ class _Request:
         return events
 
     def set_value(self, line, value):
-        self._path.write_text(str(int(value.value)))
+        t_ns, level = time.monotonic_ns(), int(value.value)
+        with self._path.with_suffix(".log").open("a") as log:
+            log.write(f"{t_ns} {level}\n")
+        self._path.write_text(str(level))
 
     def release(self):
         if self._is_input:
