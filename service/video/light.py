@@ -8,6 +8,7 @@ uncertain by that interval, and says so.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
 
@@ -22,7 +23,15 @@ _PEAK_MIN = 0.6
 """Least correlation with the code: by chance 64 bits reach half of it in 10^5 offsets."""
 _SHARE_OF_INTERVAL = 1.0 / 24.0
 """Step of the offsets in the fine grid, in intervals of pictures."""
-_EXPOSURES = np.linspace(0.0, 1.0, 9)[1:]
+_PARTS_MAX = 1024
+"""Parts of the picture, the ones that change most, in which the code is looked for."""
+_CHUNK = 4096
+"""Offsets that are tried at once."""
+_ROUGH_PICTURES = 24
+"""Pictures of a bit that are enough to see its edges."""
+_NEAR_INTERVALS = 4.0
+"""Distance from an edge, in intervals, within which pictures are fitted."""
+_EXPOSURES = np.concatenate([[1 / 24, 1 / 12], np.linspace(1 / 8, 1.0, 8)])
 """Exposures of the grid, in intervals of pictures."""
 
 
@@ -59,7 +68,11 @@ class LampPair(NamedTuple):
 
 
 def find_lamp(
-    times_s: Floats, brightness: Floats, begin_ns: float, end_ns: float
+    times_s: Floats,
+    brightness: Floats,
+    begin_ns: float,
+    end_ns: float,
+    on_window: Callable[[], None] = lambda: None,
 ) -> list[LampPair]:
     """Find the lamp in the brightness of a film's parts, one pair a window.
 
@@ -68,6 +81,7 @@ def find_lamp(
         brightness: (pictures, parts).
         begin_ns: earliest possible instant of the film's first picture, by the node's clock.
         end_ns: latest one.
+        on_window: called before each window.
 
     Returns:
         Pairs of the windows in which a part follows the code; empty if none does.
@@ -77,6 +91,7 @@ def find_lamp(
     count = max(1, int((last_s - begin_s) // _WINDOW_S))
     for edge_s in np.linspace(begin_s, max(begin_s, last_s - _WINDOW_S), count):
         rows = (times_s >= edge_s) & (times_s <= edge_s + _WINDOW_S)
+        on_window()
         if rows.sum() < 2 * _WINDOW_S:  # a film of less than two pictures a second
             continue
         if found:  # later windows follow within the drift of any camera
@@ -94,26 +109,42 @@ def find_lamp(
 def _find_in_window(
     film_s: Floats, brightness: Floats, begin_ns: float, end_ns: float
 ) -> LampPair | None:
-    interval_ns = 1e9 * float(np.median(np.diff(film_s)))
     # Coarse: a quarter of a bit is enough to see a peak, in pictures and in offsets.
-    begins = np.arange(0, len(film_s), max(1, int(BIT_NS / 4 / interval_ns)))
-    sizes = np.diff(np.append(begins, len(film_s)))
-    coarse_s = np.add.reduceat(film_s, begins) / sizes
-    series = _normalize(np.add.reduceat(brightness, begins) / sizes[:, None])
-    coarse_ns = interval_ns * sizes[0]
-    offsets_ns = np.arange(begin_ns, end_ns + BIT_NS, BIT_NS / 4)
+    step_ns = BIT_NS / 4
+    count = int(1e9 * (film_s[-1] - film_s[0]) / step_ns)
+    binned = _average_bins(film_s, brightness, count)
+    lively = np.argsort(-(np.diff(binned, axis=0) ** 2).sum(axis=0))[:_PARTS_MAX]
+    series = _normalize(binned[:, lively]).astype(np.float32)
+    bins_ns = begin_ns + 1e9 * film_s[0] + step_ns * (np.arange(0.0, count) + 0.5)
     best = 0.0, 0.0, 0
-    for chunk in np.array_split(offsets_ns, len(offsets_ns) // 4096 + 1):
-        model = compute_mean_code(chunk[:, None] + 1e9 * coarse_s[None, :], coarse_ns)
-        model -= model.mean(axis=1, keepdims=True)
-        length = np.sqrt((model**2).sum(axis=1, keepdims=True))
-        correlation = (model / np.maximum(length, 1e-9)) @ series
+    for chunk_ns in range(0, max(1, round(end_ns - begin_ns)), _CHUNK * round(step_ns)):
+        offsets = min(_CHUNK, int((end_ns - begin_ns - chunk_ns) / step_ns) + 2)
+        code_ns = bins_ns[0] + chunk_ns + step_ns * np.arange(0.0, offsets + count - 1)
+        code = compute_mean_code(code_ns, step_ns).astype(np.float32)
+        model = np.lib.stride_tricks.sliding_window_view(code, count)
+        # The series' mean is 0, so only the model's length needs its own.
+        length = np.sqrt(count) * np.maximum(model.std(axis=1), 1e-6)
+        correlation = (model @ series) / length[:, None]
         at, part = np.unravel_index(int(np.argmax(correlation)), correlation.shape)
-        best = max(best, (float(correlation[at, part]), float(chunk[at]), int(part)))
+        offset_ns = begin_ns + chunk_ns + step_ns * float(at)
+        best = max(best, (float(correlation[at, part]), offset_ns, int(lively[part])))
     if best[0] < _PEAK_MIN:
         return None
+    interval_ns = 1e9 * float(np.median(np.diff(film_s)))
     lamp = _normalize(brightness[:, best[2] : best[2] + 1])[:, 0]
     return _refine(film_s, lamp, best[1], interval_ns, best[0])
+
+
+def _average_bins(film_s: Floats, brightness: Floats, count: int) -> Floats:
+    """Average series over `count` equal bins, whatever the pictures' times: (bins, parts)."""
+    width_s = np.diff(film_s)[:, None]
+    steps = 0.5 * (brightness[1:] + brightness[:-1]) * width_s
+    sums = np.concatenate([np.zeros((1, brightness.shape[1])), np.cumsum(steps, axis=0)])
+    edges_s = film_s[0] + (BIT_NS / 4e9) * np.arange(count + 1)
+    rows = np.interp(edges_s, film_s, np.arange(0.0, len(film_s)))
+    low = np.minimum(rows.astype(int), len(film_s) - 2)
+    part = (rows - low)[:, None]
+    return np.asarray(np.diff(sums[low] + part * steps[low], axis=0))
 
 
 def _normalize(brightness: Floats) -> Floats:
@@ -128,7 +159,16 @@ def _refine(
 ) -> LampPair:
     """Refine an offset within half a bit by the moments of its posterior."""
     rough_ns = coarse_ns + np.arange(-BIT_NS / 2, BIT_NS / 2, interval_ns / 2)
-    near_ns = rough_ns[np.argmin(_compute_misfit(film_s, series, rough_ns, interval_ns))]
+    some = slice(None, None, max(1, int(BIT_NS / _ROUGH_PICTURES / interval_ns)))
+    misfit = _compute_misfit(film_s[some], series[some], rough_ns, interval_ns)
+    near_ns = rough_ns[np.argmin(misfit)]
+    middle_s = float(film_s.mean())
+    # Only pictures near the edges tell more: of fast films that is a small part.
+    t_ns = near_ns + 1e9 * film_s
+    spread = compute_mean_code(t_ns, 2.0 * _NEAR_INTERVALS * interval_ns)
+    is_near = (spread > 0) & (spread < 1)
+    if is_near.any():
+        film_s, series = film_s[is_near], _normalize(series[is_near, None])[:, 0]
     step_ns = interval_ns * _SHARE_OF_INTERVAL
     offsets_ns = near_ns + np.arange(-2.0 * interval_ns, 2.0 * interval_ns, step_ns)
     misfit = np.stack(
@@ -141,7 +181,6 @@ def _refine(
     weight /= weight.sum()
     offset_ns = float(weight @ offsets_ns)
     variance = float(weight @ (offsets_ns - offset_ns) ** 2)
-    middle_s = float(film_s.mean())
     return LampPair(
         film_s=middle_s,
         t_mono_ns=offset_ns + 1e9 * middle_s,
