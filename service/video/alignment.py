@@ -13,6 +13,7 @@ that contradicts the others is left out, and said.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,7 +27,13 @@ _OUTLIER_SIGMAS = 4.0
 
 
 def fit_alignment(
-    method: AlignmentMethod, film_s: Floats, t_ns: Floats, sigma_ns: Floats, *, begin_t_ns: int
+    method: AlignmentMethod,
+    film_s: Floats,
+    t_ns: Floats,
+    sigma_ns: Floats,
+    *,
+    begin_t_ns: int,
+    common_ns: float = 0.0,
 ) -> Alignment:
     """Fit a line to pairs of instants.
 
@@ -39,6 +46,7 @@ def fit_alignment(
         t_ns: (pairs,), in ns after `begin_t_ns`.
         sigma_ns: (pairs,), standard deviations of `t_ns`.
         begin_t_ns: begin of the session.
+        common_ns: standard deviation of an error that all pairs share.
 
     Raises:
         FileFormatError: there is no pair, or no majority agrees.
@@ -75,8 +83,109 @@ def fit_alignment(
         film_s=middle_s,
         t_ns=begin_t_ns + round(offset_ns),
         drift=drift,
-        sigma_ns=math.sqrt(1.0 / float(weight.sum())),
+        sigma_ns=math.hypot(float(weight.sum()) ** -0.5, common_ns),
         sigma_drift=math.sqrt(1.0 / information),
         pair_count=int(used.sum()),
         rejected_count=int(len(film_s) - used.sum()),
+    )
+
+
+_MISS_COST = 3.0
+"""Cost of a touchdown without a contact, or the reverse: one in twenty is missed."""
+_STEP_S = 0.5
+"""Typical time between steps: the shorter an agreement against it, the more it says."""
+_CERTAIN_BY = 3.0
+"""Least lead of the best match over one by another step: odds of 20."""
+_SAME_S = 0.05
+_FIRST_TOUCHDOWNS = 12
+"""Touchdowns with which matches are tried: the first ones, of which some may be wrong."""
+
+
+class Instants(NamedTuple):
+    """Touchdowns of a film, or contacts of a session: instants in s, rising, and their sigmas."""
+
+    at_s: Floats
+    sigma_s: Floats
+    duration_s: float
+    """Time that the film or session covers, from 0."""
+
+
+def match_contacts(
+    touchdowns: Instants, contacts: Instants, near_s: tuple[float, float] = (-math.inf, math.inf)
+) -> list[tuple[int, int]]:
+    """Match the touchdowns of a film with the contacts of a session; either may lack some.
+
+    Each of the first touchdowns is tried with every contact. The others then agree within their
+    uncertainties and the drift, or were missed. Those that the other recording does not cover count
+    neither way.
+
+    Args:
+        touchdowns: of the film, in s from its first picture.
+        contacts: of the session, in s from its begin.
+        near_s: earliest and latest instant of the film's first picture, in s from that begin.
+
+    Returns:
+        Indices of each touchdown and its contact.
+
+    Raises:
+        FileFormatError: nothing agrees, or steps are so alike that another match is as likely.
+    """
+    found: list[tuple[float, float, list[tuple[int, int]]]] = []
+    for first in range(min(len(touchdowns.at_s), _FIRST_TOUCHDOWNS)):
+        for contact in range(len(contacts.at_s)):
+            offset_s = float(contacts.at_s[contact] - touchdowns.at_s[first])
+            if near_s[0] <= offset_s <= near_s[1]:
+                score, pairs = _match_by(touchdowns, contacts, first, contact)
+                found.append((score, offset_s, pairs))
+    best = max(found, default=(0.0, 0.0, []))
+    others = [score for score, offset_s, _ in found if abs(offset_s - best[1]) > _SAME_S]
+    if best[0] <= 0.0 or best[0] - max(others, default=-math.inf) < _CERTAIN_BY:
+        count = f"{len(touchdowns.at_s)} touchdowns and {len(contacts.at_s)} contacts"
+        raise FileFormatError(
+            f"{count} do not agree" if best[0] <= 0.0 else f"{count} agree in more than one way",
+            expected="steps of which the times in between differ, or a film of all of them",
+            remedy="Say about when the film begins with --near, or align by another method",
+        )
+    return best[2]
+
+
+def _match_by(
+    touchdowns: Instants, contacts: Instants, first: int, contact: int
+) -> tuple[float, list[tuple[int, int]]]:
+    """Match the others if one touchdown is that contact: log likelihood, and pairs."""
+    since_s = touchdowns.at_s - touchdowns.at_s[first]
+    expected_s = contacts.at_s[contact] + since_s
+    right = np.minimum(np.searchsorted(contacts.at_s, expected_s), len(contacts.at_s) - 1)
+    left = np.maximum(right - 1, 0)
+    is_left = np.abs(contacts.at_s[left] - expected_s) < np.abs(contacts.at_s[right] - expected_s)
+    nearest = np.where(is_left, left, right)
+    sigma_s = np.sqrt(
+        touchdowns.sigma_s**2
+        + contacts.sigma_s[nearest] ** 2
+        + touchdowns.sigma_s[first] ** 2
+        + contacts.sigma_s[contact] ** 2
+        + (DRIFT_SIGMA * since_s) ** 2
+    )
+    ratio = np.abs(contacts.at_s[nearest] - expected_s) / sigma_s
+    agree = ratio < _OUTLIER_SIGMAS
+    gain = np.log(_STEP_S / (math.sqrt(2.0 * math.pi) * sigma_s)) - 0.5 * ratio**2
+    in_film_s = contacts.at_s - contacts.at_s[contact] + touchdowns.at_s[first]
+    covered = (expected_s >= 0) & (expected_s <= contacts.duration_s)
+    filmed = (in_film_s >= 0) & (in_film_s <= touchdowns.duration_s)
+    filmed[nearest[agree]] = False
+    misses = int((covered & ~agree).sum() + filmed.sum())
+    pairs = [(int(row), int(nearest[row])) for row in np.flatnonzero(agree)]
+    return float(gain[agree].sum()) - _MISS_COST * misses, pairs
+
+
+def describe_contradiction(old: Alignment, new: Alignment) -> str:
+    """Describe how far two alignments of a film are apart; empty within their uncertainties."""
+    at_s = np.array([new.film_s])
+    apart_ns = float(old.t_ns - new.t_ns + old.to_session_ns(at_s)[0])
+    sigma_ns = math.hypot(float(old.compute_sigma_ns(at_s)[0]), new.sigma_ns)
+    if abs(apart_ns) < _OUTLIER_SIGMAS * sigma_ns:
+        return ""
+    return (
+        f"the film is {abs(apart_ns) * 1e-6:.1f} ms {'earlier' if apart_ns > 0 else 'later'} by "
+        f"{new.method} than by {old.method}, of which {2 * sigma_ns * 1e-6:.1f} ms are uncertain"
     )

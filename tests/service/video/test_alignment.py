@@ -1,0 +1,111 @@
+"""Touchdowns of films against contacts of sessions, and alignments that contradict each other."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from devices.errors import FileFormatError
+from service.video.alignment import (
+    DRIFT_SIGMA,
+    Instants,
+    describe_contradiction,
+    fit_alignment,
+    match_contacts,
+)
+from storage.sessions.videos import Alignment
+
+SESSION_S = 60.0
+
+
+def draw_steps(
+    generator: np.random.Generator, missed: int, spurious: int
+) -> tuple[Instants, Instants, float, float]:
+    """Touchdowns and contacts of a walk that begins within both, and the film's true line."""
+    steps_s = 5.0 + np.cumsum(generator.uniform(0.45, 0.75, 14))
+    sigma_s = generator.uniform(1e-3, 6e-3, len(steps_s))
+    contacts_s = steps_s + generator.normal(0.0, 2e-3, len(steps_s))
+    offset_s, drift = generator.uniform(-3.0, 4.0), generator.normal(0.0, DRIFT_SIGMA)
+    touchdowns_s = (steps_s - offset_s) / (1.0 + drift) + generator.normal(0.0, sigma_s)
+    kept = np.sort(generator.permutation(len(steps_s))[missed:])
+    others_s = generator.uniform(touchdowns_s[0], touchdowns_s[-1], spurious)
+    film_s = np.concatenate([touchdowns_s[kept], others_s])
+    order = np.argsort(film_s)
+    film_sigma_s = np.concatenate([sigma_s[kept], np.full(spurious, 3e-3)])
+    touchdowns = Instants(film_s[order], film_sigma_s[order], 25.0)
+    contacts = Instants(contacts_s, np.full(len(steps_s), 2e-3), SESSION_S)
+    return touchdowns, contacts, offset_s, drift
+
+
+def align(touchdowns: Instants, contacts: Instants) -> Alignment:
+    film, contact = map(np.array, zip(*match_contacts(touchdowns, contacts), strict=True))
+    sigma_s = np.hypot(touchdowns.sigma_s[film], contacts.sigma_s[contact])
+    return fit_alignment(
+        "contact", touchdowns.at_s[film], 1e9 * contacts.at_s[contact], 1e9 * sigma_s, begin_t_ns=0
+    )
+
+
+@given(seed=st.integers(0, 2**32 - 1), missed=st.integers(0, 3), spurious=st.integers(0, 2))
+def test_steps_are_matched_whatever_few_are_missed_or_wrong(
+    seed: int, missed: int, spurious: int
+) -> None:
+    touchdowns, contacts, offset_s, drift = draw_steps(
+        np.random.default_rng(seed), missed, spurious
+    )
+    found = align(touchdowns, contacts)
+    at_s = np.array([10.0])
+    off_ns = found.t_ns + found.to_session_ns(at_s)[0] - 1e9 * (offset_s + 10.0 * (1.0 + drift))
+    assert abs(off_ns) < 6.0 * found.compute_sigma_ns(at_s)[0]
+    assert found.pair_count >= 14 - missed - 2
+
+
+def test_the_uncertainty_by_contact_is_that_of_many_walks() -> None:
+    generator = np.random.default_rng(2)
+    ratios, drifts = [], []
+    for _ in range(100):
+        touchdowns, contacts, offset_s, drift = draw_steps(generator, 1, 1)
+        found = align(touchdowns, contacts)
+        at_s = np.array([9.0])
+        off_ns = found.t_ns + found.to_session_ns(at_s)[0] - 1e9 * (offset_s + 9.0 * (1.0 + drift))
+        assert abs(off_ns) < 20e6, "one picture at 50 pictures/s"
+        ratios.append(off_ns / found.compute_sigma_ns(at_s)[0])
+        drifts.append((found.drift - drift) / found.sigma_drift)
+    assert 0.90 <= np.mean(np.abs(ratios) < 1.96) <= 0.99
+    assert 0.90 <= np.mean(np.abs(drifts) < 1.96) <= 0.99
+
+
+def test_equal_steps_need_a_film_of_all_of_them_or_a_hint() -> None:
+    steps_s = 5.0 + 0.6 * np.arange(10.0)
+    contacts = Instants(steps_s, np.full(10, 2e-3), SESSION_S)
+    whole = Instants(steps_s - 2.0, np.full(10, 2e-3), 20.0)
+    assert match_contacts(whole, contacts) == [(k, k) for k in range(10)]
+    part = Instants(steps_s[3:7] - 6.5, np.full(4, 2e-3), 2.4)
+    with pytest.raises(FileFormatError, match="agree in more than one way"):
+        match_contacts(part, contacts)
+    assert match_contacts(part, contacts, (6.3, 6.7))[0] == (0, 3)
+    with pytest.raises(FileFormatError, match="do not agree"):
+        match_contacts(Instants(np.array([0.1, 1.37, 1.93, 4.1]), np.full(4, 1e-3), 9.0), contacts)
+    with pytest.raises(FileFormatError, match="0 touchdowns"):
+        match_contacts(Instants(np.empty(0), np.empty(0), 9.0), contacts)
+
+
+def test_an_error_that_all_pairs_share_does_not_average_out() -> None:
+    film_s, t_ns, sigma_ns = np.arange(4.0), 1e9 * np.arange(4.0), np.full(4, 1e6)
+    alone = fit_alignment("light", film_s, t_ns, sigma_ns, begin_t_ns=0)
+    shared = fit_alignment("light", film_s, t_ns, sigma_ns, begin_t_ns=0, common_ns=2e6)
+    assert alone.sigma_ns == pytest.approx(0.5e6)
+    assert shared.sigma_ns == pytest.approx(math.hypot(0.5e6, 2e6))
+    assert (shared.drift, shared.sigma_drift) == (alone.drift, alone.sigma_drift)
+
+
+def test_alignments_that_differ_beyond_their_uncertainties_are_described() -> None:
+    film_s = np.arange(4.0)
+    one = fit_alignment("light", film_s, 1e9 * film_s, np.full(4, 1e6), begin_t_ns=10**18)
+    other = fit_alignment("hand", film_s, 1e9 * film_s + 3e8, np.full(4, 1e7), begin_t_ns=10**18)
+    assert describe_contradiction(one, one) == ""
+    assert "300.0 ms later by hand than by light" in describe_contradiction(one, other)
+    assert "300.0 ms earlier by light than by hand" in describe_contradiction(other, one)
