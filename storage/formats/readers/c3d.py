@@ -19,6 +19,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -63,7 +64,7 @@ UNSIGNED_OFFSET_MIN = 1000.0
 """Lowest OFFSET of unsigned samples, for which a stored zero means that nothing was recorded."""
 CHECKED_PEAK_FORCE_N = 10.0
 """Lowest peak force of a plate whose centre of pressure is checked."""
-_METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _FORCE_UNITS = {"n": "N", "newton": "N", "newtons": "N", "kn": "kN"}
 _MOMENT = re.compile(r"(k?N)[ .*·-]?(mm|cm|m)", re.IGNORECASE)
 RawNumbers = npt.NDArray[Any]
@@ -114,6 +115,9 @@ class C3dFile:
         rate_hz: rate of analog samples.
         samples_per_frame: analog samples in a frame of points.
         raw: (samples, channels), as stored.
+        stored_points: (frames, 4 points), x, y, z and validity of each, as stored.
+        point_rate_hz: rate of frames.
+        point_scale: unit of stored coordinates; below zero: they are not scaled.
         notes: remarks for the user.
     """
 
@@ -121,6 +125,9 @@ class C3dFile:
     rate_hz: float
     samples_per_frame: int
     raw: RawNumbers
+    stored_points: RawNumbers
+    point_rate_hz: float
+    point_scale: float
     notes: tuple[str, ...] = ()
 
     @property
@@ -187,9 +194,41 @@ def read_c3d_force_platforms(path: Path, is_needed: ColumnFilter, values_max: in
         FileFormatError: it is no C3D file, is truncated, or has no readable plate.
         OSError: the file cannot be read.
     """
-    content = read_bytes(path, bytes_max=TEXT_BYTES_MAX)
+    with _translate_contradictions():
+        file = _parse_file(read_bytes(path, bytes_max=TEXT_BYTES_MAX))
+        return _read_force_platforms(file, values_max)
+
+
+def read_c3d_points(path: Path) -> tuple[float, dict[str, Floats]]:
+    """Read the rate in Hz and the points of a C3D file by label, (frames, 3), NaN where hidden.
+
+    Raises:
+        FileFormatError: it is no C3D file, is truncated, or states no rate or unit of points.
+        OSError: the file cannot be read.
+    """
+    with _translate_contradictions():
+        file = _parse_file(read_bytes(path, bytes_max=TEXT_BYTES_MAX))
+        unit = file.parameters.get_keyword_or_empty("POINT", "UNITS").lower()
+        if unit not in METRES or not file.point_rate_hz > 0.0:
+            raise FileFormatError(
+                f"its points are in {unit!r}, at {file.point_rate_hz:g} Hz",
+                expected="POINT:UNITS of mm, cm or m, and a rate",
+            )
+        stored = file.stored_points.reshape(len(file.stored_points), -1, 4).astype(np.float64)
+        places = stored[..., :3] * (file.point_scale if file.point_scale > 0.0 else 1.0)
+        places[stored[..., 3] < 0] = np.nan
+        labels = [
+            label.strip()
+            for i in range(1, 2 + places.shape[1] // 255)
+            for label in file.parameters.get_texts_or_empty("POINT", f"LABELS{i if i > 1 else ''}")
+        ]
+        return file.point_rate_hz, dict(zip(labels, np.moveaxis(places, 1, 0), strict=False))
+
+
+@contextmanager
+def _translate_contradictions() -> Iterator[None]:
     try:
-        return _read_force_platforms(_parse_file(content), values_max)
+        yield
     except FileFormatError:
         raise
     except (struct.error, IndexError, ValueError, TypeError, OverflowError) as error:
@@ -263,7 +302,8 @@ def _parse_file(content: bytes) -> C3dFile:
         stored: RawNumbers = _parse_floats(values, order, is_dec=True)
     else:
         stored = np.frombuffer(values, kind)
-    samples = stored.reshape(frames, width)[:, 4 * points :] if width else np.empty((frames, 0))
+    rows = stored.reshape(frames, width) if width else np.empty((frames, 0))
+    samples = rows[:, 4 * points :]
     samples_a_frame = max(1, samples_a_frame)
     by_frames_hz = point_hz * samples_a_frame
     rate_hz = by_frames_hz if by_frames_hz > 0.0 else analog_hz
@@ -278,6 +318,9 @@ def _parse_file(content: bytes) -> C3dFile:
         rate_hz if notes or not analog_hz > 0.0 else analog_hz,
         samples_a_frame,
         samples.reshape(-1, channels) if channels else np.empty((0, 0)),
+        rows[:, : 4 * points],
+        point_hz,
+        scale,
         tuple(notes),
     )
 
@@ -383,7 +426,7 @@ def _read_plate(file: C3dFile, i: int, values_max: int) -> PlateSignals:
         {_FORCE_UNITS.get(units[z].lower()) for z in _VERTICAL_FORCE_CHANNELS.get(kind, ())}
     )
     position = "".join(file.parameters.get_texts_or_empty("POINT", "UNITS")[:1]).strip().lower()
-    length = position if position in _METRES else None
+    length = position if position in METRES else None
     origin = _surface_centre(file, i, kind)
     pose = compute_plate_pose(_plate_parameter(file, "CORNERS", i, (3, 4)))
     factor = 1.0
@@ -394,7 +437,7 @@ def _read_plate(file: C3dFile, i: int, values_max: int) -> PlateSignals:
         lever = _common_unit(
             {_length_unit_of(unit, force if kind == 2 else None) for unit in units[3:5]}
         )
-        factor = 1.0 if lever is None else _METRES[lever] / _METRES[length]
+        factor = 1.0 if lever is None else METRES[lever] / METRES[length]
         length = None if lever is None else length
     fz, local = compute_fz_and_local_cop(kind, channels, origin, factor)
     cop = None
@@ -461,7 +504,7 @@ def _common_unit(units: set[str | None]) -> str | None:
 def _length_unit_of(unit: str, force: str | None) -> str | None:
     """Return the length unit of a moment's or a length's unit; None for another unit."""
     if force is None:
-        return unit.lower() if unit.lower() in _METRES else None
+        return unit.lower() if unit.lower() in METRES else None
     match = _MOMENT.fullmatch(unit)
     return match[2].lower() if match and match[1].lower() == force.lower() else None
 
