@@ -69,7 +69,7 @@ _VIEWER_ONLY = (
 )
 _TOKEN_NEEDED = "A login is not enough for this: it needs the server's token"  # noqa: S105  # words
 _PUBLIC_PATHS = re.compile(
-    rf"/|/worker\.js|/nodes|/calibrate|/docs(?:/[^/]+)?|/sessions(?:/[^/]+)?|/static/.*|{LOGIN_PATH}|/api/v1/ready"
+    rf"/|/worker\.js|/nodes|/calibrate|/clock|/docs(?:/[^/]+)?|/sessions(?:/[^/]+)?|/static/.*|{LOGIN_PATH}|/api/v1/ready"
 )
 """Paths that a private server also serves without credentials: pages and files without data, login,
 and the readiness probe."""

@@ -57,6 +57,7 @@ _PAGES = {
     "/": "index.html",
     "/nodes": "nodes.html",
     "/calibrate": "calibrate.html",
+    "/clock": "clock.html",
     "/sessions": "sessions.html",
     "/sessions/{session_id}": "session.html",
     "/docs": "docs.html",

@@ -18,7 +18,7 @@ from tests.web.scripted import Scripted
 pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 Answer = Callable[[Route], object]
-PAGES = ("/", "/nodes", "/calibrate", "/docs", "/sessions", "/sessions/none")
+PAGES = ("/", "/nodes", "/calibrate", "/clock", "/docs", "/sessions", "/sessions/none")
 
 
 @pytest.fixture

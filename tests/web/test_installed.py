@@ -28,7 +28,7 @@ def installed(page: Page) -> Page:
 
 def test_the_manifest_names_files_that_exist_with_their_types(scripted: Scripted) -> None:
     http, url = scripted.running.http, scripted.url
-    for page in ("/", "/nodes", "/sessions", "/sessions/x", "/calibrate", "/docs"):
+    for page in ("/", "/nodes", "/sessions", "/sessions/x", "/calibrate", "/clock", "/docs"):
         assert 'rel="manifest"' in http.get(url + page).text
     manifest = http.get(f"{url}/static/manifest.webmanifest")
     assert manifest.headers["content-type"].startswith("application/manifest+json")

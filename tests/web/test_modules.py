@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from tests.service.running import Running
 pytestmark = pytest.mark.real_time
 
 Ask = Callable[..., Any]
+CLOCK = json.loads((Path(__file__).parents[1] / "service/video/clock_page.json").read_text("utf-8"))
 
 
 @pytest.fixture(scope="module")
@@ -358,3 +361,62 @@ def test_a_picture_that_moves_on_is_that_which_is_drawn_at_once(ask: Ask) -> Non
     for some, others in ((moved, once), (once, moved)):
         inside = some[some > 4]
         assert np.abs(inside[:, None] - others).min(axis=1).max() <= 1
+
+
+def test_the_clock_page_writes_the_code_that_films_are_read_for(ask: Ask) -> None:
+    cells = ask(
+        "clock/code",
+        """({ cellsOf }, examples) =>
+          examples.map((one) => cellsOf(one.t_ms, one.bound_ms, one.refresh_ms))""",
+        CLOCK["examples"],
+    )
+    assert cells == [example["cells"] for example in CLOCK["examples"]]
+    drawn = ask(
+        "clock/code",
+        """({ drawCode, UNITS }, cells) => {
+          const canvas = new OffscreenCanvas(UNITS.across, UNITS.down);
+          const context = canvas.getContext("2d");
+          drawCode(context, cells);
+          const { data } = context.getImageData(0, 0, UNITS.across, UNITS.down);
+          return [...data].filter((_, i) => i % 4 === 0);
+        }""",
+        cells[1],
+    )
+    page = np.array(drawn).reshape(CLOCK["units"][1], CLOCK["units"][0])
+    expected = np.full_like(page, 255)
+    for tag in CLOCK["tags"]:
+        left, top = tag["at"]
+        for row, black in enumerate(tag["black"]):
+            expected[top + row, left : left + 6] = [0 if bit == "1" else 255 for bit in black]
+    left, top = CLOCK["cells_at"]
+    size, across = CLOCK["cell_units"], CLOCK["cells_per_row"]
+    for number, bit in enumerate(cells[1]):
+        x, y = left + size * (number % across), top + size * (number // across)
+        expected[y : y + size, x : x + size] = 0 if bit == "1" else 255
+    assert (page == expected).all()
+
+
+def test_the_shortest_round_trip_tells_the_servers_time_until_it_is_too_old(ask: Ask) -> None:
+    found = ask(
+        "clock/code",
+        """({ Offset, statedMs }) => {
+          const offset = new Offset();
+          const seen = [offset.boundMs(0)];
+          const note = (...all) => {
+            offset.note(...all);
+            seen.push([offset.best.aheadMs, offset.boundMs(all[2])]);
+          };
+          note(0, 5100, 9); // a round trip of 9 ms
+          note(1000, 6001.5, 1003);
+          note(2000, 7011, 2009); // longer, and no better
+          note(60000, 65000, 60005); // the drift has made the former worse
+          note(61000, 99000, 61007); // one of the clocks was set
+          return [seen, [0.2, 3, 62.5, NaN, Infinity].map(statedMs)];
+        }""",
+    )
+    (unknown, *seen), stated = found
+    assert unknown in (None, float("inf"))
+    ahead_ms, bound_ms = zip(*seen, strict=True)
+    assert ahead_ms == pytest.approx((5095.5, 5000.0, 5000.0, 4997.5, 37996.5))
+    assert bound_ms == pytest.approx((5.0, 2.0, 2.1006, 3.0, 4.0))
+    assert stated == [1, 3, 63, 63, 63]

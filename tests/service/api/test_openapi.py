@@ -21,7 +21,16 @@ from tests.tokens import SHARED_BEARER
 from tests.waiting import PATIENCE_S, until
 
 PAGES = (
-    *("/", "/nodes", "/calibrate", "/sessions", "/docs", "/docs/swagger-ui.css", "/static/app.js"),
+    *(
+        "/",
+        "/nodes",
+        "/calibrate",
+        "/clock",
+        "/sessions",
+        "/docs",
+        "/docs/swagger-ui.css",
+        "/static/app.js",
+    ),
     "/no-such-page",
 )
 TARE = "POST /api/v1/nodes/bench/tare HTTP/1.0\r\nOrigin: http://evil.example\r\n\r\n"
