@@ -10,6 +10,22 @@ type AddMarker = {
   id?: string | null;
 };
 
+type AlignVideo = {
+  method: "hand" | "contact";
+  pairs: Array<PairOfInstants>;
+};
+
+type Alignment = {
+  method: "light" | "clock page" | "contact" | "hand";
+  film_s: number;
+  t_ns: number;
+  drift: number;
+  sigma_ns: number;
+  sigma_drift: number;
+  pair_count: number;
+  rejected_count: number;
+};
+
 type ArrayView = {
   session_id: string;
   node: string;
@@ -119,6 +135,18 @@ type DriftView = {
 type Emptied = {
   sessions: number;
   bytes: number;
+};
+
+type FilmInfo = {
+  codec: string;
+  width_px: number;
+  height_px: number;
+  rotation_deg: number;
+  picture_count: number;
+  duration_s: number;
+  rate_hz: number;
+  is_variable: boolean;
+  capture_rate_hz: number | null;
 };
 
 type FitView = {
@@ -378,6 +406,12 @@ type Page_NodeView_ = {
 type Page_SessionView_ = {
   items: Array<SessionView>;
   next_cursor: string | null;
+};
+
+type PairOfInstants = {
+  film_s: number;
+  t_ns: number;
+  sigma_ns: number;
 };
 
 type Part = {
@@ -696,6 +730,10 @@ type TileView = {
   full_scale_n: number | null;
 };
 
+type TimesView = {
+  film_s: Array<number>;
+};
+
 type TrialList = {
   trials: Array<ListedTrial>;
 };
@@ -745,6 +783,22 @@ type Version = {
   software: string;
   api: string;
   protocol: string;
+};
+
+type Video = {
+  id: string;
+  name: string;
+  suffix: string;
+  size_bytes: number;
+  sha256: string;
+  added_t_ns: number;
+  film: FilmInfo;
+  alignment?: Alignment | null;
+};
+
+type VideosView = {
+  items: Array<Video>;
+  problems: Array<string>;
 };
 
 type Vitals = {

@@ -40,6 +40,8 @@ _SECRET_BYTES = 16
 BODY_BYTES_MAX = 64 << 10
 """Size limit of a request's body: names and notes."""
 CALIBRATIONS_PATH = "/api/v1/calibrations"
+FILM_BYTES_MAX = 64 << 30
+_FILMS_PATH = re.compile(r"/api/v1/sessions/[^/]+/videos")
 
 LOGIN_PATH = "/api/v1/login"
 TICKETS_PATH = "/api/v1/tickets"
@@ -85,7 +87,7 @@ clients send it, and the client has used it before the request arrives here.
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
 _DEFAULT_HEADERS = {
     "content-security-policy": "default-src 'self'; img-src 'self' data:; "
-    "media-src data:; frame-ancestors 'none'",
+    "media-src 'self' data:; frame-ancestors 'none'",
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
     "cache-control": "no-cache",  # revalidate: after an update the page must be new
@@ -339,9 +341,11 @@ def parse_host(header: str) -> str | None:
 
 
 def _body_limit_bytes(scope: Scope) -> int:
-    """Return the limit of the body: a whole file is accepted on one path only."""
-    is_file = scope["type"] == "http" and scope["path"] == CALIBRATIONS_PATH
-    return CONTENT_BYTES_MAX if is_file else BODY_BYTES_MAX
+    """Return the limit of the body: whole files are accepted on two paths only."""
+    path = scope["path"] if scope["type"] == "http" else ""
+    if _FILMS_PATH.fullmatch(path):
+        return FILM_BYTES_MAX
+    return CONTENT_BYTES_MAX if path == CALIBRATIONS_PATH else BODY_BYTES_MAX
 
 
 def _check_role(required: Role, credentials: Credentials) -> tuple[HTTPStatus, str] | None:

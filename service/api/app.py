@@ -41,7 +41,15 @@ from service.api.routes import (
     trials,
     weighings,
 )
-from service.api.routes.recordings import comparisons, integrity, overview, sessions, stances, takes
+from service.api.routes.recordings import (
+    comparisons,
+    integrity,
+    overview,
+    sessions,
+    stances,
+    takes,
+    videos,
+)
 from service.api.routes.sockets.ingest import serve_node
 from service.api.routes.sockets.live import serve_live
 from service.api.settings import LimitSettings
@@ -198,6 +206,7 @@ def _make_api_routes() -> tuple[BaseRoute, ...]:
         stances.router,
         overview.router,
         comparisons.router,
+        videos.router,
     ):
         api.include_router(router)
     routes = APIRouter()

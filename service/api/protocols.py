@@ -43,6 +43,7 @@ SOCKET_EXTENSION = "foottile.outlet"
 CLIENT_MESSAGE_BYTES_MAX = 4096
 """Size limit of a message by clients other than nodes."""
 _BUFFER_BYTES = 64 << 10
+_TIMED_BODY_BYTES = 256 << 10
 _UNREAD_BYTES_MAX = 1 << 20
 """Limit of unsent bytes for a client that sends requests and does not read."""
 _OUT_OF_RESOURCES = {errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM}
@@ -81,6 +82,8 @@ class LimitedHttp(HttpToolsProtocol):
     name of a chunk reach no callback before they end."""
     _head_bytes = 0
     """Size of headers, with those behind the body."""
+    _body_bytes = 0
+    """Size of the body since its timeout began."""
     _is_too_long = False
     _is_upgraded = False
 
@@ -115,7 +118,8 @@ class LimitedHttp(HttpToolsProtocol):
     def on_message_begin(self) -> None:
         """Start the limits of a request."""
         super().on_message_begin()
-        self._in_head, self._unparsed_bytes, self._head_bytes = True, 0, 0
+        self._in_head = True
+        self._unparsed_bytes = self._head_bytes = self._body_bytes = 0
 
     def on_url(self, url: bytes) -> None:
         """Add to the size of the request line."""
@@ -153,9 +157,13 @@ class LimitedHttp(HttpToolsProtocol):
         self._unparsed_bytes = 0
 
     def on_body(self, body: bytes) -> None:
-        """Pass on a piece of the body."""
+        """Pass on a piece of the body; the timeout is for each 256 KiB of it, in a film's."""
         self._unparsed_bytes = 0
         super().on_body(body)
+        self._body_bytes += len(body)
+        if self._body_bytes > _TIMED_BODY_BYTES and self._unanswered:
+            self._body_bytes = 0
+            self._start_next_timeout()
 
     def on_message_complete(self) -> None:
         """Stop the timeout of the body."""

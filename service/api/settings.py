@@ -40,7 +40,7 @@ class LimitSettings(BaseModel):
     header_timeout_s: _Seconds = 10.0
     """Timeout of a request's headers; then 408, or the connection is closed."""
     body_timeout_s: _Seconds = 20.0
-    """Timeout of a request's body; then 408."""
+    """Timeout of a request's body, or of 256 KiB of a film's; then 408."""
     idle_timeout_s: _Seconds = 30.0
     """Timeout of an idle connection."""
     trusted_proxy: tuple[IPvAnyNetwork, ...] = ()

@@ -171,6 +171,19 @@ def read_video(folder: Path) -> Video:
         raise DamagedFileError("the video has no description", where=str(folder)) from error
 
 
+def read_videos(session_folder: Path) -> tuple[list[Video], list[str]]:
+    """Read the descriptions of all videos of a session, oldest first; and problems as text."""
+    videos, problems = list[Video](), list[str]()
+    for folder in find_video_folders(session_folder).values():
+        try:
+            videos.append(read_video(folder))
+        except UnknownError:
+            continue  # removed meanwhile
+        except (FileFormatError, StorageError) as error:
+            problems.append(str(error))
+    return sorted(videos, key=lambda video: video.added_t_ns), problems
+
+
 def get_film_path(folder: Path, video: Video) -> Path:
     """Return the path of a video's file."""
     return folder / f"film{video.suffix}"

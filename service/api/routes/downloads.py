@@ -8,32 +8,26 @@ program opens the incomplete archive.
 from __future__ import annotations
 
 import hashlib
-import re
 import time
 import zipfile
-from base64 import b64encode
 from collections.abc import Generator, Iterable
 from dataclasses import dataclass
-from http import HTTPStatus
 from pathlib import Path
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
-from starlette.datastructures import MutableHeaders
 
 from devices.errors import DamagedFileError, StorageError, UsageError
-from service.api.problems import problem_response
 from service.api.routes.common import (
     UNCHANGED,
     ServerState,
-    file_response,
-    has_matching_etag,
     problem_responses,
     require_file,
     require_frames,
     require_sealed,
+    stored_file_response,
 )
 from service.api.routes.exports import (
     Chunks,
@@ -58,9 +52,6 @@ from storage.sessions.stances import STANCES_NAME
 
 router = APIRouter(prefix="/sessions", tags=["data"])
 
-_CHUNK = 256 << 10  # three times the default's throughput (performance.md)
-_SINGLE_RANGE = re.compile(r"bytes=(?:(\d{1,18})-(\d{0,18})|-(\d{1,18}))")
-_YEAR_S = 31_536_000
 MEDIA_TYPES = [each.media_type for each in FORMATS.values()]
 
 
@@ -117,36 +108,14 @@ async def get_data(
 def _stored_response(
     session: Session, sha256: str, request: Request, server: Server, headers: dict[str, str]
 ) -> Response:
-    path = require_file(server.sessions.folder.get_path(session.id) / FRAMES_NAME)
-    headers |= {
-        "ETag": f'"{sha256}"',
-        "Cache-Control": f"private, max-age={_YEAR_S}, immutable",
-        "Repr-Digest": f"sha-256=:{b64encode(bytes.fromhex(sha256)).decode()}:",
-    }
-    if has_matching_etag(request, sha256):
-        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
-    size = path.stat().st_size
-    wanted = request.headers.get("range")
-    if wanted is not None:
-        found = _SINGLE_RANGE.fullmatch(wanted.replace(" ", ""))
-        if found is None or (found[2] and found[1] and int(found[2]) < int(found[1])):
-            # RFC 9110 14.2: an invalid range, or several, are ignored.
-            del MutableHeaders(scope=request.scope)["range"]
-        elif (found[1] and int(found[1]) >= size) or found[3] == "0":
-            return problem_response(
-                request.url.path,
-                HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE,
-                f"the range {wanted[:80]!r} is outside the file's {size} bytes",
-                {"Content-Range": f"bytes */{size}"},
-            )
-    answer = file_response(
-        path,
-        headers=headers,
+    return stored_file_response(
+        request,
+        require_file(server.sessions.folder.get_path(session.id) / FRAMES_NAME),
+        sha256,
         media_type=PARQUET.media_type,
         filename=f"{make_file_stem(session.name, session.id, Slice())}.parquet",
+        headers=headers,
     )
-    answer.chunk_size = _CHUNK
-    return answer
 
 
 def _write_export(

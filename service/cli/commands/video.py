@@ -9,7 +9,7 @@ import typer
 
 from devices.errors import UsageError
 from service.cli.commands.sessions import find_sealed_file
-from service.cli.options import JsonOption, echo, print_json, show_progress
+from service.cli.options import JsonOption, echo, print_json, remark, show_progress
 from storage.sessions.folder import FRAMES_NAME
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def video_command(
     add: copies the film, which is read first: a file that no decoder can read is refused. remove:
     deletes it with its alignment and tables. A server may run at the same time.
     """
-    from storage.sessions.videos import find_video_folders, read_video, remove_video
+    from storage.sessions.videos import read_videos, remove_video
 
     needed = ACTIONS.get(action)
     if needed is None:
@@ -63,7 +63,9 @@ def video_command(
     if action == "add":
         videos = [_add_video(folder, Path(str(target)), capture_rate)]
     else:
-        videos = [read_video(each) for each in find_video_folders(folder).values()]
+        videos, problems = read_videos(folder)
+        for problem in problems:
+            remark(f"left out: {problem}")
     if as_json:
         items = [video.model_dump(mode="json") for video in videos]
         print_json(items[0] if action == "add" else {"items": items})

@@ -46,7 +46,7 @@ def request(running: Running, path: str, method: str = "GET") -> httpx.Response:
 def list_paths(sealed: Sealed) -> list[str]:
     """Return every path of a GET in the index, with names of this server filled in."""
     names = {"session_id": sealed.id, "node": "bench", "take_id": "none", "job_id": "none"}
-    names |= {"calibration_id": "none", "name": "none"}
+    names |= {"calibration_id": "none", "name": "none", "video_id": "none"}
     paths = [
         re.sub(r"\{(\w+)\}", lambda found: names[found[1]], route["href"])
         for route in request(sealed.running, "/api/v1").json()["routes"]

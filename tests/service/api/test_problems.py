@@ -91,12 +91,17 @@ def test_no_route_finds_an_unknown_id(shared: Running) -> None:
         "accept-replacement": {"fingerprint": "0000-0000-0000-0000"},
         "calibration": {"id": "0" * 16},
         "markers": {"label": "x"},
+        "alignment": {
+            "method": "hand",
+            "pairs": [{"film_s": 0.0, "t_ns": 1, "sigma_ns": 1.0}],
+        },
         "weighing": {"tiles": ["T01"], "weights": ["10 N"]},
     }
     asked = 0
     for path, methods in shared.http.get("/openapi.json").json()["paths"].items():
         for method in methods if "{" in path else ():
-            query = {"format": "mcap"} if path.endswith("/data") else {}
+            queries = {"data": {"format": "mcap"}, "videos": {"name": "walk.mp4"}}
+            query = queries.get(path.rsplit("/", 1)[-1], {})
             is_sent = method in ("post", "put", "patch")
             body = bodies.get(path.rsplit("/", 1)[-1], {}) if is_sent else None
             for unknown in UNKNOWN_IDS:
@@ -180,6 +185,7 @@ def test_an_impossible_number_is_a_problem_in_every_route(sealed: Sealed) -> Non
     api = http.get("/openapi.json").json()
     names = {"session_id": sealed.id, "node": "bench", "tare_id": "x"}
     names |= {"take_id": "x", "marker_id": "x", "name": "x", "calibration_id": "x", "job_id": "x"}
+    names |= {"video_id": "x"}
     tried = 0
 
     def check(answer: httpx.Response, about: object, statuses: tuple[int, ...]) -> None:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Query, Response
 from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 
-from devices.errors import FileFormatError, UnknownError, UsageError
-from service.api.routes.common import ServerState, problem_responses, require_sealed
+from devices.errors import FileFormatError, UnknownError
+from service.api.routes.common import (
+    ServerState,
+    problem_responses,
+    require_sealed,
+    run_with_usage_errors,
+)
 from service.api.routes.recordings.overview import (
     BinsView,
     PointsQuery,
@@ -33,8 +37,6 @@ from storage.sessions.comparisons import (
 from storage.sessions.folder import Session
 
 router = APIRouter(prefix="/sessions", tags=["sessions"])
-
-T = TypeVar("T")
 
 _ONE_AT_A_TIME = CapacityLimiter(1)
 """One thread: a series is read whole once."""
@@ -85,7 +87,7 @@ async def get_comparison(session_id: str, name: str, server: ServerState) -> Rep
     """Return alignment, figures with their intervals, trials and limits."""
     session = server.sessions.get_session(session_id)
     return await run_in_threadpool(
-        _run_with_usage_errors, partial(_make_report, session, name, server)
+        run_with_usage_errors, partial(_make_report, session, name, server)
     )
 
 
@@ -100,17 +102,9 @@ async def get_comparison_series(
 ) -> Response:
     """Return minimum and maximum of the reference, and of ours minus it, aligned in time."""
     session = require_sealed(server.sessions.get_session(session_id), "the reference is")
-    make = partial(_run_with_usage_errors, partial(_encode_series, session, name, query, server))
+    make = partial(run_with_usage_errors, partial(_encode_series, session, name, query, server))
     content = await to_thread.run_sync(make, limiter=_ONE_AT_A_TIME)
     return Response(content, media_type="application/json")
-
-
-def _run_with_usage_errors(make: Callable[[], T]) -> T:
-    """Run a function on user files; a damaged file is a usage error."""
-    try:
-        return make()
-    except FileFormatError as error:
-        raise UsageError(str(error)) from error
 
 
 def _list_comparisons(session: Session, server: Server) -> list[ComparisonView]:
