@@ -13,6 +13,7 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from devices.arrays import Floats
 from devices.lamp_code import BIT_NS, CODE_BITS, make_code
@@ -69,7 +70,7 @@ class LampPair(NamedTuple):
 
 def find_lamp(
     times_s: Floats,
-    brightness: Floats,
+    brightness: npt.NDArray[np.floating],
     begin_ns: float,
     end_ns: float,
     on_window: Callable[[], None] = lambda: None,
@@ -100,7 +101,8 @@ def find_lamp(
             within = expected_ns - margin_ns, expected_ns + margin_ns
         else:
             within = begin_ns, end_ns
-        pair = _find_in_window(times_s[rows] - begin_s, brightness[rows], *within)
+        part = np.asarray(brightness[rows], dtype=np.float64)
+        pair = _find_in_window(times_s[rows] - begin_s, part, *within)
         if pair is not None:
             found.append(pair._replace(film_s=pair.film_s + begin_s))
     return found

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import json
+import math
 import os
 import resource
 import signal
@@ -33,7 +34,10 @@ _READ_BYTES_PER_S_MIN = 10e6
 """Rate of a slow disk: a film's time stamps are all over its file."""
 _PROGRESS_PICTURES = 50
 _PART_PX = 16
-"""Size of the parts of a picture in which a lamp is looked for."""
+"""Least size of the parts of a picture in which a lamp is looked for."""
+_PARTS_MAX = 8192
+_CLOCK_LOOK_S = 0.1
+"""Interval of pictures in which a clock page is looked for."""
 _ERRORS: dict[str, type[FootTileError]] = {
     kind.__name__: kind for kind in (FileFormatError, UsageError, StateError)
 }
@@ -176,7 +180,7 @@ def _read(path: Path, capture_rate_hz: float | None = None) -> dict[str, Any]:
 
 
 def _find_lamp(
-    path: Path, begin_ns: float, end_ns: float, capture_rate_hz: float | None = None
+    path: Path, windows: list[tuple[float, float]], capture_rate_hz: float | None = None
 ) -> dict[str, Any]:
     import cv2
 
@@ -184,14 +188,42 @@ def _find_lamp(
     from service.video.light import find_lamp
 
     film, times_s = read_film(path, capture_rate_hz)
-    size = max(1, film.width_px // _PART_PX), max(1, film.height_px // _PART_PX)
-    rows = np.full((len(times_s), size[0] * size[1]), np.nan, dtype=np.float32)
+    part_px = max(_PART_PX, math.sqrt(film.width_px * film.height_px / _PARTS_MAX))
+    size = max(1, int(film.width_px / part_px)), max(1, int(film.height_px / part_px))
+    # Half precision is a tenth of a step.
+    rows = np.full((len(times_s), size[0] * size[1]), np.nan, dtype=np.float16)
     for index, picture in iterate_pictures(path, is_grey=True):
         small = cv2.resize(picture.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         rows[index] = small.ravel()
         _report(index)
     seen = ~np.isnan(rows[:, 0])
-    pairs = find_lamp(times_s[seen], rows[seen].astype(np.float64), begin_ns, end_ns)
+    times_s, rows = times_s[seen], rows[seen]
+
+    def show_life() -> None:
+        _print({"picture": film.picture_count})
+
+    found = [find_lamp(times_s, rows, *window, show_life) for window in windows]
+    return {"pairs": [[pair._asdict() for pair in pairs] for pairs in found]}
+
+
+def _find_clock(path: Path, near_ns: int, capture_rate_hz: float | None = None) -> dict[str, Any]:
+    from service.video.clock_page import ClockReading, find_clock_pairs, make_clock_reader
+    from service.video.container import iterate_pictures, read_film
+
+    _, times_s = read_film(path, capture_rate_hz)
+    read = make_clock_reader()
+    found: dict[int, ClockReading] = {}
+    next_s = 0.0
+    for index, picture in iterate_pictures(path, is_grey=True):
+        _report(index)
+        # Where there is no clock, a picture now and then is enough.
+        if times_s[index] >= next_s:
+            reading = read(picture)
+            if reading is None:
+                next_s = times_s[index] + _CLOCK_LOOK_S * (index - 1 not in found)
+            else:
+                found[index] = reading
+    pairs = find_clock_pairs(times_s[list(found)], list(found.values()), near_ns)
     return {"pairs": [pair._asdict() for pair in pairs]}
 
 
@@ -229,5 +261,6 @@ def _track(
 _TASKS: dict[str, Callable[..., dict[str, Any]]] = {
     "read": _read,
     "find_lamp": _find_lamp,
+    "find_clock": _find_clock,
     "track": _track,
 }

@@ -192,7 +192,7 @@ class SealedFileReader:
         if self.time_axis.is_shifted:
             shifted = [
                 [t_ns + self.time_axis.get_shift_ns(span.number) for t_ns in span.t_ns]
-                for span in self._read_part_spans()
+                for span in self.read_part_spans()
             ]
             self.footer.span_ns = shifted[0][0], max(last for _, last in shifted)
             return self.footer.span_ns
@@ -288,9 +288,9 @@ class SealedFileReader:
         except (UsageError, FileFormatError):  # the frames are readable without a clock table
             clock = None
         period_ns = round(1e9 / self.info.nominal_rate_hz)
-        return compute_time_axis(self._read_part_spans(), clock, period_ns=period_ns)
+        return compute_time_axis(self.read_part_spans(), clock, period_ns=period_ns)
 
-    def _read_part_spans(self) -> list[PartSpan]:
+    def read_part_spans(self) -> list[PartSpan]:
         """Return first and last frame of every part with frames, by the footer where possible."""
         names, ids = ("part", "t_mono_ns", "t_ns"), read_stream_ids(self)
         found: dict[int, list[tuple[int, int]]] = {}

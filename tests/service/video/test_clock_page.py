@@ -111,12 +111,14 @@ class Screen:
     latency_ns: float
     page_off_ns: float = 0.0
     """Error of the page's offset to the server's clock."""
+    true_ns: int = TRUE_NS
+    """The server's UTC at instant 0."""
 
     def get_tick(self, t_ns: float) -> int:
-        """The tick that is lit at an instant of the server's clock."""
+        """The tick that is lit at an instant."""
         refreshes = math.floor((t_ns - self.latency_ns) / self.refresh_ns - self.phase)
         drawn_ns = (refreshes + self.phase) * self.refresh_ns
-        return int((TRUE_NS + drawn_ns + self.page_off_ns) // clock_page.TICK_NS)
+        return (self.true_ns + round(drawn_ns + self.page_off_ns)) // clock_page.TICK_NS
 
 
 def film_screen(

@@ -1,0 +1,290 @@
+"""Methods of alignment: each finds instants of a film in its session, as pairs for one line.
+
+A new alignment that contradicts the stored one is not stored unless that is asked for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from devices.arrays import Floats
+from devices.errors import FileFormatError, StateError, UsageError
+from devices.lamp_code import LAMP_LATE_NS
+from service.video.alignment import (
+    Instants,
+    describe_contradiction,
+    fit_alignment,
+    match_contacts,
+)
+from service.video.contact import find_touchdowns
+from service.video.session_time import SessionTime, read_session_time
+from service.video.worker import run_film_task
+from storage.sessions.folder import FRAMES_NAME
+from storage.sessions.videos import (
+    Alignment,
+    AlignmentMethod,
+    Video,
+    find_video_folder,
+    get_film_path,
+    read_video,
+    write_video,
+)
+
+_NEAR_S = 5.0
+"""Error of a stated begin of the film."""
+_LAMP_MARGIN_NS = 6_000_000_000
+"""Time around a part in which its lamp's window may have its middle."""
+
+
+@dataclass(frozen=True)
+class AlignmentOptions:
+    """Options of the methods.
+
+    Attributes:
+        near_s: about when the film begins, in s after the session's begin.
+        pictures: pictures that a person chose: of touchdowns, or by hand.
+        instants_s: their instants in s after the session's begin, by hand.
+        track: options of the task that tracks the foot's markers, by contact without pictures.
+        replaces: True: a stored alignment that contradicts the new one is replaced.
+    """
+
+    near_s: float | None = None
+    pictures: tuple[int, ...] = ()
+    instants_s: tuple[float, ...] = ()
+    track: dict[str, Any] | None = None
+    replaces: bool = False
+
+
+class _Pairs(NamedTuple):
+    """Pairs as arguments of `fit_alignment`."""
+
+    film_s: Floats
+    t_ns: Floats
+    sigma_ns: Floats
+    common_ns: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Film:
+    """Film that is being aligned."""
+
+    video: Video
+    path: Path
+    on_picture: Callable[[int], None]
+
+    def run(self, task: str, **options: Any) -> dict[str, Any]:
+        """Run a task on the film in a process of its own."""
+        rate_hz = self.video.film.capture_rate_hz
+        return run_film_task(
+            task, self.path, on_picture=self.on_picture, capture_rate_hz=rate_hz, **options
+        )
+
+    def find_pictures(self, pictures: Sequence[int]) -> Floats:
+        """Return the times of pictures.
+
+        Raises:
+            UsageError: the film has no such picture.
+        """
+        count = self.video.film.picture_count
+        if not pictures or not all(0 <= picture < count for picture in pictures):
+            raise UsageError(
+                f"pictures {', '.join(map(str, pictures)) or 'are missing'}",
+                where=self.video.name,
+                expected=f"numbers from 0 to {count - 1}",
+            )
+        times_s = np.asarray(self.run("read")["times_s"])
+        return np.asarray(times_s[list(pictures)])
+
+    @property
+    def pick_sigma_s(self) -> float:
+        """Standard deviation of a picture that a person chose: one too early or too late."""
+        return 1.0 / (max(self.video.film.rate_hz, 1e-3) * math.sqrt(3.0))
+
+
+def align_video(
+    session_folder: Path,
+    video_id: str,
+    method: AlignmentMethod,
+    options: AlignmentOptions = AlignmentOptions(),
+    on_picture: Callable[[int], None] = lambda _: None,
+) -> Video:
+    """Align a video with its session, and store the alignment.
+
+    Args:
+        session_folder: folder of the sealed session.
+        video_id: id of the video.
+        method: how the instants are found.
+        options: options of the method.
+        on_picture: called with the number of pictures done.
+
+    Raises:
+        UnknownError: no such video, or the session has no server's time or estimates.
+        FileFormatError: no instant is found, or they do not agree.
+        StateError: it contradicts the stored alignment.
+        UsageError: an option is missing, or does not fit the method.
+        StorageError: the alignment cannot be written.
+    """
+    folder = find_video_folder(session_folder, video_id)
+    video = read_video(folder)
+    film = _Film(video, get_film_path(folder, video), on_picture)
+    time = read_session_time(session_folder / FRAMES_NAME)
+    pairs = _METHODS[method](film, time, options)
+    alignment = fit_alignment(
+        method,
+        pairs.film_s,
+        pairs.t_ns,
+        pairs.sigma_ns,
+        begin_t_ns=time.begin_t_ns,
+        common_ns=pairs.common_ns,
+    )
+    return store_alignment(folder, alignment, time, replaces=options.replaces)
+
+
+def store_alignment(
+    folder: Path, alignment: Alignment, time: SessionTime, *, replaces: bool
+) -> Video:
+    """Store a video's alignment, if it is possible and not in contradiction to the stored one.
+
+    Raises:
+        FileFormatError: film and session have no instant in common.
+        StateError: it contradicts the stored alignment.
+        StorageError: it cannot be written.
+    """
+    video = read_video(folder)
+    ends_s = np.array([0.0, video.film.duration_s])
+    begin_ns, end_ns = (alignment.t_ns + alignment.to_session_ns(ends_s).astype(np.int64)).tolist()
+    for apart_ns, what in (
+        (time.begin_t_ns - end_ns, "ends {:.1f} s before the session"),
+        (begin_ns - time.end_t_ns, "begins {:.1f} s after the session"),
+    ):
+        if apart_ns > 0:
+            raise FileFormatError(
+                f"by {alignment.method} the film {what.format(1e-9 * apart_ns)}",
+                where=video.name,
+                expected="a film of this session",
+                remedy="Add it to the session that was recorded meanwhile",
+            )
+    problem = describe_contradiction(video.alignment, alignment) if video.alignment else ""
+    if problem and not replaces:
+        raise StateError(
+            problem,
+            where=video.name,
+            expected="agreement with the stored alignment",
+            remedy="Find out which is wrong; the new one is stored only if it shall replace that",
+        )
+    aligned = video.model_copy(update={"alignment": alignment})
+    write_video(folder, aligned)
+    return aligned
+
+
+def _pair_by_light(film: _Film, time: SessionTime, options: AlignmentOptions) -> _Pairs:
+    if not time.has_lamp:
+        raise UsageError(
+            "the node had no lamp in this session",
+            where=str(time.path.parent),
+            expected='output = "code" in [sync] of its scene',
+            remedy="Align by clock, contact or hand",
+        )
+    windows = []
+    for span in time.spans:
+        begin_ns = span.t_mono_ns[0] - round(1e9 * film.video.film.duration_s)
+        end_ns = span.t_mono_ns[1]
+        if options.near_s is not None:
+            near_ns = time.begin_t_ns + round(1e9 * options.near_s) - time.get_mono_offset_ns(span)
+            begin_ns = max(begin_ns, near_ns - round(1e9 * _NEAR_S))
+            end_ns = min(end_ns, near_ns + round(1e9 * _NEAR_S))
+        windows.append((begin_ns, end_ns))
+    found: dict[float, tuple[float, float]] = {}
+    for span, pairs in zip(
+        time.spans, film.run("find_lamp", windows=windows)["pairs"], strict=True
+    ):
+        first_ns, last_ns = span.t_mono_ns
+        to_session_ns = time.get_mono_offset_ns(span) - time.begin_t_ns
+        for pair in pairs:
+            t_mono_ns = pair["t_mono_ns"]
+            if first_ns - _LAMP_MARGIN_NS <= t_mono_ns <= last_ns + _LAMP_MARGIN_NS:
+                found[pair["film_s"]] = t_mono_ns + to_session_ns, pair["sigma_ns"]
+    if not found:
+        raise FileFormatError(
+            "no part of the picture blinks the lamp's code",
+            where=film.video.name,
+            expected="the node's lamp in the picture for at least 6 s while it records",
+            remedy="Look for it in the film, or align by clock, contact or hand",
+        )
+    t_ns, sigma_ns = np.array(list(found.values())).T
+    # A switch is late, never early.
+    late_ns = LAMP_LATE_NS / 2.0
+    return _Pairs(np.array(list(found)), t_ns + late_ns, sigma_ns, late_ns / math.sqrt(3.0))
+
+
+def _pair_by_clock_page(film: _Film, time: SessionTime, _: AlignmentOptions) -> _Pairs:
+    pairs = film.run("find_clock", near_ns=time.compute_server_begin())["pairs"]
+    if not pairs:
+        raise FileFormatError(
+            "no picture shows the clock page",
+            where=film.video.name,
+            expected="the page /clock of this server, whole and sharp, for two seconds",
+            remedy="Look for it in the film, or align by another method",
+        )
+    rows = [time.convert_server_time(pair["t_ns"]) for pair in pairs]
+    return _Pairs(
+        film_s=np.array([pair["film_s"] for pair in pairs]),
+        t_ns=np.array([t_ns - time.begin_t_ns for t_ns, _ in rows], dtype=np.float64),
+        sigma_ns=np.array([pair["sigma_ns"] for pair in pairs]),
+        common_ns=max(
+            math.hypot(pair["common_ns"], bound_ns / math.sqrt(3.0))
+            for pair, (_, bound_ns) in zip(pairs, rows, strict=True)
+        ),
+    )
+
+
+def _pair_by_contact(film: _Film, time: SessionTime, options: AlignmentOptions) -> _Pairs:
+    if options.track is not None:
+        table = film.run("track", **options.track)
+        columns = {
+            name: np.array([math.nan if v is None else v for v in table[name]])
+            for name in ("film_s", "lower_y_px")
+        }
+        found = find_touchdowns(columns["film_s"], -columns["lower_y_px"])
+        at_s, sigma_s = np.array(found, dtype=np.float64).reshape(-1, 2).T
+    else:
+        at_s = np.sort(film.find_pictures(options.pictures))
+        sigma_s = np.full(len(at_s), film.pick_sigma_s)
+    near_s = (-math.inf, math.inf)
+    if options.near_s is not None:
+        near_s = options.near_s - _NEAR_S, options.near_s + _NEAR_S
+    contacts = time.load_contacts()
+    pairs = match_contacts(Instants(at_s, sigma_s, film.video.film.duration_s), contacts, near_s)
+    rows, numbers = np.array(pairs).T
+    return _Pairs(
+        film_s=at_s[rows],
+        t_ns=1e9 * contacts.at_s[numbers],
+        sigma_ns=1e9 * np.hypot(sigma_s[rows], contacts.sigma_s[numbers]),
+    )
+
+
+def _pair_by_hand(film: _Film, time: SessionTime, options: AlignmentOptions) -> _Pairs:
+    if len(options.instants_s) != len(options.pictures):
+        raise UsageError("by hand each picture needs its instant", where=film.video.name)
+    return _Pairs(
+        film_s=film.find_pictures(options.pictures),
+        t_ns=1e9 * np.array(options.instants_s),
+        sigma_ns=np.full(
+            len(options.pictures),
+            math.hypot(1e9 * film.pick_sigma_s, time.period_ns / math.sqrt(12.0)),
+        ),
+    )
+
+
+_METHODS: dict[AlignmentMethod, Callable[[_Film, SessionTime, AlignmentOptions], _Pairs]] = {
+    "light": _pair_by_light,
+    "clock page": _pair_by_clock_page,
+    "contact": _pair_by_contact,
+    "hand": _pair_by_hand,
+}
