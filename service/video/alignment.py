@@ -116,7 +116,7 @@ def match_contacts(
     """Match the touchdowns of a film with the contacts of a session; either may lack some.
 
     Each of the first touchdowns is tried with every contact. The others then agree within their
-    uncertainties and the drift, or were missed. Those that the other recording does not cover count
+    uncertainties and the drift, or were missed; one before or after the other recording counts
     neither way.
 
     Args:

@@ -8,17 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from devices.errors import UsageError
+from service.cli.align_options import AlignArguments, align_and_report
 from service.cli.commands.sessions import find_sealed_file
-from service.cli.options import JsonOption, echo, print_json, remark, show_progress
+from service.cli.options import JsonOption, add_options, echo, print_json, remark, show_progress
 from storage.sessions.folder import FRAMES_NAME
 
 if TYPE_CHECKING:
     from storage.sessions.videos import Video
 
-ACTIONS = {"add": "FILE", "list": "", "remove": "VIDEO"}
+ACTIONS = {"add": "FILE", "list": "", "remove": "VIDEO", "align": "VIDEO"}
 """Actions, with what each needs behind the session."""
 
 
+@add_options
 def video_command(
     action: Annotated[str, typer.Argument(help=f"{', '.join(ACTIONS)}.")],
     session: Annotated[
@@ -34,15 +36,18 @@ def video_command(
             "not say so."
         ),
     ] = None,
+    *,
+    aligning: AlignArguments,
     data: Annotated[
         Path | None, typer.Option(help="Data folder of the server; default: the user's.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Keep films beside a session: add, list, remove.
+    """Keep films beside a session: add, list, remove, align.
 
     add: copies the film, which is read first: a file that no decoder can read is refused. remove:
-    deletes it with its alignment and tables. A server may run at the same time.
+    deletes it with its alignment and tables. align: finds the film's time in the session, with its
+    uncertainty. A server may run at the same time.
     """
     from storage.sessions.videos import read_videos, remove_video
 
@@ -56,7 +61,12 @@ def video_command(
         )
     if capture_rate is not None and action != "add":
         raise UsageError("--capture-rate is for `foottile video add`")
+    if aligning != AlignArguments() and action != "align":
+        raise UsageError("--by and its options are for `foottile video align`")
     folder = _find_session_folder(session, data)
+    if action == "align":
+        align_and_report(folder, str(target), aligning, None, as_json=as_json)
+        return
     if action == "remove":
         remove_video(folder, str(target))
         return

@@ -71,7 +71,13 @@ COMMANDS: dict[str, tuple[tuple[object, ...], ...]] = {
     ),
     "recover": ((),),
     "sessions": ((), ("--node", HOSTILE), ("--from", HOSTILE)),
-    "video": (("list", ID), ("add", ID, f"{HOSTILE}.mp4"), ("list", HOSTILE), (HOSTILE, ID)),
+    "video": (
+        ("list", ID),
+        ("add", ID, f"{HOSTILE}.mp4"),
+        ("list", HOSTILE),
+        (HOSTILE, ID),
+        ("align", ID, HOSTILE),
+    ),
     "verify": ((ID,), (), (HOSTILE,), ("--manifest", HOSTILE)),
     # What these print of names is the user's own, or a scene's, which has to be one of a few words.
     "benchmark": (("--scene", HOSTILE, "--out", "o"),),

@@ -126,3 +126,34 @@ def test_what_a_killed_add_leaves_is_no_video_and_is_deleted(
     assert contents(folder) != before
     run("recover", "data").succeeds()
     assert {path.name for path in folder.iterdir()} == {*before}
+
+
+def test_a_film_aligned_by_hand_says_where_it_begins_and_how_surely(
+    run: Run, folder: Path, film: Path
+) -> None:
+    video_id = run("video", "add", folder, film, "--json").printed()["id"]
+    align = ("video", "align", folder, video_id)
+    told = run(*align, "--by", "hand", "--pair", "2=0.1", "--pair", "10=0.26")
+    told.succeeds()
+    assert "by hand, begins 0.0600 s after the session, +- " in told.out
+    assert "from 2 instants" in told.out
+    assert "drift: not measured, 98 ppm are allowed for" in told.out
+    again = run(*align, "--by", "hand", "--pair", "2=0.1", "--json").printed()
+    assert again["alignment"]["pair_count"] == 1
+    assert "aligned by hand" in run("video", "list", folder).out
+    run("verify", folder).succeeds()
+    run(*align, "--by", "hand", "--pair", "2=0.5").fails(1, "begins", "after the session")
+    for options, words in (
+        (("--by", "sound"), "light, clock, contact, hand"),
+        ((), "--by is missing"),
+        (("--by", "light"), "no lamp"),
+        (("--by", "light", "--pair", "1=2"), "--pair is for --by hand"),
+        (("--by", "contact"), "--picture of each"),
+        (("--by", "hand"), "from 0 to 11"),
+        (("--by", "hand", "--pair", "12=0.1"), "from 0 to 11"),
+        (("--by", "hand", "--pair", "x"), "as 120=3.52"),
+        (("--by", "hand", "--pair", "1=inf"), "as 120=3.52"),
+        (("--by", "hand", "--pair", "1=0.1", "--capture-rate", "50"), "foottile video add"),
+    ):
+        run(*align, *options).fails(2, words)
+    run("video", "list", folder, "--by", "hand").fails(2, "`foottile video align`")
