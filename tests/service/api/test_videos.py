@@ -230,7 +230,8 @@ def test_an_alignment_by_hand(session: Recording) -> None:
     assert list_all(session) == [aligned]
     other = [pairs[0], pairs[1] | {"t_ns": begin_t_ns}]
     assert_refused(http.put(f"{url}/alignment", json=body | {"pairs": other}), 422, "no majority")
-    for wrong in ({"pairs": []}, {"method": "light"}, {"pairs": [pairs[0] | {"sigma_ns": 0}]}):
+    wrongs: list[dict[str, Any]] = [{"pairs": []}, {"method": "light"}]
+    for wrong in (*wrongs, {"pairs": [pairs[0] | {"sigma_ns": 0}]}):
         assert http.put(f"{url}/alignment", json=body | wrong).status_code == 422
     assert content_of(http.get(url)) == aligned
     assert content_of(http.delete(f"{url}/alignment")) == video
