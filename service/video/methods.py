@@ -1,6 +1,7 @@
 """Methods of alignment: each finds instants of a film in its session, as pairs for one line.
 
-A new alignment that contradicts the stored one is not stored unless that is asked for.
+One that contradicts the stored alignment by another method is not stored unless it shall replace
+that.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ class AlignmentOptions:
         pictures: pictures that a person chose: of touchdowns, or by hand.
         instants_s: their instants in s after the session's begin, by hand.
         track: options of the task that tracks the foot's markers, by contact without pictures.
-        replaces: True: a stored alignment that contradicts the new one is replaced.
+        replaces: True: an alignment by another method that it contradicts is replaced.
     """
 
     near_s: float | None = None
@@ -124,9 +125,9 @@ def align_video(
         on_picture: called with the number of pictures done.
 
     Raises:
-        UnknownError: no such video, or the session has no server's time or estimates.
+        UnknownError: no such video, or the session has no estimates.
         FileFormatError: no instant is found, or they do not agree.
-        StateError: it contradicts the stored alignment.
+        StateError: it contradicts that by another method, or the server's time is unknown.
         UsageError: an option is missing, or does not fit the method.
         StorageError: the alignment cannot be written.
     """
@@ -143,20 +144,44 @@ def align_video(
         begin_t_ns=time.begin_t_ns,
         common_ns=pairs.common_ns,
     )
-    return store_alignment(folder, alignment, time, replaces=options.replaces)
+    _check_overlap(video, alignment, time)
+    return store_alignment(folder, alignment, replaces=options.replaces)
 
 
-def store_alignment(
-    folder: Path, alignment: Alignment, time: SessionTime, *, replaces: bool
-) -> Video:
-    """Store a video's alignment, if it is possible and not in contradiction to the stored one.
+def store_alignment(folder: Path, alignment: Alignment, *, replaces: bool) -> Video:
+    """Store a video's alignment.
+
+    Args:
+        folder: folder of the video.
+        alignment: the alignment.
+        replaces: True: one by another method that it contradicts is replaced.
 
     Raises:
-        FileFormatError: film and session have no instant in common.
-        StateError: it contradicts the stored alignment.
+        StateError: it contradicts the stored one, by another method.
         StorageError: it cannot be written.
     """
     video = read_video(folder)
+    stored = video.alignment
+    if stored is not None and stored.method != alignment.method and not replaces:
+        problem = describe_contradiction(stored, alignment)
+        if problem:
+            raise StateError(
+                problem,
+                where=video.name,
+                expected="methods that agree",
+                remedy="Find out which is wrong; the new one may replace the stored one",
+            )
+    aligned = video.model_copy(update={"alignment": alignment})
+    write_video(folder, aligned)
+    return aligned
+
+
+def _check_overlap(video: Video, alignment: Alignment, time: SessionTime) -> None:
+    """Check that film and session have an instant in common.
+
+    Raises:
+        FileFormatError: they have none.
+    """
     ends_s = np.array([0.0, video.film.duration_s])
     begin_ns, end_ns = (alignment.t_ns + alignment.to_session_ns(ends_s).astype(np.int64)).tolist()
     for apart_ns, what in (
@@ -170,17 +195,6 @@ def store_alignment(
                 expected="a film of this session",
                 remedy="Add it to the session that was recorded meanwhile",
             )
-    problem = describe_contradiction(video.alignment, alignment) if video.alignment else ""
-    if problem and not replaces:
-        raise StateError(
-            problem,
-            where=video.name,
-            expected="agreement with the stored alignment",
-            remedy="Find out which is wrong; the new one is stored only if it shall replace that",
-        )
-    aligned = video.model_copy(update={"alignment": alignment})
-    write_video(folder, aligned)
-    return aligned
 
 
 def _pair_by_light(film: _Film, time: SessionTime, options: AlignmentOptions) -> _Pairs:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from devices.errors import FileFormatError, UnknownError, UsageError
+from devices.errors import FileFormatError, StateError, UsageError
 from service.sessions.stances import load_stances
 from service.video.alignment import Instants
 from storage.clock.table import ClockTable
@@ -45,8 +45,7 @@ class SessionTime(NamedTuple):
     def convert_server_time(self, t_server_ns: int) -> tuple[int, int]:
         """Convert an instant of the server's UTC to the session's time, with its bound, in ns.
 
-        Raises:
-            UnknownError: the node's clock was never compared with the server's.
+        Parts whose clock was never compared with the server's count as far away.
         """
         found: list[tuple[int, int, int]] = []
         for span in self.spans:
@@ -67,12 +66,12 @@ class SessionTime(NamedTuple):
         """Return the server's UTC at the session's begin.
 
         Raises:
-            UnknownError: the node's clock was never compared with the server's.
+            StateError: the node's clock was never compared with the server's.
         """
         first = self.spans[0]
         server_ns, _ = self._to_server_time(first.t_mono_ns[0], first.t_ns[0], first.number)
         if server_ns == UNKNOWN_T_NS:
-            raise UnknownError(
+            raise StateError(
                 "the node's clock was not compared with a server's, whose time the film shows",
                 where=str(self.path.parent),
                 remedy="Align by light, contact or hand",

@@ -234,7 +234,24 @@ def test_an_alignment_by_hand(session: Recording) -> None:
     for wrong in (*wrongs, {"pairs": [pairs[0] | {"sigma_ns": 0}]}):
         assert http.put(f"{url}/alignment", json=body | wrong).status_code == 422
     assert content_of(http.get(url)) == aligned
+    contact = {"method": "contact", "pairs": [pair | {"t_ns": begin_t_ns} for pair in pairs[:1]]}
+    refused = http.put(f"{url}/alignment", json=contact)
+    assert_refused(refused, 409, "5000.0 ms earlier by contact than by hand")
+    replaced = http.put(f"{url}/alignment", params={"replace": True}, json=contact)
+    assert content_of(replaced)["alignment"]["method"] == "contact"
     assert content_of(http.delete(f"{url}/alignment")) == video
+
+
+def test_what_is_not_in_the_film_is_no_alignment(session: Recording) -> None:
+    http, video = session.running.http, content_of(upload(session), 201)
+    url = f"{session.url}/videos/{video['id']}/alignment"
+    assert_refused(http.post(url, params={"method": "light"}), 422, "no lamp in this session")
+    assert_refused(http.post(url, params={"method": "clock_page"}), 422, "shows the clock page")
+    assert http.post(url, params={"method": "hand"}).status_code == 422
+    assert http.post(url, params={"method": "light", "near_s": "nan"}).status_code == 422
+    missing = f"{session.url}/videos/{'0' * 12}/alignment"
+    assert http.post(missing, params={"method": "light"}).status_code == 404
+    assert list_all(session) == [video]
 
 
 def test_access_is_that_of_the_session(serve_with: ServeWith) -> None:
@@ -248,7 +265,8 @@ def test_access_is_that_of_the_session(serve_with: ServeWith) -> None:
         answer = stranger.post(f"{session.url}/videos", params=query, content=short_film())
         assert answer.status_code == 401
         assert stranger.delete(f"{session.url}/videos/{video['id']}").status_code == 401
-        assert stranger.put(f"{session.url}/videos/{video['id']}/alignment").status_code == 401
+        for alter in (stranger.put, stranger.post):
+            assert alter(f"{session.url}/videos/{video['id']}/alignment").status_code == 401
     assert list_all(session) == [video]
 
 

@@ -9,14 +9,15 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from devices.errors import FileFormatError, StateError, UnknownError, UsageError
+from devices.errors import FileFormatError, StateError, UsageError
+from service.video.alignment import fit_alignment
 from service.video.light import compute_mean_code
 from service.video.methods import AlignmentOptions, align_video
 from service.video.worker import describe_film
 from storage.clock.log import ClockOffset
 from storage.clock.table import StreamClockFacts, write_clock_file
 from storage.sessions.folder import FRAMES_NAME
-from storage.sessions.videos import IncomingVideo, Video, find_video_folder, read_video
+from storage.sessions.videos import IncomingVideo, Video, find_video_folder, read_video, write_video
 from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.frames import make_frames
@@ -151,20 +152,27 @@ def test_picked_touchdowns_are_aligned_with_contacts_within_a_picture(session: P
     assert abs(off_ns) < 4.0 * sigma_ns
 
 
-def test_what_contradicts_the_stored_alignment_is_refused_unless_it_replaces_it(
+def test_what_contradicts_another_method_is_refused_unless_it_replaces_it(
     session: Path,
 ) -> None:
     added = add_film(session, SMALL, DARK)
-    first = AlignmentOptions(pictures=(0, 250), instants_s=(3.001, 7.999))
-    align_video(session, added.id, "hand", first)
+    folder = find_video_folder(session, added.id)
+    film_s, begin_ns = np.array([1.0, 5.0]), MONO_NS + UTC_NS
+    by_light = fit_alignment(
+        "light", film_s, 1e9 * (film_s + 3.0), np.full(2, 1e6), begin_t_ns=begin_ns
+    )
+    write_video(folder, added.model_copy(update={"alignment": by_light}))
+    wrong = AlignmentOptions(pictures=(100, 200), instants_s=(5.4, 7.4))
+    with pytest.raises(StateError, match=r"400\.\d ms later by hand than by light"):
+        align_video(session, added.id, "hand", wrong)
+    assert read_video(folder).alignment == by_light
     right = AlignmentOptions(pictures=(100,), instants_s=(5.0,))
     assert align_video(session, added.id, "hand", right).alignment is not None
-    wrong = AlignmentOptions(pictures=(100, 200), instants_s=(5.4, 7.4))
-    with pytest.raises(StateError, match=r"400\.\d ms later by hand than by hand"):
+    corrected = AlignmentOptions(pictures=(100,), instants_s=(6.0,))
+    assert align_video(session, added.id, "hand", corrected).alignment is not None
+    write_video(folder, added.model_copy(update={"alignment": by_light}))
+    with pytest.raises(StateError, match="methods that agree"):
         align_video(session, added.id, "hand", wrong)
-    stored = read_video(find_video_folder(session, added.id)).alignment
-    assert stored is not None
-    assert stored.pair_count == 1
     wrong = AlignmentOptions(pictures=(100, 200), instants_s=(5.4, 7.4), replaces=True)
     replaced = align_video(session, added.id, "hand", wrong).alignment
     assert replaced is not None
@@ -195,5 +203,5 @@ def test_a_film_of_nothing_or_of_another_session_is_refused_with_a_reason(tmp_pa
     video_id = add_film(alone, SMALL, DARK[:20]).id
     with pytest.raises(UsageError, match="no lamp"):
         align_video(alone, video_id, "light")
-    with pytest.raises(UnknownError, match="not compared with a server"):
+    with pytest.raises(StateError, match="not compared with a server"):
         align_video(alone, video_id, "clock page")

@@ -32,12 +32,13 @@ from service.api.routes.common import (
 )
 from service.server.server import Server
 from service.user_folders import PublicText
+from service.video import methods
 from service.video.alignment import fit_alignment
+from service.video.methods import AlignmentOptions, store_alignment
 from service.video.worker import check_extra_installed, describe_film, run_film_task
 from storage.sessions.folder import Session
 from storage.sessions.videos import (
     FILM_MEDIA_TYPES,
-    Alignment,
     IncomingVideo,
     Video,
     find_video_folder,
@@ -58,6 +59,8 @@ _CHUNK_BYTES = 4 << 20
 _PAIRS_MAX = 200
 _SECONDS_MAX = 1e6
 
+_CONTRADICTS = "Its description is damaged, or it contradicts the alignment by another method."
+_Replace = Annotated[bool, Query(description="Replace an alignment that it contradicts.")]
 _UNKNOWN = problem_responses(_404="No such session or video.", _409="Its description is damaged.")
 
 
@@ -246,12 +249,14 @@ def _encode_times(folder: Path, video: Video) -> bytes:
 @router.put(
     "/{video_id}/alignment",
     summary="Align a video by hand",
-    responses=problem_responses(_UNKNOWN, FULL, _422="Invalid body, or the pairs disagree."),
+    responses=problem_responses(
+        _UNKNOWN, FULL, _409=_CONTRADICTS, _422="Invalid body, or the pairs disagree."
+    ),
 )
 async def align_video(
-    session_id: str, video_id: str, body: AlignVideo, server: ServerState
+    session_id: str, video_id: str, body: AlignVideo, server: ServerState, replace: _Replace = False
 ) -> Video:
-    """Fit offset and drift of the film's clock to pairs of instants; replaces an alignment."""
+    """Fit offset and drift of the film's clock to pairs of instants."""
     session = _require_sealed_with_frames(session_id, server)
     begin_t_ns = session.started_t_ns
     fit = partial(
@@ -263,7 +268,45 @@ async def align_video(
         begin_t_ns=begin_t_ns,
     )
     aligned = run_with_usage_errors(fit)
-    return await run_in_threadpool(_set_alignment, session_id, video_id, server, aligned)
+    folder = (await run_in_threadpool(_read, session_id, video_id, server))[0]
+    return await run_in_threadpool(store_alignment, folder, aligned, replaces=replace)
+
+
+@router.post(
+    "/{video_id}/alignment",
+    summary="Find an alignment in the film",
+    responses=problem_responses(
+        _UNKNOWN, FULL, _409=_CONTRADICTS, _422="Lamp or clock page is not found in the film."
+    ),
+)
+async def find_alignment(
+    session_id: str,
+    video_id: str,
+    method: Annotated[
+        Literal["light", "clock_page"],
+        Query(description="The node's lamp, or the page /clock, is in the picture."),
+    ],
+    server: ServerState,
+    near_s: Annotated[
+        float | None,
+        Query(
+            ge=-_SECONDS_MAX,
+            le=_SECONDS_MAX,
+            description="About when the film begins, in s after the session, within 5 s.",
+        ),
+    ] = None,
+    replace: _Replace = False,
+) -> Video:
+    """Find offset and drift by the lamp or the clock page; films are decoded one at a time."""
+    _require_sealed_with_frames(session_id, server)
+    await run_in_threadpool(_read, session_id, video_id, server)
+    find = partial(
+        methods.align_video,
+        *(_find_folder(session_id, server), video_id),
+        "light" if method == "light" else "clock page",
+        AlignmentOptions(near_s=near_s, replaces=replace),
+    )
+    return await to_thread.run_sync(partial(run_with_usage_errors, find), limiter=_DECODING)
 
 
 @router.delete(
@@ -273,14 +316,12 @@ async def align_video(
 )
 async def delete_alignment(session_id: str, video_id: str, server: ServerState) -> Video:
     """Forget how the film's time and the session's belong together."""
-    return await run_in_threadpool(_set_alignment, session_id, video_id, server, None)
+    return await run_in_threadpool(_forget_alignment, session_id, video_id, server)
 
 
-def _set_alignment(
-    session_id: str, video_id: str, server: Server, alignment: Alignment | None
-) -> Video:
+def _forget_alignment(session_id: str, video_id: str, server: Server) -> Video:
     folder, video = _read(session_id, video_id, server)
-    video = video.model_copy(update={"alignment": alignment})
+    video = video.model_copy(update={"alignment": None})
     write_video(folder, video)
     return video
 
