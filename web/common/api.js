@@ -24,6 +24,11 @@ export async function call(method, path, { body, stop = null, type = JSON_TYPE, 
   if (response.status === 401 && await askToLogIn()) ({ response, text } = await sendRequest(PREFIX + path, options, { timeoutS, stop }));
   if (response.status === 204) return null;
   if (response.ok && type !== JSON_TYPE) return text;
+  return resultOf(response, text);
+}
+
+/** Return the parsed answer, or throw its refusal. @param {Response} response @param {string} text */
+export function resultOf(response, text) {
   const answer = parseResponse(response, text);
   if (response.ok) return answer;
   throw new Refusal(String(answer?.detail || answer?.title || `The server refused (${response.status}).`), response.status);
@@ -117,6 +122,22 @@ export const changeMarker = (session, marker, changes, said) =>
   call("PATCH", `/sessions/${id(session)}/markers/${id(marker)}`, { body: changes, said });
 export const removeMarker = (session, marker, said) =>
   call("DELETE", `/sessions/${id(session)}/markers/${id(marker)}`, { said });
+/** @type {(session: string) => Promise<{items: Video[]}>} */
+export const listVideos = (session) => call("GET", `/sessions/${id(session)}/videos`);
+/** Return the address to upload a film to. @param {string} session @param {string} name @param {number | null} captureRateHz */
+export const videosAddress = (session, name, captureRateHz) =>
+  `${PREFIX}/sessions/${id(session)}/videos?${encoded({ name, ...(captureRateHz && { capture_rate_hz: captureRateHz }) })}`;
+const ofVideo = (session, video, part = "") => `/sessions/${id(session)}/videos/${id(video)}${part}`;
+export const removeVideo = (session, video) => call("DELETE", ofVideo(session, video));
+export const filmAddress = (session, video) => PREFIX + ofVideo(session, video, "/film");
+/** @type {(session: string, video: string) => Promise<{film_s: number[]}>} */
+export const filmTimes = (session, video) => call("GET", ofVideo(session, video, "/times"));
+/** @type {(session: string, video: string, pairs: object) => Promise<Video>} */
+export const setAlignment = (session, video, pairs) => call("PUT", ofVideo(session, video, "/alignment"), { body: pairs });
+/** Let the server find it in the pictures: slow. @type {(session: string, video: string, method: string) => Promise<Video>} */
+export const findAlignment = (session, video, method) => call("POST", ofVideo(session, video, `/alignment?method=${method}`), { timeoutS: 3600 });
+/** @type {(session: string, video: string) => Promise<Video>} */
+export const removeAlignment = (session, video) => call("DELETE", ofVideo(session, video, "/alignment"));
 /** @type {(session: string) => Promise<SessionView>} */
 export const sealSession = (session) => call("POST", `/sessions/${id(session)}/abandon-missing`);
 export const deleteSession = (session) => call("DELETE", `/sessions/${id(session)}`);

@@ -20,10 +20,15 @@ export function savePicture(plots, session) {
   context.fillStyle = text;
   context.font = "700 14px system-ui, sans-serif";
   context.fillText(printable(`${session.name}, ${session.node}, ${localTime(new Date(session.started_t_ns / 1e6))}`), 8, 22, plots.width - 16);
+  saveCanvas(canvas, `${session.id}.png`);
+}
+
+/** Download a canvas as PNG. @param {HTMLCanvasElement} canvas @param {string} name */
+export function saveCanvas(canvas, name) {
   canvas.toBlob((blob) => {
     const link = document.createElement("a");
     link.href = URL.createObjectURL(blob);
-    link.download = `${session.id}.png`;
+    link.download = name;
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
   });

@@ -52,6 +52,8 @@ export class Plotted {
       changed: () => this.draw(), failed: showRefusal,
     });
     this.downloads = new Downloads();
+    /** @type {import("./videos.js").Videos | null} */
+    this.videos = null;
     this.cursorS = null;
     this.drawing = 0;
   }
@@ -114,7 +116,9 @@ export class Plotted {
     this.markers.show(events?.items ?? [], whole.beginNs, offset);
     this.plots.markers = this.markers.placed;
     this.draw();
-    if (sealed) quietly(() => this.showCompare(offset));
+    if (!sealed) return;
+    quietly(() => this.showCompare(offset));
+    quietly(() => this.showVideos());
   }
 
   /** Offer an overlay; its modules load on request, or if there is a reference. */
@@ -132,6 +136,21 @@ export class Plotted {
       await open();
       byId("beside", HTMLSelectElement).focus();
     }));
+  }
+
+  /** Show the session's videos; their modules load with the first one, or for an upload. */
+  async showVideos() {
+    const found = await unlessRefused(api.listVideos(this.session.id));
+    const card = byId("videos-card");
+    card.hidden = !found || (!found.items.length && !isOperator());
+    if (card.hidden) return;
+    const load = async () => {
+      const { Videos } = await loadModule(() => import("./videos.js"));
+      this.videos ??= new Videos(this);
+      await this.videos.show(found.items);
+    };
+    if (found.items.length) await load();
+    else for (const name of ["pointerenter", "focusin", "dragenter"]) card.addEventListener(name, () => { if (!this.videos) quietly(load); }, { once: true });
   }
 
   /** Show the stance overlay; its modules load only if there are stances. */
@@ -300,6 +319,7 @@ export class Plotted {
       ArrowLeft: () => this.replay.walk(-1, event.shiftKey), ArrowRight: () => this.replay.walk(1, event.shiftKey),
     };
     if (!onButton) acts[" "] = () => this.replay.toggle();
+    if (this.videos) Object.assign(acts, { ",": () => this.videos.step(-1), ".": () => this.videos.step(1) });
     if (event.target.closest?.("#stances-scroll, .scroll")) { // they scroll the table there
       delete acts.ArrowLeft;
       delete acts.ArrowRight;
@@ -357,6 +377,7 @@ export class Plotted {
     const text = this.readout.draw(bins, this.cursorS === null ? -1 : bins.at(this.cursorS), plots.panels,
       this.cursorS === null ? [] : plots.beside?.readings(view, this.cursorS));
     this.replay.draw();
+    this.videos?.draw();
     if (!this.replay.playing.going) this.describeCursor(text); // not while playing: too fast for a screen reader
     byId("as-heat").setAttribute("aria-pressed", String(plots.panels.some((panel) => panel.kind === "heat")));
     setText(byId("marker-at"), this.cursorS === null ? "at mid-view" : "at cursor");

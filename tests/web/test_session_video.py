@@ -1,0 +1,252 @@
+"""A film on a session's page: added, aligned by hand, in step with the plots, stills of it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.service.recording import Recording
+from tests.service.running import Running
+from tests.service.video.films import Camera, write_film
+from tests.waiting import until
+from tests.web.pages import DESK, PHONE, OpenPage, complaints_at
+from tests.web.session_page import recorded_walk, settled, url_of
+
+pytestmark = [pytest.mark.real_time, pytest.mark.slow]
+
+PICTURES, RATE_HZ, BITS = 60, 25.0, 6
+BLOCK_PX = 40
+NAME = "<img src=x onerror=alert(1)> walk.webm"
+BEGIN_S = 1.0
+"""Of the film, after the session's first frame."""
+SHOWN = """(pictures) => {
+  const film = document.getElementById("film");
+  const canvas = new OffscreenCanvas(film.videoWidth, film.videoHeight);
+  const context = canvas.getContext("2d", { willReadFrequently: true });
+  context.drawImage(film, 0, 0);
+  let number = 0;
+  for (let bit = 0; bit < pictures.bits; bit++) {
+    const at = pictures.block * (bit + 0.5);
+    number = 2 * number + Number(context.getImageData(at, pictures.block / 2, 1, 1).data[0] > 128);
+  }
+  return number;
+}"""
+
+
+def numbered(number: int) -> np.ndarray:
+    """A picture with its number in black and white blocks."""
+    picture = np.full((180, 320), 90, np.uint8)
+    for bit in range(BITS):
+        is_white = number >> (BITS - 1 - bit) & 1
+        picture[:BLOCK_PX, bit * BLOCK_PX : (bit + 1) * BLOCK_PX] = 255 if is_white else 0
+    cv2.circle(picture, (20 + 4 * number, 120), 18, 230, -1)
+    return picture
+
+
+def make_film(path: Path, codec: str) -> Path:
+    camera = Camera(rate_hz=RATE_HZ, codec=codec, width=320, height=180)
+    pictures = [numbered(number) for number in range(PICTURES)]
+    return write_film(path, camera, pictures, np.arange(PICTURES) / RATE_HZ)
+
+
+@pytest.fixture(scope="module")
+def session(server: Running) -> Recording:
+    return recorded_walk(server)
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_film(tmp_path_factory.mktemp("films") / NAME, "libvpx-vp9")
+
+
+@pytest.fixture
+def videos(session: Recording) -> Any:
+    """The address of the session's videos, of which none is left by another test."""
+    address = f"{session.url}/videos"
+    yield address
+    for video in session.running.http.get(address).json()["items"]:
+        assert session.running.http.delete(f"{address}/{video['id']}").status_code == 204
+
+
+def added(session: Recording, film: Path, *, begin_s: float | None = BEGIN_S) -> dict[str, Any]:
+    """A video of the session, aligned or not."""
+    http, address = session.running.http, f"{session.url}/videos"
+    answer = http.post(address, params={"name": film.name}, content=film.read_bytes())
+    assert answer.status_code == 201, answer.text
+    video: dict[str, Any] = answer.json()
+    if begin_s is not None:
+        t_ns = int(session.column("t_ns")[0]) + round(1e9 * begin_s)
+        pair = {"film_s": 0.0, "t_ns": t_ns, "sigma_ns": 1e6}
+        body = {"method": "hand", "pairs": [pair]}
+        answer = http.put(f"{address}/{video['id']}/alignment", json=body)
+        assert answer.status_code == 200, answer.text
+        video = answer.json()
+    return video
+
+
+def still(page: Page, number: int | None = None) -> int:
+    """The number of the picture, once the film stands; it is in the picture, too."""
+    card = page.locator("#film-card[data-still=true]")
+    if number is not None:
+        card = page.locator(f"#film-card[data-still=true][data-picture='{number}']")
+    expect(card).to_have_count(1)
+    shown = int(card.get_attribute("data-picture") or "-1")
+    assert page.evaluate(SHOWN, {"bits": BITS, "block": BLOCK_PX}) == shown
+    return shown
+
+
+def cursor_s(page: Page) -> float:
+    return float(page.locator("#plots").get_attribute("aria-valuenow") or "nan")
+
+
+def put_cursor(page: Page, at_s: float) -> None:
+    """Put the cursor on an instant, by the mouse."""
+    plots = settled(page)
+    plots.evaluate("(plots) => plots.scrollIntoView()")
+    box = plots.bounding_box()
+    begin_s, end_s = (float(plots.get_attribute(f"data-{name}")) for name in ("from", "to"))
+    width = box["width"] - 56 - 12
+    page.mouse.click(box["x"] + 56 + width * (at_s - begin_s) / (end_s - begin_s), box["y"] + 150)
+
+
+def test_a_film_is_added_aligned_by_hand_and_removed(
+    session: Recording, videos: str, film: Path, open_page: OpenPage
+) -> None:
+    page = open_page(url_of(session), 1280, 900)
+    settled(page)
+    page.hover("#video-upload")
+    page.set_input_files("#video-file", film)
+    page.click("#video-send")
+    row = page.locator("#videos-list li")
+    expect(row.locator("strong")).to_have_text(NAME)
+    expect(row).to_contain_text("320 × 180, 25.0 pictures/s, 2.4 s, vp9")
+    expect(page.locator("#alignment-line")).to_contain_text("Not aligned")
+    still(page, 0)
+    expect(page.locator("#film-at")).to_contain_text("Picture 1 of 60: 0.000 s of the film")
+    assert page.locator("#videos-card img").count() == 0
+
+    page.click("#alignment summary")
+    for number, at_s in ((10, 1.4), (50, 3.0)):
+        page.fill("#film-slider", str(number))
+        still(page, number)
+        put_cursor(page, at_s)
+        page.click("#pair-hand")
+    expect(page.locator("#pairs li")).to_have_count(2)
+    page.click("#pair-contact")  # of the same picture: instead of the pair before
+    expect(page.locator("#pairs li").last).to_contain_text("contact at")
+    page.click("#pairs li:last-child button")
+    expect(page.locator("#pairs li")).to_have_count(1)
+    put_cursor(page, 3.0)
+    page.click("#pair-hand")
+    page.click("#align-pairs")
+    line = page.locator("#alignment-line")
+    expect(line).to_contain_text("Aligned by hand: the film begins at")
+    (video,) = session.running.http.get(videos).json()["items"]
+    found = video["alignment"]
+    begin_s = (found["t_ns"] - int(session.column("t_ns")[0])) * 1e-9 - found["film_s"]
+    assert begin_s == pytest.approx(BEGIN_S, abs=0.02)  # a pixel is 5 ms
+    assert 0.02 < 1e-9 * found["sigma_ns"] * 2**0.5 < 0.04  # of each: 2 pictures / sqrt(12)
+    assert (found["method"], found["pair_count"]) == ("hand", 2)
+    text = line.inner_text().replace("\xa0", " ")
+    assert re.search(r"begins at (0\.9|1\.0)\d+ s ± \d\d ms \(95 %\), drift -?\d+", text), text
+    assert "from 2 pairs" in text
+    page.click("#align-light")
+    expect(page.locator("#notices")).to_contain_text("Not done")
+    page.click("#align-undo")
+    expect(line).to_contain_text("Not aligned")
+
+    page.click("#videos-list [aria-label^=Remove]")
+    page.click("#ask-yes")
+    expect(row).to_have_count(0)
+    expect(page.locator("#film-card")).to_be_hidden()
+    assert session.running.http.get(videos).json()["items"] == []
+
+
+@pytest.mark.parametrize("codec", ["libvpx-vp9", "libx264"])
+def test_film_and_cursor_move_together(
+    session: Recording, videos: str, tmp_path: Path, open_page: OpenPage, codec: str
+) -> None:
+    name = "walk.webm" if codec == "libvpx-vp9" else "walk.mp4"
+    added(session, make_film(tmp_path / name, codec))
+    page = open_page(url_of(session, "?at=1.0"), 1280, 900)
+    settled(page)
+    still(page, 0)
+    for at_s in (2.01, 1.33, 3.09):
+        put_cursor(page, at_s)
+        until(lambda at_s=at_s: abs(cursor_s(page) - at_s) < 0.02)
+        expected = round((cursor_s(page) - BEGIN_S) * RATE_HZ)
+        still(page, expected)
+    page.keyboard.press(".")
+    shown = still(page, expected + 1)
+    until(lambda: abs(cursor_s(page) - BEGIN_S - shown / RATE_HZ) < 0.002)
+    for _ in range(3):
+        page.keyboard.press(",")
+    still(page, expected - 2)
+    until(lambda: abs(cursor_s(page) - BEGIN_S - (expected - 2) / RATE_HZ) < 0.002)
+    at = page.locator("#film-at").inner_text().replace("\xa0", " ")
+    assert re.fullmatch(rf"Picture {expected - 1} of 60: \d\.\d{{4}} s ± 2\.0 ms \(95 %\)", at), at
+
+    put_cursor(page, 0.3)
+    expect(page.locator("#film-card")).to_have_attribute("data-outside", "true")
+    expect(page.locator("#film-over")).to_contain_text("it runs from 1.00 s to 3.36 s")
+    page.click("#zoom-in")  # a film that leads moves the plots' window, too
+    page.click("#zoom-in")
+    page.fill("#film-slider", "55")
+    still(page, 55)
+    until(lambda: float(settled(page).get_attribute("data-to")) > BEGIN_S + 55 / RATE_HZ)
+    assert cursor_s(page) == pytest.approx(BEGIN_S + 55 / RATE_HZ, abs=0.002)
+
+    page.click("#zoom-all")
+    page.fill("#film-slider", "5")
+    still(page, 5)
+    page.click("#speeds [data-speed='0.25']")
+    page.click("#play")
+    until(lambda: cursor_s(page) > 0 and page.locator("#film-card").get_attribute("data-picture") not in ("5", "6", "7"))
+    assert page.evaluate("document.getElementById('film').playbackRate") == pytest.approx(0.25, rel=0.3)
+    page.click("#play")
+    shown = still(page)
+    until(lambda: abs(cursor_s(page) - BEGIN_S - still(page) / RATE_HZ) < 0.5 / RATE_HZ + 0.002)
+
+
+def test_a_strip_of_stills_is_one_picture(
+    session: Recording, videos: str, film: Path, open_page: OpenPage, tmp_path: Path
+) -> None:
+    added(session, film)
+    page = open_page(url_of(session, "?at=1.0"), 1280, 900)
+    settled(page)
+    still(page, 0)
+    for number in (40, 12, 25):
+        page.fill("#film-slider", str(number))
+        still(page, number)
+        page.click("#still-add")
+    expect(page.locator("#strip-canvas")).to_have_attribute("data-stills", "3")
+    assert complaints_at(page, DESK, PHONE) == []
+    with page.expect_download() as download:
+        page.click("#strip-save")
+    assert download.value.suggested_filename == f"{session.id}-stills.png"
+    picture = cv2.imread(str(download.value.path()))
+    assert picture[0, 0].tolist() == picture[-1, -1].tolist() == [255, 255, 255]
+    # The stills are side by side in order of time: each has its number in blocks.
+    row = picture[44 + BLOCK_PX // 2, :, 0]
+    (edges,) = np.nonzero(np.diff((row < 250).astype(int)) == 1)
+    assert picture.shape[1] == 1800
+    assert len(edges) >= 3
+
+
+def test_a_film_that_the_browser_cannot_play_is_said(
+    session: Recording, videos: str, tmp_path: Path, open_page: OpenPage
+) -> None:
+    added(session, make_film(tmp_path / "walk.avi", "libx264"), begin_s=None)
+    page = open_page(url_of(session), 1280, 900)
+    expect(page.locator("#film-problem")).to_contain_text("cannot play h264 in AVI")
+    expect(page.locator("#film-tools")).to_be_hidden()
+    expect(page.locator("#videos-list li")).to_have_count(1)
+    page.click("#alignment summary")
+    expect(page.locator("#align-clock")).to_be_enabled()
+    assert complaints_at(page, DESK, PHONE) == []

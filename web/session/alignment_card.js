@@ -1,0 +1,92 @@
+// Alignment of a film: pairs of a picture and an instant of the session, or found by the server in its pictures.
+
+import * as api from "../common/api.js";
+import { notice, quietly } from "../common/notices.js";
+import { byId, el, setText } from "../common/text.js";
+import { pairOf } from "./film_time.js";
+import { timeText } from "./overlay.js";
+
+const NOT_ALIGNED = "Not aligned: where this film lies in the session is not known. Align it here: by light or clock page if it shows one, else by hand.";
+
+/** Controls and result of an alignment. While they are open, film and cursor move apart. */
+export class AlignmentCard {
+  /** @param {import("./plotted.js").Plotted} page @param {import("./film_card.js").FilmCard} card @param {(video: Video) => unknown} onVideo it has changed */
+  constructor(page, card, onVideo) {
+    this.page = page;
+    this.card = card;
+    this.onVideo = onVideo;
+    this.pairs = [];
+    this.shown = null; // id of the video that they are of
+    const buttons = {
+      "pair-hand": () => this.add("hand"), "pair-contact": () => this.add("contact"), "align-pairs": () => this.change(() => this.send()),
+      "align-light": () => this.find("light"), "align-clock": () => this.find("clock_page"),
+      "align-undo": () => this.change(() => api.removeAlignment(this.page.session.id, this.card.video.id)),
+    };
+    for (const [name, act] of Object.entries(buttons)) byId(name).addEventListener("click", act);
+    byId("alignment", HTMLDetailsElement).addEventListener("toggle", () => this.card.setApart(byId("alignment", HTMLDetailsElement).open));
+  }
+
+  /** Show the alignment of the card's video. */
+  show() {
+    const { line } = this.card;
+    if (this.shown !== this.card.video?.id) this.pairs = [];
+    this.shown = this.card.video?.id ?? null;
+    setText(byId("alignment-line"), line?.text ?? NOT_ALIGNED);
+    byId("align-undo").hidden = !line;
+    this.draw();
+  }
+
+  /** Add the picture shown with the cursor, or with the contact nearest to it. @param {"hand" | "contact"} method */
+  add(method) {
+    const { cursorS, plots, view, middle } = this.page;
+    const { film } = this.card;
+    const aboutS = cursorS ?? middle;
+    const contacts = plots.stances.filter((stance) => stance.begun).map((stance) => stance.from);
+    if (method === "hand" && cursorS === null) return notice("put the cursor on the instant first.", { bad: true });
+    if (method === "contact" && !contacts.length) return notice("the session has no contact that begins in it.", { bad: true });
+    const timeS = method === "hand" ? cursorS : contacts.reduce((best, one) => (Math.abs(one - aboutS) < Math.abs(best - aboutS) ? one : best));
+    const resolutionS = method === "hand" ? (view.to - view.from) / plots.plotWidth : 1 / plots.whole.rateHz;
+    this.pairs = this.pairs.filter(({ index }) => index !== film.wanted);
+    this.pairs.push({ index: film.wanted, timeS, method, ...pairOf(method, film.times, film.wanted, timeS, plots.whole.beginNs, resolutionS) });
+    this.draw();
+  }
+
+  draw() {
+    byId("pairs").replaceChildren(...this.pairs.map((pair) => {
+      const text = `Picture ${(pair.index + 1).toLocaleString("en-GB")} ↔ ${pair.method === "contact" ? "contact at " : ""}${timeText(pair.timeS, 1e-3)}`;
+      const remove = el("button", { type: "button", cls: "small", text: "×", "aria-label": `Remove ${text}` });
+      remove.addEventListener("click", () => { this.pairs = this.pairs.filter((one) => one !== pair); this.draw(); });
+      return el("li", { text }, remove);
+    }));
+    byId("align-pairs", HTMLButtonElement).disabled = !this.pairs.length;
+  }
+
+  send() {
+    const pairs = this.pairs.map(({ film_s, t_ns, sigma_ns }) => ({ film_s, t_ns, sigma_ns }));
+    const method = this.pairs.every((pair) => pair.method === "contact") ? "contact" : "hand";
+    return api.setAlignment(this.page.session.id, this.card.video.id, { method, pairs });
+  }
+
+  /** Let the server look for instants in the pictures. @param {"light" | "clock_page"} method */
+  find(method) {
+    const startedMs = performance.now();
+    const say = () => setText(byId("align-wait"), `The server looks through the film: ${Math.round((performance.now() - startedMs) / 1e3)} s`);
+    say();
+    const timer = setInterval(say, 1000);
+    this.change(() => api.findAlignment(this.page.session.id, this.card.video.id, method).finally(() => {
+      clearInterval(timer);
+      setText(byId("align-wait"), "");
+    }));
+  }
+
+  /** Change the alignment; buttons wait meanwhile. @param {() => Promise<Video>} asked */
+  change(asked) {
+    const tools = byId("alignment-tools", HTMLFieldSetElement);
+    tools.disabled = true;
+    quietly(async () => {
+      const video = await asked();
+      await this.onVideo(video);
+      notice(video.alignment ? this.card.line?.text ?? "Aligned." : `“${video.name}” is no longer aligned.`);
+    }).finally(() => { tools.disabled = false; });
+  }
+}

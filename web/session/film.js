@@ -1,0 +1,115 @@
+// Film in a video element: shows a picture by its number, or follows an instant at a speed.
+
+import { intervalOf, pictureAt } from "./film_time.js";
+
+const RATES = [0.0625, 16]; // that browsers play
+const FIRST_MS = 1500; // some browsers load no picture before they are asked for one
+const APART_S = 0.2; // further away the film jumps, nearer it hurries or waits
+const HURRY = 2; // of the rate, per second apart
+const HURRY_MAX = 0.25;
+
+/** Pictures of a film, on demand. */
+export class Film {
+  /** @param {HTMLVideoElement} element @param {() => void} onShown another picture is shown @param {() => void} onBroken it cannot be played */
+  constructor(element, onShown, onBroken) {
+    this.element = element;
+    this.onShown = onShown;
+    this.close();
+    element.addEventListener("seeked", () => this.arrive());
+    element.addEventListener("loadedmetadata", () => {
+      if (!element.videoWidth) onBroken(); // sound alone
+      else this.waiting = setTimeout(() => this.begin(0), FIRST_MS);
+    });
+    element.addEventListener("error", () => { if (element.hasAttribute("src")) onBroken(); });
+    if (typeof element.requestVideoFrameCallback === "function") this.listen();
+    else {
+      element.addEventListener("loadeddata", () => this.begin(0));
+      element.addEventListener("timeupdate", () => this.note(element.currentTime));
+    }
+  }
+
+  listen() {
+    this.element.requestVideoFrameCallback((_, { mediaTime }) => {
+      this.begin(mediaTime);
+      this.note(mediaTime);
+      this.listen();
+    });
+  }
+
+  /**
+   * Open a film at its first picture.
+   * @param {string} address @param {number[]} times of its pictures, in s from the first
+   * @param {number} slowness played time per its time: 33 if taken at 1000 pictures/s and played at 30
+   */
+  open(address, times, slowness) {
+    this.close();
+    [this.times, this.slowness] = [times, slowness];
+    this.element.src = address;
+  }
+
+  close() {
+    clearTimeout(this.waiting);
+    this.element.removeAttribute("src");
+    this.element.load();
+    this.times = [];
+    this.slowness = 1;
+    this.startS = null; // of the first picture by the element, in some files after 0; null: it is not there yet
+    this.index = this.wanted = 0; // the picture shown; the one that it will be
+    this.seeking = null;
+  }
+
+  begin(startS) {
+    if (this.startS !== null || !this.times.length) return;
+    clearTimeout(this.waiting);
+    this.startS = startS;
+    this.arrive();
+  }
+
+  /** True while the picture shown is the one that is wanted. */
+  get isStill() { return this.startS !== null && this.element.paused && this.seeking === null && this.index === this.wanted; }
+
+  /** Note the picture of a playing film. */
+  note(mediaS) {
+    if (this.startS === null || this.element.paused || this.element.seeking) return;
+    this.index = this.wanted = pictureAt(this.times, (mediaS - this.startS) / this.slowness);
+    this.onShown();
+  }
+
+  /** Show a picture; while one is sought, the latest wins. */
+  show(index) {
+    this.element.pause();
+    this.wanted = Math.min(this.times.length - 1, Math.max(0, index));
+    if (this.startS !== null && this.seeking === null && this.index !== this.wanted) this.seek();
+  }
+
+  /** Seek the middle of a picture's interval: stamps are rounded. */
+  seek() {
+    this.seeking = this.wanted;
+    this.element.currentTime = this.startS + (this.times[this.wanted] + intervalOf(this.times, this.wanted) / 2) * this.slowness;
+  }
+
+  arrive() {
+    if (this.seeking !== null) this.index = this.seeking;
+    this.seeking = null;
+    if (this.element.paused && this.index !== this.wanted) this.seek();
+    else this.onShown();
+  }
+
+  /** Play on from an instant of the film at a speed of its own time; called again and again, it corrects its pace. */
+  follow(filmS, speed) {
+    const { element } = this;
+    const rate = speed * this.slowness;
+    if (this.startS === null || rate < RATES[0] || rate > RATES[1]) return this.show(pictureAt(this.times, filmS));
+    const lateS = this.startS + filmS * this.slowness - element.currentTime;
+    if (Math.abs(lateS) > APART_S * Math.max(1, rate) && !element.seeking) element.currentTime += lateS;
+    this.play(speed * (1 + Math.min(HURRY_MAX, Math.max(-HURRY_MAX, HURRY * lateS / rate))));
+  }
+
+  /** Play at a speed of the film's time, as far as the browser can. */
+  play(speed) {
+    this.element.playbackRate = Math.min(RATES[1], Math.max(RATES[0], speed * this.slowness));
+    if (!this.element.paused) return;
+    this.seeking = null;
+    this.element.play().catch(() => {}); // paused meanwhile, or it tells `error`
+  }
+}
