@@ -145,6 +145,7 @@ type FilmInfo = {
   picture_count: number;
   duration_s: number;
   rate_hz: number;
+  play_rate_hz: number;
   is_variable: boolean;
   capture_rate_hz: number | null;
 };

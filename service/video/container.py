@@ -85,6 +85,7 @@ def read_film(path: Path, capture_rate_hz: float | None = None) -> tuple[FilmInf
         picture_count=len(times_s),
         duration_s=float(times_s[-1]),
         rate_hz=rate_hz,
+        play_rate_hz=play_rate_hz,
         is_variable=bool(uneven.any()),
         capture_rate_hz=captured_hz,
     ), times_s

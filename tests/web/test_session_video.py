@@ -207,8 +207,15 @@ def test_film_and_cursor_move_together(
     still(page, 5)
     page.click("#speeds [data-speed='0.25']")
     page.click("#play")
-    until(lambda: cursor_s(page) > 0 and page.locator("#film-card").get_attribute("data-picture") not in ("5", "6", "7"))
-    assert page.evaluate("document.getElementById('film').playbackRate") == pytest.approx(0.25, rel=0.3)
+    until(
+        lambda: (
+            cursor_s(page) > 0
+            and page.locator("#film-card").get_attribute("data-picture") not in ("5", "6", "7")
+        )
+    )
+    assert page.evaluate("document.getElementById('film').playbackRate") == pytest.approx(
+        0.25, rel=0.3
+    )
     page.click("#play")
     shown = still(page)
     until(lambda: abs(cursor_s(page) - BEGIN_S - still(page) / RATE_HZ) < 0.5 / RATE_HZ + 0.002)

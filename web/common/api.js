@@ -122,7 +122,7 @@ export const changeMarker = (session, marker, changes, said) =>
   call("PATCH", `/sessions/${id(session)}/markers/${id(marker)}`, { body: changes, said });
 export const removeMarker = (session, marker, said) =>
   call("DELETE", `/sessions/${id(session)}/markers/${id(marker)}`, { said });
-/** @type {(session: string) => Promise<{items: Video[]}>} */
+/** @type {(session: string) => Promise<VideosView>} */
 export const listVideos = (session) => call("GET", `/sessions/${id(session)}/videos`);
 /** Return the address to upload a film to. @param {string} session @param {string} name @param {number | null} captureRateHz */
 export const videosAddress = (session, name, captureRateHz) =>
@@ -130,8 +130,8 @@ export const videosAddress = (session, name, captureRateHz) =>
 const ofVideo = (session, video, part = "") => `/sessions/${id(session)}/videos/${id(video)}${part}`;
 export const removeVideo = (session, video) => call("DELETE", ofVideo(session, video));
 export const filmAddress = (session, video) => PREFIX + ofVideo(session, video, "/film");
-/** @type {(session: string, video: string) => Promise<{film_s: number[]}>} */
-export const filmTimes = (session, video) => call("GET", ofVideo(session, video, "/times"));
+/** @type {(session: string, video: string) => Promise<TimesView>} */
+export const filmTimes = (session, video) => call("GET", ofVideo(session, video, "/times"), { timeoutS: 120 });
 /** @type {(session: string, video: string, pairs: object) => Promise<Video>} */
 export const setAlignment = (session, video, pairs) => call("PUT", ofVideo(session, video, "/alignment"), { body: pairs });
 /** Let the server find it in the pictures: slow. @type {(session: string, video: string, method: string) => Promise<Video>} */

@@ -43,7 +43,7 @@ export class FilmCard {
       const { id } = this.page.session;
       const times = video && (await api.filmTimes(id, video.id)).film_s;
       if (this.video !== video) return; // another one was asked for meanwhile
-      if (video) this.film.open(api.filmAddress(id, video.id), times, video.film.rate_hz / (video.film.play_rate_hz || video.film.rate_hz || 1));
+      if (video) this.film.open(api.filmAddress(id, video.id), times, video.film.rate_hz / video.film.play_rate_hz || 1);
     }
     this.draw();
     this.follow();

@@ -100,7 +100,8 @@ def test_pictures_have_the_order_of_time_with_b_frames_a_variable_rate_and_a_cap
     assert [index for index, _ in shown] == [3, 4, 5, 6]
     assert np.all(np.diff([grey for _, grey in shown]) > 10)
     slow, slow_s = read_film(path, capture_rate_hz=1000.0)
-    assert slow.capture_rate_hz == 1000.0
+    assert (slow.capture_rate_hz, slow.rate_hz) == (1000.0, pytest.approx(1000.0))
+    assert slow.play_rate_hz == pytest.approx(film.rate_hz)
     np.testing.assert_allclose(slow_s, np.array(times_s) / 20.0, atol=1e-5)
     with pytest.raises(UsageError, match="cannot have been taken"):
         read_film(path, capture_rate_hz=1e9)

@@ -35,6 +35,7 @@ INFO = FilmInfo(
     picture_count=2,
     duration_s=0.02,
     rate_hz=50.0,
+    play_rate_hz=50.0,
     is_variable=False,
     capture_rate_hz=None,
 )

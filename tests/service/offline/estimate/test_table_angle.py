@@ -190,6 +190,7 @@ def test_a_films_table_takes_the_alignment_beside_it(tmp_path: Path) -> None:
         picture_count=4,
         duration_s=0.06,
         rate_hz=50.0,
+        play_rate_hz=50.0,
         is_variable=False,
         capture_rate_hz=None,
     )
