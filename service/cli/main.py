@@ -57,7 +57,7 @@ SUMMARIES = {
     "query": "Run SQL over all sealed sessions.",
     "simulate": "Run a scene on emulated hardware in virtual time and write the session.",
     "estimate": "Estimate a recorded session again and write it with the new estimates.",
-    "video": "Keep films beside a session: add, list, remove, align.",
+    "video": "Keep films beside a session: add, list, remove, align, track.",
     "compare": "Compare a session with a reference: a force plate, an insole, another session.",
     "calibrate": (
         "Fit curve and effects of every tile in the recordings, with confidence intervals."

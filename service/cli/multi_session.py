@@ -9,14 +9,14 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain
+from itertools import chain, count
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from devices.errors import UsageError, escape_control_chars
-from service.cli.options import echo, remark, stderr
+from service.cli.options import echo, remark, show_progress_bar, stderr
 
 if TYPE_CHECKING:
     from service.offline.archive.jobs import Job, JobMapper, Outcome, OutcomeCounts
@@ -217,23 +217,13 @@ def _show_progress(
     if not stderr.is_terminal:
         yield lambda outcome: None
         return
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-
-    text = TextColumn("{task.description}")
-    bar = Progress(text, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=stderr)
-    with bar:
-        task_id = bar.add_task(command, total=sum(1 for _ in list_again()))
+    done = count(1)
+    with show_progress_bar(command, sum(1 for _ in list_again())) as show_done:
 
         def show_outcome(outcome: Outcome) -> None:
             if outcome.state == "failed":
                 remark(_format_failure(outcome))
-            bar.advance(task_id)
+            show_done(next(done))
 
         yield show_outcome
 

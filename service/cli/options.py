@@ -160,6 +160,30 @@ def show_progress(message: str) -> Iterator[Callable[[str], None]]:
         yield lambda text: status.update(escape(escape_control_chars(text)))
 
 
+@contextmanager
+def show_progress_bar(message: str, total: int) -> Iterator[Callable[[int], None]]:
+    """Show a bar and the remaining time on a terminal.
+
+    The yielded function shows how many are done.
+    """
+    if not stderr.is_terminal:
+        yield lambda done: None
+        return
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    text = TextColumn("{task.description}", markup=False)
+    bar = Progress(text, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=stderr)
+    with bar:
+        task_id = bar.add_task(escape_control_chars(message), total=total)
+        yield lambda done: bar.update(task_id, completed=done)
+
+
 def is_encodable(text: str) -> bool:
     """Return whether the encodings of both streams have all characters of a text."""
     try:

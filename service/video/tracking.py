@@ -14,7 +14,7 @@ greater, never less). A picture in which a marker is hidden has no angle.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +23,8 @@ import numpy.typing as npt
 
 from devices.arrays import Floats
 from devices.errors import FileFormatError, UsageError
-from service.video.container import Picture, iterate_pictures
+from service.video.container import Picture, iterate_pictures, read_film
+from storage.sessions.videos import FilmInfo
 
 _TAG_SEARCH = 4.0
 """Where a tag is looked for: its last place, and this many times its size around it."""
@@ -33,7 +34,7 @@ _DOT_ROUNDNESS = 0.6
 """Least ratio of a dot's area to that of the circle around it."""
 _WINDOW = 7
 """Pictures of the parabola that measures the noise."""
-_SIGMA_MIN_PX = 0.03
+PLACE_SIGMA_PX = 0.03
 """Least uncertainty of a marker's place: no detection is better on real pictures."""
 _COLOURS_HUE = {"red": 0, "orange": 12, "yellow": 28, "green": 60, "blue": 112, "magenta": 150}
 """Hues in OpenCV's half degrees."""
@@ -41,7 +42,8 @@ _HUE_WITHIN = 11
 _SATURATION_MIN = 90
 _VALUE_MIN = 70
 _BRIGHT_MIN = 200
-_BOARDS_MIN = 5
+_BOARDS_MIN, _BOARDS_MAX = 5, 40
+"""Pictures of a checkerboard that are needed, and that are looked at."""
 
 
 class Lens(NamedTuple):
@@ -51,37 +53,19 @@ class Lens(NamedTuple):
     distortion: Floats
 
 
-class Track(NamedTuple):
-    """Markers and angle of each picture; NaN where a marker is hidden.
-
-    Attributes:
-        lower_px: (pictures, 2), x to the right and y down.
-        upper_px: (pictures, 2).
-        angle_rad: (pictures,).
-        sigma_rad: (pictures,), standard deviation.
-    """
-
-    lower_px: Floats
-    upper_px: Floats
-    angle_rad: Floats
-    sigma_rad: Floats
-
-
 FindMarkers = Callable[[Picture], Floats | None]
 """Finds both markers in a picture: (2, 2), the lower one first; None if not both are seen."""
 
 
-def track_angle(
+def track_markers(
     path: Path,
     picture_count: int,
     find_markers: FindMarkers,
     *,
     is_grey: bool,
-    forward_is_right: bool = True,
-    zero_rad: float = 0.0,
     lens: Lens | None = None,
     on_picture: Callable[[int], None] = lambda _: None,
-) -> Track:
+) -> Floats:
     """Track the markers through a film.
 
     Args:
@@ -89,10 +73,12 @@ def track_angle(
         picture_count: number of its pictures.
         find_markers: finds them in a picture.
         is_grey: whether it takes grey pictures.
-        forward_is_right: True if the foot rolls forward to the right.
-        zero_rad: angle in the picture at which the segment's is 0.
         lens: of the camera, by a checkerboard.
         on_picture: called with the number of each picture.
+
+    Returns:
+        (pictures, 2, 2), places in pixels, the lower marker first, x to the right and y down; NaN
+        where a marker is hidden.
 
     Raises:
         FileFormatError: the film is damaged, or no picture shows both markers.
@@ -109,23 +95,23 @@ def track_angle(
             where=str(path),
             remedy="Look at the film: tags need a white border, and 5 pixels a square",
         )
-    if lens is not None:
-        places_px = _undistort(places_px, lens)
-    return compute_track(places_px, forward_is_right=forward_is_right, zero_rad=zero_rad)
+    return places_px if lens is None else _undistort(places_px, lens)
 
 
-def compute_track(
-    places_px: Floats, *, forward_is_right: bool = True, zero_rad: float = 0.0
-) -> Track:
-    """Compute the angle from the places of both markers, (pictures, 2, 2), the lower first."""
-    lower_px, upper_px = places_px[:, 0], places_px[:, 1]
-    along_px = upper_px - lower_px
-    forward_px = along_px[:, 0] if forward_is_right else -along_px[:, 0]
-    angle_rad = np.arctan2(forward_px, -along_px[:, 1]) - zero_rad
-    least_rad = math.sqrt(2.0) * _SIGMA_MIN_PX / np.hypot(along_px[:, 0], along_px[:, 1])
-    return Track(
-        lower_px, upper_px, angle_rad, np.maximum(least_rad, _measure_noise_rad(angle_rad))
-    )
+def compute_angle(
+    places: Floats, *, zero_rad: float, place_sigma: float = PLACE_SIGMA_PX
+) -> tuple[Floats, Floats]:
+    """Compute the angle and its standard deviation, (pictures,) each.
+
+    Args:
+        places: (pictures, 2, 2), of the lower and the upper marker, forward and up.
+        zero_rad: angle of the line between them at which the segment's is 0.
+        place_sigma: least standard deviation of a place, in the unit of `places`.
+    """
+    forward, up = np.moveaxis(places[:, 1] - places[:, 0], 1, 0)
+    angle_rad = np.remainder(np.arctan2(forward, up) - zero_rad + math.pi, 2.0 * math.pi) - math.pi
+    least_rad = math.sqrt(2.0) * place_sigma / np.hypot(forward, up)
+    return angle_rad, np.maximum(least_rad, _measure_noise_rad(angle_rad))
 
 
 def _measure_noise_rad(angle_rad: Floats) -> float:
@@ -270,30 +256,43 @@ def _undistort(places_px: Floats, lens: Lens) -> Floats:
     return points.reshape(shape)
 
 
-def calibrate_lens(pictures: Iterator[Picture], columns: int, rows: int) -> Lens:
-    """Compute a camera's lens from grey pictures of a checkerboard.
+def calibrate_lens(path: Path, columns: int, rows: int, film: FilmInfo) -> Lens:
+    """Compute a camera's lens from a film of a checkerboard.
 
     Args:
-        pictures: at least five in which the board lies differently.
+        path: film in which the board is held in many ways before the camera.
         columns: inner corners along a row.
         rows: inner corners along a column.
+        film: the film that the lens is for.
 
     Raises:
-        FileFormatError: the board is seen too rarely.
+        FileFormatError: the board is seen too rarely, or in pictures of another size.
     """
     import cv2
 
+    size = film.width_px, film.height_px
+    boards, _ = read_film(path)
+    if (boards.width_px, boards.height_px) != size:
+        raise FileFormatError(
+            f"its pictures have {boards.width_px} x {boards.height_px} pixels",
+            where=str(path),
+            expected=f"{size[0]} x {size[1]}, as the film of the leg",
+        )
     board = np.zeros((columns * rows, 3), np.float32)
     board[:, :2] = np.mgrid[:columns, :rows].T.reshape(-1, 2)
-    corners, size = [], (0, 0)
-    for picture in pictures:
-        is_found, places = cv2.findChessboardCornersSB(picture, (columns, rows))
-        if is_found:
-            corners.append(places.astype(np.float32))
-            size = picture.shape[1], picture.shape[0]
+    step = max(1, boards.picture_count // _BOARDS_MAX)
+    corners = []
+    for index, picture in iterate_pictures(path, is_grey=True):
+        if index % step == 0:
+            is_found, places = cv2.findChessboardCornersSB(
+                np.ascontiguousarray(picture), (columns, rows)
+            )
+            if is_found:
+                corners.append(places.astype(np.float32))
     if len(corners) < _BOARDS_MIN:
         raise FileFormatError(
             f"the checkerboard of {columns} x {rows} inner corners is in {len(corners)} pictures",
+            where=str(path),
             expected=f"at least {_BOARDS_MIN}, tilted differently",
         )
     _, matrix, distortion, _, _ = cv2.calibrateCamera(

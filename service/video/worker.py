@@ -229,33 +229,30 @@ def _find_clock(path: Path, near_ns: int, capture_rate_hz: float | None = None) 
 
 def _track(
     path: Path,
-    marks: str,
     tags: tuple[int, int] | None = None,
+    dots: str | None = None,
+    lens: str | None = None,
+    board: tuple[int, int] = (0, 0),
     capture_rate_hz: float | None = None,
-    forward_is_right: bool = True,
-    zero_rad: float = 0.0,
 ) -> dict[str, Any]:
     from service.video.container import read_film
-    from service.video.tracking import make_dot_finder, make_tag_finder, track_angle
+    from service.video.tracking import (
+        calibrate_lens,
+        make_dot_finder,
+        make_tag_finder,
+        track_markers,
+    )
 
     film, times_s = read_film(path, capture_rate_hz)
-    find = make_tag_finder(*tags) if tags is not None else make_dot_finder(marks)
-    track = track_angle(
+    places_px = track_markers(
         path,
         film.picture_count,
-        find,
-        is_grey=tags is not None or marks == "bright",
-        forward_is_right=forward_is_right,
-        zero_rad=zero_rad,
+        make_tag_finder(*tags) if tags is not None else make_dot_finder(dots or ""),
+        is_grey=tags is not None or dots == "bright",
+        lens=None if lens is None else calibrate_lens(Path(lens), *board, film),
         on_picture=_report,
     )
-    columns = {"film_s": times_s, "angle_rad": track.angle_rad, "sigma_rad": track.sigma_rad}
-    for name, places in (("lower", track.lower_px), ("upper", track.upper_px)):
-        columns |= {f"{name}_x_px": places[:, 0], f"{name}_y_px": places[:, 1]}
-    return {
-        name: [None if np.isnan(v) else v for v in column.tolist()]
-        for name, column in columns.items()
-    }
+    return {"film_s": times_s.tolist(), "places_px": places_px.tolist()}
 
 
 _TASKS: dict[str, Callable[..., dict[str, Any]]] = {

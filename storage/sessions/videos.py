@@ -21,7 +21,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from devices.arrays import Floats
+from devices.arrays import Floats, Times
 from devices.clock import server_utc_ns
 from devices.errors import (
     DamagedFileError,
@@ -100,6 +100,11 @@ class Alignment(StrictModel):
     def to_film_s(self, t_ns: Floats) -> Floats:
         """Convert instants in ns after `t_ns` to the film's, in s from its first picture."""
         return np.asarray(t_ns / (1e9 * (1.0 + self.drift)) + self.film_s)
+
+    def place(self, film_s: Floats) -> tuple[Times, Floats]:
+        """Convert instants of the film to the session's time, with their standard deviations."""
+        t_ns = self.t_ns + np.rint(self.to_session_ns(film_s)).astype(np.int64)
+        return t_ns, self.compute_sigma_ns(film_s)
 
     def compute_sigma_ns(self, film_s: Floats) -> Floats:
         """Compute the standard deviation of converted instants, in ns."""

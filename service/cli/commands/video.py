@@ -11,12 +11,13 @@ from devices.errors import UsageError
 from service.cli.align_options import AlignArguments, align_and_report
 from service.cli.commands.sessions import find_sealed_file
 from service.cli.options import JsonOption, add_options, echo, print_json, remark, show_progress
+from service.cli.track_options import TrackArguments, track_angle
 from storage.sessions.folder import FRAMES_NAME
 
 if TYPE_CHECKING:
     from storage.sessions.videos import Video
 
-ACTIONS = {"add": "FILE", "list": "", "remove": "VIDEO", "align": "VIDEO"}
+ACTIONS = {"add": "FILE", "list": "", "remove": "VIDEO", "align": "VIDEO", "track": "VIDEO"}
 """Actions, with what each needs behind the session."""
 
 
@@ -38,20 +39,24 @@ def video_command(
     ] = None,
     *,
     aligning: AlignArguments,
+    tracking: TrackArguments,
     data: Annotated[
         Path | None, typer.Option(help="Data folder of the server; default: the user's.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Keep films beside a session: add, list, remove, align.
+    """Keep films beside a session: add, list, remove, align, track.
 
     add: copies the film, which is read first: a file that no decoder can read is refused. remove:
     deletes it with its alignment and tables. align: finds the film's time in the session, with its
-    uncertainty. A server may run at the same time.
+    uncertainty. track: writes the foot's angle in each picture as a table, for `foottile estimate
+    --angle`. A server may run at the same time.
     """
     from storage.sessions.videos import read_videos, remove_video
 
     needed = ACTIONS.get(action)
+    if action == "track" and tracking.begin_s is not None:
+        needed = ""  # points in space, without a video
     if needed is None:
         raise UsageError(f"video {action!r}", expected=f"one of {', '.join(ACTIONS)}")
     if bool(needed) != bool(target):
@@ -66,6 +71,9 @@ def video_command(
     folder = _find_session_folder(session, data)
     if action == "align":
         align_and_report(folder, str(target), aligning, None, as_json=as_json)
+        return
+    if action == "track":
+        track_angle(folder, target, tracking, as_json=as_json)
         return
     if action == "remove":
         remove_video(folder, str(target))

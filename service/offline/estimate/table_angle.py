@@ -97,8 +97,7 @@ def read_angle_track(path: Path) -> AngleTrack:
     if table.film_s is not None and (path.parent / VIDEO_NAME).exists():
         alignment = read_video(path.parent).alignment  # the newest, also if the table is older
         if alignment is not None:
-            t_ns = alignment.t_ns + np.rint(alignment.to_session_ns(table.film_s)).astype(np.int64)
-            sigma_ns = alignment.compute_sigma_ns(table.film_s)
+            t_ns, sigma_ns = alignment.place(table.film_s)
     if t_ns is None:
         raise UsageError(
             f"{path} has times of a film that is not aligned with the session",

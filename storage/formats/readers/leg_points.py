@@ -21,8 +21,8 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.errors import FileFormatError, UsageError
-from devices.input_files import read_text
 from storage.formats.readers.c3d import METRES, read_c3d_points
+from storage.formats.readers.text import read_decoded_text
 
 LIKELIHOOD_MIN = 0.6
 """Likelihood below which DeepLabCut itself shows no point (its `pcutoff`)."""
@@ -94,7 +94,7 @@ def _read(path: Path, names: tuple[str, str], forward: str | None) -> LegPoints:
             expected=".csv of Kinovea or DeepLabCut, .trc or .c3d",
             remedy="Export it from Kinovea as CSV (trajectories)",
         )
-    text = read_text(path)
+    text = read_decoded_text(path)
     first = text.partition("\n")[0]
     separators = "\t" if suffix == ".trc" else ",;"
     delimiter = max(separators, key=first.count)

@@ -18,6 +18,7 @@ _SUPER = 3
 """Pixels of the drawing for one of the picture."""
 _TIME_BASE = Fraction(1, 90_000)
 LOWER_TAG, UPPER_TAG = 3, 7
+_FAST = {"libx264": {"preset": "veryfast"}, "libvpx-vp9": {"deadline": "realtime", "cpu-used": "8"}}
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class Camera:
     height: int = 360
 
 
-def draw_leg(camera: Camera, angle_rad: float, marks: str) -> npt.NDArray[np.float64]:
+def draw_leg(camera: Camera, angle_rad: float, marks: str) -> npt.NDArray[np.float32]:
     """The leg at an angle, in linear steps of 0 to 255."""
     size = camera.height * _SUPER, camera.width * _SUPER
     picture = np.full(size, 110, np.uint8)
@@ -54,7 +55,8 @@ def draw_leg(camera: Camera, angle_rad: float, marks: str) -> npt.NDArray[np.flo
             cv2.circle(picture, centre, 9 * _SUPER * 16, 255, -1, shift=4)
         elif marks == "tags":
             _draw_tag(picture, number, middle, angle_rad)
-    return picture.astype(np.float64)
+    shown = cv2.resize(picture, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    return shown.astype(np.float32)
 
 
 def _draw_tag(
@@ -66,12 +68,14 @@ def _draw_tag(
     scale = 42.0 * _SUPER / 120.0
     c, s = scale * math.cos(angle_rad), scale * math.sin(angle_rad)
     matrix = np.array([[c, -s, 0.0], [s, c, 0.0]])
-    centre = (tag.shape[0] - 1) / 2
-    matrix[:, 2] = middle - matrix[:, :2] @ np.array([centre, centre])
-    shape = picture.shape[1], picture.shape[0]
+    centre, half = (tag.shape[0] - 1) / 2, int(scale * tag.shape[0])
+    left, top = (int(v) - half for v in middle)
+    matrix[:, 2] = middle - (left, top) - matrix[:, :2] @ np.array([centre, centre])
+    part = picture[top : top + 2 * half, left : left + 2 * half]
+    shape = part.shape[1], part.shape[0]
     drawn = cv2.warpAffine(tag, matrix, shape, flags=cv2.INTER_AREA)
     mask = cv2.warpAffine(np.full_like(tag, 255), matrix, shape)
-    picture[mask > 127] = drawn[mask > 127]
+    part[mask > 127] = drawn[mask > 127]
 
 
 def film_leg(
@@ -112,9 +116,7 @@ def film_leg(
             )
             high = drawn.shape[0] // bands
             rows.append(drawn[band * high : (band + 1) * high])
-        shown = cv2.resize(
-            np.concatenate(rows), (camera.width, camera.height), interpolation=cv2.INTER_AREA
-        )
+        shown = np.concatenate(rows)
         if lamp_at is not None:
             shown[20:32, 20:32] = 60.0 + 180.0 * lamp_at(at_s + exposure_s / 2, exposure_s)
         noisy = shown + generator.normal(0.0, camera.noise, shown.shape)
@@ -133,6 +135,7 @@ def write_film(
         stream.pix_fmt = "yuv420p"
         stream.codec_context.time_base = stream.time_base = _TIME_BASE
         stream.codec_context.bit_rate = 8_000_000
+        stream.codec_context.options = _FAST.get(camera.codec, {})
         for picture, t_s in zip(pictures, times_s, strict=True):
             frame = av.VideoFrame.from_ndarray(picture, format="gray").reformat(format="yuv420p")
             frame.pts, frame.time_base = round(t_s / _TIME_BASE), _TIME_BASE

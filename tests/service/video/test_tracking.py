@@ -10,7 +10,7 @@ import pytest
 
 from devices.errors import FileFormatError, UsageError
 from service.video.container import iterate_pictures, read_film
-from service.video.tracking import compute_track, make_dot_finder, make_tag_finder, track_angle
+from service.video.tracking import compute_angle, make_dot_finder, make_tag_finder, track_markers
 from tests.service.video.films import LOWER_TAG, UPPER_TAG, Camera, film_leg, write_film
 
 
@@ -42,23 +42,24 @@ def test_the_angle_of_each_picture_is_right_within_what_it_says(
     assert film.picture_count == 40
     np.testing.assert_allclose(times_s, begin_s, atol=1e-3)
     find = make_tag_finder(LOWER_TAG, UPPER_TAG) if marks == "tags" else make_dot_finder("bright")
-    track = track_angle(path, film.picture_count, find, is_grey=True)
+    places_px = track_markers(path, film.picture_count, find, is_grey=True)
+    angle_rad, sigma_rad = compute_angle(places_px * (1.0, -1.0), zero_rad=0.0)
     exposure_s = camera.exposure / camera.rate_hz
     true_rad = np.array([swing(t_s + exposure_s / 2) for t_s in begin_s])
-    off_deg = np.degrees(track.angle_rad - true_rad)
+    off_deg = np.degrees(angle_rad - true_rad)
     assert np.flatnonzero(np.isnan(off_deg)).tolist() == [hidden]
     assert np.nanmax(np.abs(off_deg)) < 0.2
-    sigma_deg = np.degrees(track.sigma_rad)
+    sigma_deg = np.degrees(sigma_rad)
     assert np.sqrt(np.nanmean((off_deg / sigma_deg) ** 2)) < 2.5
 
 
-def test_forward_to_the_left_and_a_zero_change_sign_and_origin() -> None:
-    places_px = np.array(
-        [[[100.0, 300.0], [100.0 + 200 * math.sin(0.3), 300 - 200 * math.cos(0.3)]]] * 9
-    )
-    assert compute_track(places_px).angle_rad == pytest.approx(0.3)
-    left = compute_track(places_px, forward_is_right=False, zero_rad=0.1)
-    assert left.angle_rad == pytest.approx(-0.4)
+def test_a_zero_turns_the_angle_and_no_angle_is_beyond_half_a_turn() -> None:
+    ahead, up = 200.0 * math.sin(3.0), 200.0 * math.cos(3.0)
+    places = np.array([[[100.0, -300.0], [100.0 + ahead, -300.0 + up]]] * 9)
+    assert compute_angle(places, zero_rad=0.1)[0] == pytest.approx(2.9)
+    angle_rad, sigma_rad = compute_angle(places, zero_rad=-1.0)
+    assert angle_rad == pytest.approx(4.0 - 2.0 * math.pi)
+    assert sigma_rad == pytest.approx(0.03 * math.sqrt(2.0) / 200.0)
 
 
 def test_a_film_without_markers_and_one_that_breaks_off_are_refused(tmp_path: Path) -> None:
@@ -67,7 +68,7 @@ def test_a_film_without_markers_and_one_that_breaks_off_are_refused(tmp_path: Pa
     blank = [np.full((camera.height, camera.width), 90, np.uint8)] * 12
     path = write_film(tmp_path / "blank.mkv", camera, blank, begin_s)
     with pytest.raises(FileFormatError, match="no picture shows both markers"):
-        track_angle(path, 12, make_tag_finder(1, 2), is_grey=True)
+        track_markers(path, 12, make_tag_finder(1, 2), is_grey=True)
     with pytest.raises(UsageError, match="beige"):
         make_dot_finder("beige")
     cut = tmp_path / "cut.mp4"

@@ -172,6 +172,7 @@ FILES = {"missing", "nowhere", "empty", "junk", "hole", "no Parquet"}
 """What may be written over."""
 
 
+POINTS = ("track", "s.parquet", "--begin-s", 0, "--points", "a,b", "--points-file")
 READ: dict[tuple[str, str], tuple[object, ...]] = {
     ("benchmark", "scene"): ("--out", "bench", "--scene", "{}"),
     ("calibrate", "recordings"): ("{}", "--out", "cal.json"),
@@ -185,6 +186,7 @@ READ: dict[tuple[str, str], tuple[object, ...]] = {
     ("estimate", "manifest"): ("--manifest", "{}", "--out", "o"),
     ("estimate", "calibration"): ("s.parquet", "--out", "x.parquet", "--calibration", "{}"),
     ("estimate", "scene"): (*COMMANDS["estimate"], "--scene", "{}"),
+    ("estimate", "angle"): (*COMMANDS["estimate"], "--angle", "{}"),
     ("export", "sessions"): ("{}", "--format", "csv", "--out", "x.csv"),
     ("export", "manifest"): ("--manifest", "{}", "--format", "csv", "--out", "o"),
     ("node", "scene"): ("--scene", "{}"),
@@ -196,6 +198,8 @@ READ: dict[tuple[str, str], tuple[object, ...]] = {
     ("verify", "targets"): ("{}",),
     ("video", "session"): ("list", "{}"),
     ("video", "target"): ("add", "s.parquet", "{}"),
+    ("video", "lens"): ("track", "s.parquet", "0" * 12, "--dots", "red", "--lens", "{}"),
+    ("video", "points_file"): (*POINTS, "{}", "--out", "t.csv"),
     ("verify", "manifest"): ("--manifest", "{}"),
     ("calibrate", "ca"): (
         *("--live", "--tile", "T01", "--out", "cal.json"),
@@ -217,6 +221,7 @@ WRITTEN: dict[tuple[str, str], tuple[object, ...]] = {
     ),
     ("export", "out"): ("s.parquet", "--format", "csv", "--out", "{}"),
     ("query", "out"): ("SELECT 1", "--data", ".", "--out", "{}"),
+    ("video", "out"): (*POINTS, "k.csv", "--out", "{}"),
     ("simulate", "force_plate"): (*SHORT[1:], "--force-plate", "{}"),
     ("simulate", "out"): (*SHORT[1:-1], "{}"),
     ("simulate", "pressure_plate"): (*SHORT[1:], "--pressure-plate", "{}"),
