@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,6 +50,15 @@ class TrackOptions:
     zero_rad: float = 0.0
     scale_m: float | None = None
 
+    def make_task_options(self) -> dict[str, Any]:
+        """Return the options of the task that tracks the markers."""
+        return {
+            "tags": self.tags,
+            "dots": self.dots,
+            "lens": None if self.lens is None else str(self.lens),
+            "board": self.board,
+        }
+
 
 class TrackedAngle(NamedTuple):
     """Table of angles, with the places of the markers by column."""
@@ -87,11 +96,8 @@ def track_video(
         "track",
         path,
         on_picture=on_picture,
-        tags=options.tags,
-        dots=options.dots,
-        lens=None if options.lens is None else str(options.lens),
-        board=options.board,
         capture_rate_hz=rate_hz,
+        **options.make_task_options(),
     )
     places_px = np.array(found["places_px"], dtype=np.float64)
     sign = -1.0 if options.forward == "left" else 1.0

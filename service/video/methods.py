@@ -260,12 +260,9 @@ def _pair_by_clock_page(film: _Film, time: SessionTime, _: AlignmentOptions) -> 
 
 def _pair_by_contact(film: _Film, time: SessionTime, options: AlignmentOptions) -> _Pairs:
     if options.track is not None:
-        table = film.run("track", **options.track)
-        columns = {
-            name: np.array([math.nan if v is None else v for v in table[name]])
-            for name in ("film_s", "lower_y_px")
-        }
-        found = find_touchdowns(columns["film_s"], -columns["lower_y_px"])
+        track = film.run("track", **options.track)
+        height_px = -np.array(track["places_px"])[:, 0, 1]
+        found = find_touchdowns(np.array(track["film_s"]), height_px)
         at_s, sigma_s = np.array(found, dtype=np.float64).reshape(-1, 2).T
     else:
         at_s = np.sort(film.find_pictures(options.pictures))

@@ -68,6 +68,8 @@ def video_command(
         raise UsageError("--capture-rate is for `foottile video add`")
     if aligning != AlignArguments() and action != "align":
         raise UsageError("--by and its options are for `foottile video align`")
+    if tracking != TrackArguments() and action != "track":
+        raise UsageError("options of markers and tables are for `foottile video track`")
     folder = _find_session_folder(session, data)
     if action == "align":
         align_and_report(folder, str(target), aligning, None, as_json=as_json)
