@@ -37,6 +37,7 @@ from studies.reproduce.experiments import (
     ExperimentSetup,
     pool_repeatability,
 )
+from studies.reproduce.video_angle import AngleComparison
 
 _STEP_S = 1e-3
 _LOADED_N = 0.5
@@ -248,6 +249,7 @@ class Reproduction:
         failures: reasons of failed measurements, by name.
         seconds: run time, by step.
         notes: remarks on the run.
+        angles: angle of `rolling` by servo and by video; None if not asked for, or failed.
     """
 
     software: str
@@ -261,6 +263,7 @@ class Reproduction:
     failures: Mapping[str, str]
     seconds: Mapping[str, float]
     notes: Sequence[str] = ()
+    angles: AngleComparison | None = None
 
     def find_experiment(self, name: str) -> ExperimentResult | None:
         """Return an experiment by name; None if it has no result."""
@@ -298,6 +301,7 @@ class Reproduction:
                 }
                 for one in self.experiments
             },
+            **({} if self.angles is None else {"angles": self.angles}),
         }
 
 

@@ -37,6 +37,7 @@ from service.version import SOFTWARE_VERSION
 from storage.durable_files import make_synced_folder, write_atomically
 from storage.sessions.folder import FRAMES_NAME
 from studies.reproduce.experiments import (
+    LEAD_S,
     ROLLING,
     SETUPS,
     TRIALS,
@@ -58,6 +59,7 @@ from studies.reproduce.result import (
     compute_not_borne_n,
     evaluate_trial,
 )
+from studies.reproduce.video_angle import AngleComparison, compare_angle_sources
 
 _SERVER_START_TIMEOUT_S = 120.0
 """Timeout of the server's start, which compiles models on a new machine."""
@@ -269,6 +271,8 @@ class ReproduceOptions:
     trials: int = TRIALS
     jobs: int = 2
     quick: bool = False
+    films_angle: bool = False
+    """True: the angle of `rolling` is also taken from a film."""
 
     @property
     def domes(self) -> tuple[Dome, ...]:
@@ -317,9 +321,13 @@ def run_reproduction(options: ReproduceOptions, folder: Path, report: ReportStep
     with run.measure_time("mill"):
         domes, calibration = _indent_tiles(run)
     experiments: tuple[ExperimentResult, ...] = ()
+    angles = None
     if calibration is not None:
         with run.measure_time("trials"):
             experiments = _run_experiments(run, calibration)
+        if options.films_angle:
+            with run.measure_time("film"):
+                angles = _film_angle(run, calibration)
     return Reproduction(
         software=SOFTWARE_VERSION,
         run_at=datetime.now(UTC).strftime("%Y-%m-%d"),
@@ -332,6 +340,7 @@ def run_reproduction(options: ReproduceOptions, folder: Path, report: ReportStep
         failures=run.failures,
         seconds=run.seconds,
         notes=_make_notes(run),
+        angles=angles,
     )
 
 
@@ -426,6 +435,21 @@ def _run_experiments(run: _Run, calibration: Calibration) -> tuple[ExperimentRes
         for setup in options.setups
     )
     return tuple(one for one in grouped if one.trials)
+
+
+def _film_angle(run: _Run, calibration: Calibration) -> AngleComparison | None:
+    run.report_step("film: rolling, with the angle from video")
+    try:
+        return compare_angle_sources(
+            load_scene(str(_get_scene_path(run, ROLLING))),
+            calibration,
+            seconds=LEAD_S + ROLLING.trial_seconds,
+            seed=run.options.seed,
+            parts_seed=run.options.parts_seed,
+        )
+    except FootTileError as error:
+        run.add_failure("film: the angle", error)
+        return None
 
 
 def _write_scenes(run: _Run, calibration: Calibration) -> None:

@@ -321,6 +321,10 @@ def reproduce_command(
         int | None,
         typer.Option(min=1, max=JOBS_MAX, help="Parallel trials; default: one per core, up to 2."),
     ] = None,
+    angle: Annotated[
+        str,
+        typer.Option(help="Angle of the rolling foot: servo; or video, also from a rendered film."),
+    ] = "servo",
     as_json: JsonOption = False,
 ) -> None:
     """Repeat the paper's experiments on emulated hardware.
@@ -330,18 +334,24 @@ def reproduce_command(
     success, 1 failure, 2 wrong usage, 3 written, but with missing results.
     """
     from service.offline.figure_output import create_figure
+    from service.video.worker import check_extra_installed
     from studies.reproduce.experiments import TRIALS
     from studies.reproduce.figures import draw_figures
     from studies.reproduce.report import format_reproduction_report
     from studies.reproduce.run import QUICK_TRIALS, ReproduceOptions, run_reproduction
 
     create_figure(1.0, 1.0)  # reports a missing package early
+    if angle not in ("servo", "video"):
+        raise UsageError(f"--angle {angle}", expected="servo or video")
+    if angle == "video":
+        check_extra_installed()
     options = ReproduceOptions(
         seed=seed,
         parts_seed=parts_seed,
         trials=trials or (QUICK_TRIALS if quick else TRIALS),
         jobs=jobs or min(2, os.cpu_count() or 1),
         quick=quick,
+        films_angle=angle == "video",
     )
     with open_result_folder(out) as folder:
         with show_progress("starting") as report_step:

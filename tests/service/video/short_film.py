@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.service.video.films import Camera, write_film
+from studies.reproduce.leg_film import Camera, write_film
 
 PICTURES = 12
 RATE_HZ = 50.0

@@ -19,9 +19,9 @@ from storage.clock.table import StreamClockFacts, write_clock_file
 from storage.sessions.folder import FRAMES_NAME
 from storage.sessions.videos import IncomingVideo, Video, find_video_folder, read_video, write_video
 from storage.sessions.writer import SealedFileWriter
+from studies.reproduce.leg_film import Camera, write_film
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.frames import make_frames
-from tests.service.video.films import Camera, write_film
 from tests.service.video.test_clock_page import Screen, film_screen
 
 MONO_NS = 5_000_000_000_000

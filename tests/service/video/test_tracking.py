@@ -11,7 +11,7 @@ import pytest
 from devices.errors import FileFormatError, UsageError
 from service.video.container import iterate_pictures, read_film
 from service.video.tracking import compute_angle, make_dot_finder, make_tag_finder, track_markers
-from tests.service.video.films import LOWER_TAG, UPPER_TAG, Camera, film_leg, write_film
+from studies.reproduce.leg_film import LOWER_TAG, UPPER_TAG, Camera, film_leg, write_film
 
 
 def swing(t_s: float) -> float:

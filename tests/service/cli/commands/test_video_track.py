@@ -14,11 +14,11 @@ from storage.formats.angle_table import ANGLE_NAME, read_angle_table
 from storage.sessions.folder import FRAMES_NAME
 from storage.sessions.videos import find_video_folder, read_video, write_video
 from storage.sessions.writer import SealedFileWriter
+from studies.reproduce.leg_film import LOWER_TAG, UPPER_TAG, Camera, film_leg, write_film
 from tests.builders.arrays import UTC_NS, make_array, make_servo
 from tests.service.cli.commands.test_any_value import PLACES
 from tests.service.cli.outcome import Run
 from tests.service.sessions.pieces import calibration, frames, hopping
-from tests.service.video.films import LOWER_TAG, UPPER_TAG, Camera, film_leg, write_film
 
 PICTURES = 16
 TAGS = "--tags", f"{LOWER_TAG},{UPPER_TAG}"

@@ -1,4 +1,4 @@
-"""Films of an emulated foot: tags or dots along a leg, a lamp, and what a camera does to them."""
+"""Films of an emulated leg with tags or dots, and a lamp: blur, rolling shutter, noise, codec."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _FAST = {"libx264": {"preset": "veryfast"}, "libvpx-vp9": {"deadline": "realtime
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera.
+    """Camera.
 
     Attributes:
         rate_hz: pictures per second.
@@ -43,7 +43,7 @@ class Camera:
 
 
 def draw_leg(camera: Camera, angle_rad: float, marks: str) -> npt.NDArray[np.float32]:
-    """The leg at an angle, in linear steps of 0 to 255."""
+    """Draw the leg at an angle, in linear steps of 0 to 255."""
     size = camera.height * _SUPER, camera.width * _SUPER
     picture = np.full(size, 110, np.uint8)
     lower = np.array([0.5 * size[1], 0.8 * size[0]])
@@ -87,7 +87,7 @@ def film_leg(
     marks: str = "tags",
     lamp_at: Callable[[float, float], float] | None = None,
 ) -> list[Picture]:
-    """Pictures of a leg whose exposures begin at instants.
+    """Film a leg.
 
     Motion within an exposure is drawn at three instants, and rows are exposed one after the other.
 
@@ -130,7 +130,7 @@ def write_film(
     """Write pictures with their times."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream(camera.codec, rate=round(camera.rate_hz))
-        assert isinstance(stream, av.VideoStream)
+        assert isinstance(stream, av.VideoStream)  # noqa: S101
         stream.width, stream.height = pictures[0].shape[1], pictures[0].shape[0]
         stream.pix_fmt = "yuv420p"
         stream.codec_context.time_base = stream.time_base = _TIME_BASE
