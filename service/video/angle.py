@@ -51,7 +51,13 @@ class TrackOptions:
     scale_m: float | None = None
 
     def make_task_options(self) -> dict[str, Any]:
-        """Return the options of the task that tracks the markers."""
+        """Return the options of the task that tracks the markers.
+
+        Raises:
+            UsageError: there are none, but points of a file.
+        """
+        if self.points_file is not None:
+            raise UsageError("points of a file are no markers", expected="--tags or --dots")
         return {
             "tags": self.tags,
             "dots": self.dots,

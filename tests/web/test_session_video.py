@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
+from studies.reproduce.leg_film import Camera, write_film
 from tests.service.recording import Recording
 from tests.service.running import Running
-from tests.service.video.films import Camera, write_film
 from tests.waiting import until
 from tests.web.pages import DESK, PHONE, OpenPage, complaints_at
 from tests.web.session_page import recorded_walk, settled, url_of

@@ -68,11 +68,15 @@ def video_command(
         raise UsageError("--capture-rate is for `foottile video add`")
     if aligning != AlignArguments() and action != "align":
         raise UsageError("--by and its options are for `foottile video align`")
-    if tracking != TrackArguments() and action != "track":
-        raise UsageError("options of markers and tables are for `foottile video track`")
+    by_markers = aligning.by == "contact" and tracking != TrackArguments()
+    if tracking != TrackArguments() and action != "track" and not by_markers:
+        raise UsageError(
+            "options of markers are for `foottile video track` and `align --by contact`"
+        )
     folder = _find_session_folder(session, data)
     if action == "align":
-        align_and_report(folder, str(target), aligning, None, as_json=as_json)
+        track = tracking.make_options().make_task_options() if by_markers else None
+        align_and_report(folder, str(target), aligning, track, as_json=as_json)
         return
     if action == "track":
         track_angle(folder, target, tracking, as_json=as_json)

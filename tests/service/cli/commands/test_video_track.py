@@ -42,7 +42,8 @@ def folder(tmp_path: Path) -> Path:
     folder.mkdir()
     notes = {"calibration": calibration().model_dump(mode="json")}
     with SealedFileWriter(folder / FRAMES_NAME, make_array(servo=make_servo()), notes) as writer:
-        writer.append_frames(frames(hopping(750, loaded_from=300), lead=200), {})
+        part = np.zeros(750, dtype=np.uint16)
+        writer.append_frames(frames(hopping(750, loaded_from=300), lead=200), {"part": part})
     return folder
 
 
@@ -149,6 +150,10 @@ def test_options_that_do_not_fit_are_refused(run: Run, folder: Path, film: Path)
     for options, problem in REFUSED:
         run("video", "track", folder, video_id, *options).fails(2, problem)
     run("video", "track", folder, "0" * 12, "--dots", "red").fails(1, "no video", video_id)
+    run("video", "list", folder, *TAGS).fails(2, "are for `foottile video track`")
+    by_contact = "video", "align", folder, video_id, "--by", "contact"
+    run(*by_contact, *TAGS).fails(1, "no estimates")
+    run(*by_contact, "--points-file", "x.csv", "--points", "a,b").fails(2, "--tags or --dots")
 
 
 def test_a_special_file_is_refused_as_points(run: Run, folder: Path, tmp_path: Path) -> None:
