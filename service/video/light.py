@@ -8,6 +8,7 @@ uncertain by that interval, and says so.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
@@ -22,8 +23,8 @@ _WINDOW_S = 6.0
 """Length of a window: 64 bits."""
 _PEAK_MIN = 0.6
 """Least correlation with the code: by chance 64 bits reach half of it in 10^5 offsets."""
-_SHARE_OF_INTERVAL = 1.0 / 24.0
-"""Step of the offsets in the fine grid, in intervals of pictures."""
+_GRID_STEPS = 96
+"""Offsets of the fine grid."""
 _PARTS_MAX = 1024
 """Parts of the picture, the ones that change most, in which the code is looked for."""
 _CHUNK = 4096
@@ -164,31 +165,51 @@ def _refine(
     some = slice(None, None, max(1, int(BIT_NS / _ROUGH_PICTURES / interval_ns)))
     misfit = _compute_misfit(film_s[some], series[some], rough_ns, interval_ns)
     near_ns = rough_ns[np.argmin(misfit)]
-    middle_s = float(film_s.mean())
     # Only pictures near the edges tell more: of fast films that is a small part.
     t_ns = near_ns + 1e9 * film_s
     spread = compute_mean_code(t_ns, 2.0 * _NEAR_INTERVALS * interval_ns)
     is_near = (spread > 0) & (spread < 1)
     if is_near.any():
         film_s, series = film_s[is_near], _normalize(series[is_near, None])[:, 0]
-    step_ns = interval_ns * _SHARE_OF_INTERVAL
-    offsets_ns = near_ns + np.arange(-2.0 * interval_ns, 2.0 * interval_ns, step_ns)
-    misfit = np.stack(
-        [_compute_misfit(film_s, series, offsets_ns, part * interval_ns) for part in _EXPOSURES],
-        axis=1,
+    offset_ns, reach_ns, exposures = float(near_ns), 2.0 * interval_ns, _EXPOSURES
+    for _ in range(2):  # the second time on a grid as fine as the posterior is narrow
+        step_ns = 2.0 * reach_ns / _GRID_STEPS
+        offsets_ns = offset_ns + np.arange(-reach_ns, reach_ns, step_ns)
+        misfit = np.stack(
+            [_compute_misfit(film_s, series, offsets_ns, p * interval_ns) for p in exposures],
+            axis=1,
+        )
+        # The noise is unknown, too: integrated out, the posterior is a power of the misfit.
+        log_posterior = -0.5 * (len(series) - 3) * np.log(np.maximum(misfit, 1e-9))
+        weight = np.exp(log_posterior - log_posterior.max())
+        weight /= weight.sum()
+        offset_ns, sigma_ns = _compute_moments(weight.sum(axis=1), offsets_ns)
+        exposure, spread = _compute_moments(weight.sum(axis=0), exposures)
+        reach_ns = 6.0 * sigma_ns
+        low, high = max(_EXPOSURES[0], exposure - 4.0 * spread), min(1.0, exposure + 4.0 * spread)
+        exposures = np.linspace(low, high, len(_EXPOSURES))
+    # At the mean instant of all that tells the offset, a drift does not change it.
+    shift_ns = max(sigma_ns, interval_ns / _GRID_STEPS)
+    change = np.subtract(
+        *(
+            compute_mean_code(offset_ns + side_ns + 1e9 * film_s, exposure * interval_ns)
+            for side_ns in (-shift_ns, shift_ns)
+        )
     )
-    # The noise is unknown, too: integrated out, the posterior is a power of the misfit.
-    log_posterior = -0.5 * (len(series) - 3) * np.log(np.maximum(misfit, 1e-9))
-    weight = np.exp(log_posterior - log_posterior.max()).sum(axis=1)
-    weight /= weight.sum()
-    offset_ns = float(weight @ offsets_ns)
-    variance = float(weight @ (offsets_ns - offset_ns) ** 2)
+    at_s = float(np.average(film_s, weights=change**2 + 1e-12))
     return LampPair(
-        film_s=middle_s,
-        t_mono_ns=offset_ns + 1e9 * middle_s,
-        sigma_ns=float(np.sqrt(variance + step_ns**2 / 12.0)),
+        film_s=at_s,
+        t_mono_ns=offset_ns + 1e9 * at_s,
+        sigma_ns=sigma_ns,
         correlation=correlation,
     )
+
+
+def _compute_moments(weight: Floats, values: Floats) -> tuple[float, float]:
+    """Compute mean and standard deviation over a grid, with what its steps hide."""
+    mean = float(weight @ values)
+    step = float(values[-1] - values[0]) / (len(values) - 1)
+    return mean, math.sqrt(float(weight @ (values - mean) ** 2) + step**2 / 12.0)
 
 
 def _compute_misfit(

@@ -12,10 +12,12 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from storage.sessions.folder import SessionsFolder
 from storage.sessions.metadata import read_existing_markers
+from storage.sessions.reader import SealedFileReader
 from tests.devices.array.gpio_chip import FileChip
 from tests.service.cli.outcome import static_only
 from tests.service.process import Start, acquisition_of
@@ -42,7 +44,9 @@ def leg(foottile: Start, tmp_path: Path, chip: FileChip) -> Callable[..., Any]:
     scene = tmp_path / "scene.toml"
     scene.write_text('calibration = "paper-eq2-shape"\n' + static_only(text) + "\n" + sync)
 
-    def start(*arguments: object) -> Any:
+    def start(*arguments: object, **keys: str) -> Any:
+        for name, value in keys.items():
+            scene.write_text(scene.read_text() + f'{name} = "{value}"\n')
         return foottile(
             *("node", "--scene", scene, "--name", "leg", "--journal", tmp_path / "node"),
             *arguments,
@@ -143,6 +147,38 @@ def test_a_node_alone_has_its_edges_in_its_session(
     assert labels == ["sync rising"] * 2
     for t_ns, row in zip(sent, (rows * 2)[:2], strict=True):
         assert abs(int(row["t_mono_ns"]) - t_ns) < 20e6
+
+
+def test_a_film_of_the_lamp_of_a_node_is_aligned_with_its_session(
+    leg: Callable[..., Any], chip: FileChip, tmp_path: Path
+) -> None:
+    pytest.importorskip("av", reason="films need the extra `video`")
+    from service.video.methods import align_video
+    from tests.service.video.films import Camera
+    from tests.service.video.test_methods import add_film
+
+    process = leg("--record", "trial", output="code")
+    until(lambda: chip.is_high(27), 30.0)
+    time.sleep(10.0)
+    process.process.send_signal(signal.SIGTERM)
+    assert process.ended(30.0) == 0, process.err
+    (session,) = (tmp_path / "node" / "sessions").iterdir()
+    switched_ns, levels = map(np.array, zip(*chip.read_levels(27), strict=True))
+    begin_ns = int(switched_ns[levels][0]) - 1_234_567_890
+    camera = Camera(width=96, height=64)
+    pictures = []
+    for index in range(500):
+        at_ns = begin_ns + index * 20_000_000 + np.arange(0, 6_000_000, 500_000)
+        rows = np.searchsorted(switched_ns, at_ns, side="right") - 1
+        picture = np.full((64, 96), 90.0)
+        picture[16:32, 32:48] += 60.0 * np.mean(levels[np.maximum(rows, 0)] & (rows >= 0))
+        pictures.append(picture.astype(np.uint8))
+    found = align_video(session, add_film(session, camera, pictures).id, "light").alignment
+    assert found is not None
+    with SealedFileReader(session / "frames.parquet") as reader:
+        off_ns = found.t_ns + found.to_session_ns(np.array([0.0]))[0] - reader.info.utc_offset_ns
+    is_late = any("the lamp is switched late" in line for line in process.err)
+    assert abs(off_ns - begin_ns - 3_000_000) < (10e6 if not is_late else 40e6)
 
 
 def test_a_chip_that_is_not_there_is_said_at_the_start(

@@ -73,6 +73,23 @@ def test_an_instant_is_found_within_half_a_picture_as_surely_as_it_says(
     assert np.sqrt(np.mean(np.square(ratios))) < 2.5
 
 
+@pytest.mark.slow(parts=8)
+def test_the_uncertainty_by_light_is_that_of_many_films() -> None:
+    ratios, drifts = [], []
+    for rate_hz, exposure in ((30.0, 0.3), (50.0, 0.1), (50.0, 1.0)):
+        generator = np.random.default_rng(round(rate_hz + 10 * exposure))
+        for _ in range(50):
+            times_s, brightness, offset_ns, drift = make_brightness(rate_hz, exposure, generator)
+            found = align(times_s, brightness)
+            true_ns = offset_ns + 1e10 * (1.0 + drift)
+            off_ns = float(found.t_ns + found.to_session_ns(np.array([10.0]))[0] - true_ns)
+            assert abs(off_ns) < 0.5e9 / rate_hz
+            ratios.append(off_ns / found.compute_sigma_ns(np.array([10.0]))[0])
+            drifts.append((found.drift - drift) / found.sigma_drift)
+    for each in (ratios, drifts):
+        assert 0.90 <= np.mean(np.abs(each) < 1.96) <= 0.99
+
+
 def test_a_film_without_the_lamp_has_no_pair() -> None:
     generator = np.random.default_rng(5)
     times_s, brightness, _, _ = make_brightness(50.0, 0.3, generator)
