@@ -5,9 +5,10 @@ deviation of their difference. All pairs of a film are fitted by one line
 
     session t = begin + offset + (1 + drift) (film t - middle)
 
-with the drift's own knowledge beforehand: crystals of cameras are within some 50 ppm. So one pair
-gives an offset whose uncertainty grows away from it, and several pairs give the drift, too. A pair
-that contradicts the others is left out, and said.
+with the drift's own knowledge beforehand: crystals of cameras are within some 50 ppm, and a stated
+capture rate within 0.1 % (240 may be 239.76). So one pair gives an offset whose uncertainty grows
+away from it, and several pairs give the drift, too. A pair that contradicts the others is left out,
+and said; the scatter of the others enlarges the uncertainties that they state.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from storage.sessions.videos import Alignment, AlignmentMethod
 
 DRIFT_SIGMA = 50e-6
 """Standard deviation of a camera's drift before anything is measured."""
+CAPTURE_RATE_SIGMA = 1e-3
+"""The same for a film whose capture rate is stated."""
 _OUTLIER_SIGMAS = 4.0
 
 
@@ -34,6 +37,7 @@ def fit_alignment(
     *,
     begin_t_ns: int,
     common_ns: float = 0.0,
+    drift_sigma: float = DRIFT_SIGMA,
 ) -> Alignment:
     """Fit a line to pairs of instants.
 
@@ -46,7 +50,8 @@ def fit_alignment(
         t_ns: (pairs,), in ns after `begin_t_ns`.
         sigma_ns: (pairs,), standard deviations of `t_ns`.
         begin_t_ns: begin of the session.
-        common_ns: standard deviation of an error that all pairs share.
+        common_ns: standard deviation of an error that all pairs share, or those of one end.
+        drift_sigma: standard deviation of the drift beforehand.
 
     Raises:
         FileFormatError: there is no pair, or no majority agrees.
@@ -57,7 +62,7 @@ def fit_alignment(
     apart_s = film_s[None, :] - film_s[:, None]
     misfit_ns = np.abs(t_ns[None, :] - t_ns[:, None] - 1e9 * apart_s)
     allowed_ns = np.sqrt(
-        sigma_ns[None, :] ** 2 + sigma_ns[:, None] ** 2 + (1e9 * DRIFT_SIGMA * apart_s) ** 2
+        sigma_ns[None, :] ** 2 + sigma_ns[:, None] ** 2 + (1e9 * drift_sigma * apart_s) ** 2
     )
     ratio = misfit_ns / allowed_ns
     agree = ratio < _OUTLIER_SIGMAS
@@ -76,15 +81,18 @@ def fit_alignment(
     # A line about the weighted mean: offset and drift are independent.
     rest_ns = y_ns - 1e9 * shifted_s
     offset_ns = float(weight @ rest_ns / weight.sum())
-    information = 1e18 * float(weight @ shifted_s**2) + DRIFT_SIGMA**-2.0
+    information = 1e18 * float(weight @ shifted_s**2) + drift_sigma**-2.0
     drift = float(1e9 * (weight * shifted_s) @ (rest_ns - offset_ns)) / information
+    left_ns = rest_ns - offset_ns - 1e9 * drift * shifted_s
+    scatter = math.sqrt(max(1.0, float(weight @ left_ns**2) / max(1, used.sum() - 1)))
+    common_drift = math.sqrt(2.0) * 1e-9 * common_ns / max(float(np.ptp(x_s)), 1e-9)
     return Alignment(
         method=method,
         film_s=middle_s,
         t_ns=begin_t_ns + round(offset_ns),
         drift=drift,
-        sigma_ns=math.hypot(float(weight.sum()) ** -0.5, common_ns),
-        sigma_drift=math.sqrt(1.0 / information),
+        sigma_ns=math.hypot(scatter * float(weight.sum()) ** -0.5, common_ns),
+        sigma_drift=min(drift_sigma, math.hypot(scatter * information**-0.5, common_drift)),
         pair_count=int(used.sum()),
         rejected_count=int(len(film_s) - used.sum()),
     )
@@ -108,6 +116,8 @@ class Instants(NamedTuple):
     sigma_s: Floats
     duration_s: float
     """Time that the film or session covers, from 0."""
+    drift_sigma: float = DRIFT_SIGMA
+    """Standard deviation of its clock's drift."""
 
 
 def match_contacts(
@@ -164,7 +174,7 @@ def _match_by(
         + contacts.sigma_s[nearest] ** 2
         + touchdowns.sigma_s[first] ** 2
         + contacts.sigma_s[contact] ** 2
-        + (DRIFT_SIGMA * since_s) ** 2
+        + (touchdowns.drift_sigma * since_s) ** 2
     )
     ratio = np.abs(contacts.at_s[nearest] - expected_s) / sigma_s
     agree = ratio < _OUTLIER_SIGMAS

@@ -167,7 +167,8 @@ def _check(columns: dict[str, Any]) -> AngleTable:
             refuse(~np.isfinite(times), f"{name} is empty", "an instant in each row")
             falls = np.diff(times, prepend=times[:1] - 1) <= 0
             refuse(falls, f"{name} does not rise", "rows in order of time, each instant once")
-    refuse(np.abs(angle_rad) > 2.0 * math.pi, "the angle is beyond a turn", "radians, not degrees")
+    is_beyond = np.abs(angle_rad) > math.pi / 2.0
+    refuse(is_beyond, "the angle is beyond a quarter of a turn", "radians, not degrees")
     refuse(
         is_known & ~(np.isfinite(sigma_rad) & (sigma_rad > 0.0)),
         "sigma_rad is no uncertainty",

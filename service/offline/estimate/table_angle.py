@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -34,7 +34,8 @@ _UNKNOWN = np.uint8(FrameFlag.SERVO_STALE | FrameFlag.SERVO_TURN_UNKNOWN)
 _REPLACED = ("servo_counts", "servo_age_us", "frame_flags")
 
 
-class AngleTrack(NamedTuple):
+@dataclass(frozen=True)
+class AngleTrack:
     """Known angles at n instants of a session, rising.
 
     Attributes:
@@ -53,6 +54,18 @@ class AngleTrack(NamedTuple):
     source: npt.NDArray[np.str_]
     origin: Mapping[str, str]
 
+    @cached_property
+    def bend(self) -> Floats:
+        """Largest second derivative of the angle near each instant, (n,), in rad/s^2.
+
+        The change of slope over a gap counts in the gap, where the angle may have turned.
+        """
+        since_s = (self.t_ns - self.t_ns[0]) * 1e-9
+        slope = np.gradient(self.angle_rad, since_s)
+        over_step = np.abs(np.diff(slope)) / np.diff(since_s)
+        around = np.concatenate([over_step[:1], over_step, over_step[-1:]])
+        return np.asarray(np.maximum(around[:-1], around[1:]))
+
     def interpolate(self, t_ns: Times) -> tuple[Floats, Floats, npt.NDArray[np.str_]]:
         """Interpolate to instants: angle and its standard deviation, NaN where unknown; source.
 
@@ -67,9 +80,7 @@ class AngleTrack(NamedTuple):
         is_known &= (step_ns <= GAP_MAX_NS) | (part == 0.0) | (part == 1.0)
         rise_rad = self.angle_rad[after] - self.angle_rad[before]
         angle_rad = self.angle_rad[before] + part * rise_rad
-        since_s = (self.t_ns - self.t_ns[0]) * 1e-9
-        bends = np.abs(np.gradient(np.gradient(self.angle_rad, since_s), since_s))
-        bend = np.maximum(bends[before], bends[after])
+        bend = np.maximum(self.bend[before], self.bend[after])
         sigma_rad = np.sqrt(
             ((1.0 - part) * self.sigma_rad[before]) ** 2
             + (part * self.sigma_rad[after]) ** 2
@@ -95,23 +106,29 @@ def read_angle_track(path: Path) -> AngleTrack:
     table = read_angle_table(path)
     t_ns, sigma_ns = table.t_ns, table.sigma_ns
     if table.film_s is not None and (path.parent / VIDEO_NAME).exists():
-        alignment = read_video(path.parent).alignment  # the newest, also if the table is older
-        if alignment is not None:
-            t_ns, sigma_ns = alignment.place(table.film_s)
+        alignment = read_video(path.parent).alignment  # the present one: the table may be older
+        t_ns, sigma_ns = (None, None) if alignment is None else alignment.place(table.film_s)
     if t_ns is None:
         raise UsageError(
             f"{path} has times of a film that is not aligned with the session",
             expected="an aligned video beside it, or a column t_ns",
             remedy="Align it: foottile video align, then track it again, or leave the table there",
         )
-    is_known = ~np.isnan(table.angle_rad)
     count = len(t_ns)
+    sigma_ns = np.zeros(count) if sigma_ns is None else sigma_ns
+    is_known = ~np.isnan(table.angle_rad)
+    if np.isnan(sigma_ns[is_known]).any():
+        raise FileFormatError(
+            "sigma_ns is empty in a row with an angle",
+            where=str(path),
+            expected="a number, or no column",
+        )
     source = np.full(count, VIDEO) if table.angle_source is None else table.angle_source
     return AngleTrack(
         t_ns[is_known],
         table.angle_rad[is_known],
         table.sigma_rad[is_known],
-        (np.zeros(count) if sigma_ns is None else np.nan_to_num(sigma_ns))[is_known],
+        sigma_ns[is_known],
         source.astype(np.str_)[is_known],
         {"table": path.name, "sha256": compute_sha256(path)},
     )

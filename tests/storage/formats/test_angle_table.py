@@ -39,7 +39,10 @@ def test_a_table_is_read_as_it_was_written(tmp_path: Path, suffix: str) -> None:
     [
         (HEAD + "1,0.1,0.01\n3,0.1,0.01\n2,0.1,0.01\n", "t_ns does not rise in row 3"),
         (HEAD + "1,0.1,0.01\n1,0.1,0.01\n", "t_ns does not rise in row 2"),
-        (HEAD + "1,0.1,0.01\n2,12.5,0.01\n", "beyond a turn in row 2.*radians, not degrees"),
+        (
+            HEAD + "1,0.1,0.01\n2,5.0,0.01\n",
+            "beyond a quarter of a turn in row 2.*radians, not degrees",
+        ),
         (HEAD + "1,0.1,0.01\n2,0.1,\n", "sigma_rad is no uncertainty in row 2"),
         (HEAD + "1,0.1,0.01\n2,0.1,-1\n", "sigma_rad is no uncertainty in row 2"),
         (HEAD + "1,0.1,0.01\n2,left,0.01\n", "[Rr]ow #3.*left"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -156,9 +157,19 @@ def test_an_uncertain_instant_makes_a_fast_angle_uncertain() -> None:
     np.testing.assert_allclose(sigma_rad, 0.010 * rate_rad_s, atol=6e-4)
 
 
+def test_a_turn_within_a_gap_is_in_the_uncertainty() -> None:
+    """Half a swing of 0.1 rad in 0.1 s is hidden: the line between its ends says nothing of it."""
+    seen = np.concatenate([np.arange(0, 11), np.arange(15, 26)])
+    t_ns, zero = UTC_NS + seen * INTERVAL_NS, np.zeros(22)
+    angle_rad = 0.1 * np.sin((seen - 10) * INTERVAL_NS * 1e-9 * math.pi / 0.1)
+    track = AngleTrack(t_ns, angle_rad, zero + 1e-4, zero, np.full(22, "video"), {})
+    found_rad, sigma_rad, _ = track.interpolate(np.array([UTC_NS + 25 * INTERVAL_NS // 2]))
+    assert abs(found_rad[0] - 0.1) < 2.0 * sigma_rad[0]
+
+
 def test_a_table_of_another_time_is_refused(raw: Path, tmp_path: Path) -> None:
     track = make_track()
-    other = track._replace(t_ns=track.t_ns + 3_600_000_000_000)
+    other = replace(track, t_ns=track.t_ns + 3_600_000_000_000)
     with pytest.raises(
         FileFormatError, match=r"from 3600.0 to 3606.0 s of the session.*6.0 s long"
     ):
@@ -201,4 +212,8 @@ def test_a_films_table_takes_the_alignment_beside_it(tmp_path: Path) -> None:
     write_video(tmp_path, video)
     found = read_angle_track(tmp_path / ANGLE_NAME)
     np.testing.assert_array_equal(found.t_ns, UTC_NS + np.arange(4) * 20_020_000)
+    replace(table, t_ns=found.t_ns, sigma_ns=found.sigma_ns).write(tmp_path / ANGLE_NAME)
+    write_video(tmp_path, video.model_copy(update={"alignment": None}))
+    with pytest.raises(UsageError, match="not aligned"):  # what was wrong does not come back
+        read_angle_track(tmp_path / ANGLE_NAME)
     assert found.sigma_ns.tolist() == [2e6] * 4
