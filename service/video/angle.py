@@ -17,7 +17,7 @@ from storage.formats.angle_table import VIDEO, AngleTable
 from storage.formats.readers.leg_points import read_leg_points
 from storage.sessions.folder import FRAMES_NAME
 from storage.sessions.reader import SealedFileReader
-from storage.sessions.videos import Video, get_film_path
+from storage.sessions.videos import Video, get_film_path, read_picture_times
 
 _POINT_SIGMA = 1e-4
 """Least uncertainty of another program's points, relative to their distance."""
@@ -94,8 +94,7 @@ def track_video(
     path = get_film_path(folder, video)
     rate_hz = video.film.capture_rate_hz
     if options.points_file is not None:
-        found = run_film_task("read", path, capture_rate_hz=rate_hz)
-        return read_points(options, np.array(found["times_s"]), video)
+        return read_points(options, read_picture_times(folder), video)
     if options.forward not in (None, "right", "left"):
         raise UsageError(f"--forward {options.forward}", expected="right or left")
     found = run_film_task(

@@ -35,6 +35,7 @@ from storage.sessions.videos import (
     Video,
     find_video_folder,
     get_film_path,
+    read_picture_times,
     read_video,
     write_video,
 )
@@ -103,8 +104,7 @@ class _Film:
                 where=self.video.name,
                 expected=f"numbers from 0 to {count - 1}",
             )
-        times_s = np.asarray(self.run("read")["times_s"])
-        return np.asarray(times_s[list(pictures)])
+        return np.asarray(read_picture_times(self.path.parent)[list(pictures)])
 
     @property
     def drift_sigma(self) -> float:
@@ -154,7 +154,6 @@ def align_video(
         common_ns=pairs.common_ns,
         drift_sigma=film.drift_sigma,
     )
-    _check_overlap(video, alignment, time)
     return store_alignment(folder, alignment, replaces=options.replaces)
 
 
@@ -167,10 +166,12 @@ def store_alignment(folder: Path, alignment: Alignment, *, replaces: bool) -> Vi
         replaces: True: one by another method that it contradicts is replaced.
 
     Raises:
+        FileFormatError: by it, film and session have no instant in common.
         StateError: it contradicts the stored one, by another method.
         StorageError: it cannot be written.
     """
     video = read_video(folder)
+    _check_overlap(video, alignment, read_session_time(folder.parent / FRAMES_NAME))
     stored = video.alignment
     if stored is not None and stored.method != alignment.method and not replaces:
         problem = describe_contradiction(stored, alignment)

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,8 @@ from devices.errors import FileFormatError, FootTileError, StateError, UsageErro
 from storage.sessions.videos import FilmInfo
 
 _CODE = "from service.video.worker import main; main()"
+_TIMES_BEGIN = '{"film_s"'
+"""Begin of the line with the times of all pictures, which is not parsed here."""
 _PR_SET_PDEATHSIG = 1  # prctl.h
 _MEMORY_BYTES_MAX = 4 << 30
 _SILENT_S_MAX = 60.0
@@ -55,8 +58,13 @@ def check_extra_installed() -> None:
                 raise ModuleNotFoundError(name=name)
 
 
-def describe_film(path: Path, name: str, capture_rate_hz: float | None = None) -> FilmInfo:
+def describe_film(
+    path: Path, name: str, capture_rate_hz: float | None = None
+) -> tuple[FilmInfo, bytes]:
     """Read what a film is, and that its first and last pictures can be decoded.
+
+    The times of its pictures, as `write_times` takes them, are not parsed: that would hold up a
+    server's event loop.
 
     Args:
         path: the film.
@@ -68,7 +76,8 @@ def describe_film(path: Path, name: str, capture_rate_hz: float | None = None) -
         UsageError: the rate is impossible.
     """
     try:
-        return FilmInfo(**run_film_task("read", path, capture_rate_hz=capture_rate_hz)["film"])
+        found = run_film_task("read", path, capture_rate_hz=capture_rate_hz)
+        return FilmInfo(**found["film"]), found["times_json"].encode()
     except (FileFormatError, UsageError) as error:
         error.what = error.what.replace(str(path), name)
         error.where = name
@@ -91,6 +100,12 @@ def run_film_task(
         FootTileError: of the task.
     """
     request = json.dumps({"task": task, "path": str(path), "options": options})
+    try:
+        silent_s_max = _SILENT_S_MAX + path.stat().st_size / _READ_BYTES_PER_S_MIN
+    except OSError as error:
+        raise FileFormatError(
+            f"cannot be read: {error.strerror}", where=str(path), expected="a film"
+        ) from error
     process = subprocess.Popen(  # noqa: S603  # our own module
         [sys.executable, "-P", "-c", _CODE],  # -P: no module of the working folder
         stdin=subprocess.PIPE,
@@ -101,16 +116,20 @@ def run_film_task(
     )
     assert process.stdin is not None  # noqa: S101
     assert process.stdout is not None  # noqa: S101
-    silent_s_max = _SILENT_S_MAX + path.stat().st_size / _READ_BYTES_PER_S_MIN
     watchdog = threading.Timer(silent_s_max, process.kill)
+    times_json = ""
     try:
-        process.stdin.write(request)
-        process.stdin.close()
+        with suppress(BrokenPipeError):  # it has ended, and its code says how
+            process.stdin.write(request)
+            process.stdin.close()
         watchdog.start()
         for line in process.stdout:
             watchdog.cancel()
             watchdog = threading.Timer(silent_s_max, process.kill)
             watchdog.start()
+            if line.startswith(_TIMES_BEGIN):
+                times_json = line
+                continue
             message: dict[str, Any] = json.loads(line)
             if "picture" in message:
                 on_picture(message["picture"])
@@ -119,7 +138,7 @@ def run_film_task(
                 raise _ERRORS[facts.pop("kind")](facts.pop("what"), **facts)
             else:
                 result: dict[str, Any] = message["result"]
-                return result
+                return {**result, "times_json": times_json} if times_json else result
         code = process.wait()
         how = f"ended with {'signal' if code < 0 else 'code'} {abs(code)}"
         raise FileFormatError(
@@ -176,7 +195,8 @@ def _read(path: Path, capture_rate_hz: float | None = None) -> dict[str, Any]:
             where=str(path),
             remedy="Copy the file from the camera again",
         )
-    return {"film": film.model_dump(), "times_s": times_s.tolist()}
+    _print({"film_s": times_s.tolist()})
+    return {"film": film.model_dump()}
 
 
 def _find_lamp(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import json
 import os
 import re
 import secrets
@@ -32,10 +33,15 @@ from devices.errors import (
 )
 from devices.types import Count, Identifier, StrictModel, Text, TNs
 from storage.documents import read_document, write_document
-from storage.durable_files import make_temporary_path, sync_folder, translate_storage_errors
+from storage.durable_files import (
+    make_temporary_path,
+    sync_folder,
+    translate_storage_errors,
+    write_atomically,
+)
 from storage.parquet_hash import compute_sha256
 
-VIDEO_NAME = "video.json"
+VIDEO_NAME, TIMES_NAME = "video.json", "times.json"
 FILM_MEDIA_TYPES = {
     ".mp4": "video/mp4",
     ".mov": "video/quicktime",
@@ -50,6 +56,7 @@ FREE_BYTES_MIN = 1 << 30
 _VIDEO_ID = "[0-9a-f]{12}"
 _FOLDER = re.compile(f"video-({_VIDEO_ID})")
 
+Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 AlignmentMethod = Literal["light", "clock page", "contact", "hand"]
 
 
@@ -121,7 +128,9 @@ class Video(StrictModel):
     """Name of the file as it came."""
     suffix: Annotated[str, Field(pattern=r"^\.[a-z0-9]{3,4}$")]
     size_bytes: Count
-    sha256: str
+    sha256: Sha256
+    times_sha256: Sha256
+    """SHA-256 of the file with the times of its pictures."""
     added_t_ns: TNs
     film: FilmInfo
     alignment: Alignment | None = None
@@ -196,6 +205,23 @@ def get_film_path(folder: Path, video: Video) -> Path:
     return folder / f"film{video.suffix}"
 
 
+def read_picture_times(folder: Path) -> Floats:
+    """Read the times of a film's pictures, in s from the first.
+
+    Raises:
+        DamagedFileError: they are missing, or were changed.
+    """
+    path = folder / TIMES_NAME
+    try:
+        return np.asarray(json.loads(path.read_bytes())["film_s"], dtype=np.float64)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DamagedFileError(
+            f"the times of its pictures cannot be read: {error}",
+            where=str(path),
+            remedy="Add the film again",
+        ) from error
+
+
 def write_video(folder: Path, video: Video) -> None:
     """Write the description of a video; an existing one is replaced.
 
@@ -268,16 +294,18 @@ class IncomingVideo:
             os.fdatasync(self._file.fileno())
         self._hash.update(chunk)
 
-    def keep(self, describe: Callable[[Path], FilmInfo]) -> Video:
+    def keep(self, describe: Callable[[Path], tuple[FilmInfo, bytes]]) -> Video:
         """Describe the film that is now complete, and put the video in place.
 
         Args:
-            describe: reads a film in a process of its own; raises if it is none.
+            describe: reads a film and the times of its pictures, JSON with `film_s`, in a process
+                of its own; raises if it is none.
 
         Raises:
             UnknownError: the session was deleted meanwhile.
             StorageError: the disk is full or not writable.
         """
+        film, times_json = describe(self._path)
         video = Video(
             id=self._id,
             name=self.name,
@@ -285,9 +313,11 @@ class IncomingVideo:
             size_bytes=self._file.tell(),
             sha256=self._hash.hexdigest(),
             added_t_ns=server_utc_ns(),
-            film=describe(self._path),
+            film=film,
+            times_sha256=hashlib.sha256(times_json).hexdigest(),
         )
-        _check_space(self._folder, 0)
+        _check_space(self._folder, len(times_json))
+        write_atomically(self._folder / TIMES_NAME, times_json)
         write_video(self._folder, video)
         with translate_storage_errors(self._final):
             self._folder.rename(self._final)
@@ -342,6 +372,8 @@ def verify_videos(session_folder: Path) -> list[str]:
                 what = f"has {path.stat().st_size} bytes, not {video.size_bytes}"
             elif compute_sha256(path) != video.sha256:
                 what = "was changed: its SHA-256 is another one"
+            elif compute_sha256(folder / TIMES_NAME) != video.times_sha256:
+                what = f"has another {TIMES_NAME}: its SHA-256 is another one"
             else:
                 continue
             problems.append(f"video {video_id}: {video.name} {what}")

@@ -213,9 +213,9 @@ def test_a_session_that_is_deleted_meanwhile(shared_tared: FakeNode) -> None:
 
 def test_an_alignment_by_hand(session: Recording) -> None:
     http, video = session.running.http, content_of(upload(session), 201)
-    url, begin_t_ns = f"{session.url}/videos/{video['id']}", session["started_t_ns"]
+    url, begin_t_ns = f"{session.url}/videos/{video['id']}", int(session.column("t_ns")[0])
     pairs = [
-        {"film_s": at_s, "t_ns": begin_t_ns + 5_000_000_000 + round(at_s * 1e9), "sigma_ns": 1e7}
+        {"film_s": at_s, "t_ns": begin_t_ns + 20_000_000 + round(at_s * 1e9), "sigma_ns": 1e6}
         for at_s in (0.0, 0.2)
     ]
     body = {"method": "hand", "pairs": pairs}
@@ -226,17 +226,20 @@ def test_an_alignment_by_hand(session: Recording) -> None:
         pytest.approx(0.1),
         2,
     )
-    assert found["t_ns"] == pytest.approx(begin_t_ns + 5_100_000_000, abs=10)
+    assert found["t_ns"] == pytest.approx(begin_t_ns + 120_000_000, abs=10)
     assert list_all(session) == [aligned]
     other = [pairs[0], pairs[1] | {"t_ns": begin_t_ns}]
     assert_refused(http.put(f"{url}/alignment", json=body | {"pairs": other}), 422, "no majority")
+    later = [pair | {"t_ns": pair["t_ns"] + 3_600_000_000_000} for pair in pairs]
+    refused = http.put(f"{url}/alignment", json=body | {"pairs": later})
+    assert_refused(refused, 422, "after the session")
     wrongs: list[dict[str, Any]] = [{"pairs": []}, {"method": "light"}]
     for wrong in (*wrongs, {"pairs": [pairs[0] | {"sigma_ns": 0}]}):
         assert http.put(f"{url}/alignment", json=body | wrong).status_code == 422
     assert content_of(http.get(url)) == aligned
     contact = {"method": "contact", "pairs": [pair | {"t_ns": begin_t_ns} for pair in pairs[:1]]}
     refused = http.put(f"{url}/alignment", json=contact)
-    assert_refused(refused, 409, "5000.0 ms earlier by contact than by hand")
+    assert_refused(refused, 409, "20.0 ms earlier by contact than by hand")
     replaced = http.put(f"{url}/alignment", params={"replace": True}, json=contact)
     assert content_of(replaced)["alignment"]["method"] == "contact"
     assert content_of(http.delete(f"{url}/alignment")) == video
@@ -287,10 +290,11 @@ def test_an_upload_that_vanishes_leaves_nothing(
 ) -> None:
     before = contents(session)
     connection = begin_upload(session, 50 << 20, bytes(6 << 20))
-    until(lambda: len(contents(session)) > len(before))
+    until(lambda: list(session.folder.glob(".video-*")))
     assert list_all(session) == []
     connection.close()
-    until(lambda: contents(session) == before)
+    until(lambda: not list(session.folder.glob(".video-*")))
+    assert contents(session) == before
     assert [each for each in caplog.records if each.levelname == "ERROR"] == []
 
 
@@ -301,7 +305,8 @@ def test_a_slow_upload_ends_and_a_steady_one_does_not(strict: Running) -> None:
     connection.settimeout(20.0)
     assert b"408" in connection.recv(4096)
     connection.close()
-    until(lambda: contents(session) == before)
+    until(lambda: not list(session.folder.glob(".video-*")))
+    assert contents(session) == before
 
     def steady() -> Iterator[bytes]:
         for begin in range(0, len(film), 600 << 10):

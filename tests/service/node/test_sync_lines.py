@@ -154,7 +154,7 @@ def test_a_film_of_the_lamp_of_a_node_is_aligned_with_its_session(
 ) -> None:
     pytest.importorskip("av", reason="films need the extra `video`")
     from service.video.methods import align_video
-    from tests.service.video.films import Camera
+    from studies.reproduce.leg_film import Camera
     from tests.service.video.test_methods import add_film
 
     process = leg("--record", "trial", output="code")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
+import json
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import av
 import psutil
 import pytest
 
@@ -39,12 +42,49 @@ def test_a_whole_film_is_described_and_a_cut_one_refused(
 ) -> None:
     film, whole = tmp_path / f"film{suffix}", short_film(suffix, codec)
     film.write_bytes(whole)
-    info = describe_film(film, "walk")
+    info, times_json = describe_film(film, "walk")
+    assert len(json.loads(times_json)["film_s"]) == PICTURES
     assert (info.picture_count, info.width_px, info.height_px) == (PICTURES, 64, 48)
     assert info.rate_hz == pytest.approx(RATE_HZ, rel=0.05)
     film.write_bytes(whole[: len(whole) * 2 // 5])
     with pytest.raises(FileFormatError, match=r"walk: the f.* (breaks off after|be read as)"):
         describe_film(film, "walk")
+
+
+def test_a_film_that_begins_with_its_index_and_is_cut_is_refused(tmp_path: Path) -> None:
+    film = tmp_path / "film.mp4"
+    with (
+        av.open(io.BytesIO(short_film()), "r") as source,
+        av.open(str(film), "w", options={"movflags": "faststart"}) as target,
+    ):
+        stream = target.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(source.streams.video[0]):
+            if packet.size:
+                end = packet.size
+                packet.stream = stream
+                target.mux(packet)
+    describe_film(film, "walk")
+    with film.open("r+b") as file:
+        file.truncate(film.stat().st_size - end)
+    with pytest.raises(FileFormatError, match=r"walk: .*(breaks off after|cannot be decoded)"):
+        describe_film(film, "walk")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nt=0 0\nm=video 50004 RTP/AVP 96\n"
+        "a=rtpmap:96 H264/90000\n",
+        "ffconcat version 1.0\nfile kept.mp4\n",
+        "#EXTM3U\n#EXTINF:1,\nkept.mp4\n#EXT-X-ENDLIST\n",
+    ],
+    ids=["session description", "concatenation", "playlist"],
+)
+def test_a_text_that_names_other_files_or_addresses_is_no_film(film: Path, text: str) -> None:
+    path = film.with_name("film.mov")
+    path.write_text(text)
+    with pytest.raises(FileFormatError, match="cannot be read as a film"):
+        describe_film(path, "walk.mov")
 
 
 @pytest.mark.parametrize(

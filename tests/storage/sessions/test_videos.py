@@ -41,6 +41,9 @@ INFO = FilmInfo(
 )
 
 
+TIMES = b'{"film_s": [0.0, 0.02]}\n'
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     folder = tmp_path / "session"
@@ -53,7 +56,7 @@ def add(folder: Path, name: str = "walk.mp4") -> Video:
     with IncomingVideo(folder, name) as incoming:
         for begin in range(0, len(CONTENT), 1000):
             incoming.write(CONTENT[begin : begin + 1000])
-        return incoming.keep(lambda _: INFO)
+        return incoming.keep(lambda _: (INFO, TIMES))
 
 
 def names(folder: Path) -> set[str]:
@@ -92,7 +95,7 @@ def test_a_hostile_name_is_only_shown(folder: Path, name: str) -> None:
     assert video.name.isprintable()
     assert video.name.lower().endswith(".mp4")
     assert names(folder) == {"session.json", f"video-{video.id}"}
-    assert names(folder / f"video-{video.id}") == {"film.mp4", "video.json"}
+    assert names(folder / f"video-{video.id}") == {"film.mp4", "times.json", "video.json"}
 
 
 @pytest.mark.parametrize(
@@ -106,7 +109,7 @@ def test_another_suffix_is_refused_at_once(folder: Path, name: str) -> None:
     assert names(folder) == {"session.json"}
 
 
-def broken(path: Path) -> FilmInfo:
+def broken(path: Path) -> tuple[FilmInfo, bytes]:
     raise FileFormatError("no film", where=str(path))
 
 
@@ -152,7 +155,7 @@ def test_a_session_that_is_deleted_meanwhile_is_named(folder: Path) -> None:
         with pytest.raises(UnknownError, match="deleted meanwhile"):
             incoming.write(CONTENT)
         with pytest.raises(UnknownError, match="deleted meanwhile"):
-            incoming.keep(lambda _: INFO)
+            incoming.keep(lambda _: (INFO, TIMES))
     with pytest.raises(UnknownError), IncomingVideo(folder, "a.mp4"):
         pytest.fail("it was begun")
     assert find_video_folders(trash) == find_video_folders(folder) == {}

@@ -32,7 +32,7 @@ from storage.verify.sealed_file import verify_sealed_file
 from storage.verify.session import SessionReport, verify_session
 from tests.builders.arrays import UTC_NS, make_array
 from tests.builders.frames import make_frames
-from tests.storage.sessions.test_videos import INFO
+from tests.storage.sessions.test_videos import INFO, TIMES
 
 ID = "20200101T000000Z-00000a"
 OTHER_ID = "20200101T000000Z-00000b"
@@ -410,7 +410,7 @@ def test_videos_are_verified_with_their_session(folder: Path) -> None:
     before = verify_session(folder).to_json_dict()
     with IncomingVideo(folder, "walk.mp4") as incoming:
         incoming.write(b"film")
-        video = incoming.keep(lambda _: INFO)
+        video = incoming.keep(lambda _: (INFO, TIMES))
     assert verify_session(folder).to_json_dict() == before
     (folder / f"video-{video.id}" / "film.mp4").write_bytes(b"flim")
     assert problems(folder) == f"video {video.id}: walk.mp4 was changed: its SHA-256 is another one"

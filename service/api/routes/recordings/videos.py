@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from http import HTTPStatus
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from anyio import CapacityLimiter, to_thread
-from fastapi import APIRouter, Header, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import contextmanager_in_threadpool, run_in_threadpool
 from pydantic import BaseModel, Field
 from starlette.requests import ClientDisconnect
@@ -19,10 +18,10 @@ from devices.errors import FileFormatError, StateError, UsageError
 from devices.types import StrictModel, TNs
 from service.api.routes.common import (
     FULL,
+    JSON,
     NO_CONTENT,
     UNCHANGED,
     ServerState,
-    numbers_response,
     problem_responses,
     require_file,
     require_frames,
@@ -35,10 +34,11 @@ from service.user_folders import PublicText
 from service.video import methods
 from service.video.alignment import fit_alignment
 from service.video.methods import AlignmentOptions, store_alignment
-from service.video.worker import check_extra_installed, describe_film, run_film_task
+from service.video.worker import check_extra_installed, describe_film
 from storage.sessions.folder import Session
 from storage.sessions.videos import (
     FILM_MEDIA_TYPES,
+    TIMES_NAME,
     IncomingVideo,
     Video,
     find_video_folder,
@@ -220,30 +220,17 @@ async def get_film(
     "/{video_id}/times",
     summary="Times of a film's pictures",
     response_model=TimesView,
-    responses=problem_responses(UNCHANGED, _UNKNOWN, _422="The film is damaged."),
+    responses=problem_responses(UNCHANGED, _UNKNOWN),
 )
 async def get_film_times(
-    session_id: str,
-    video_id: str,
-    request: Request,
-    server: ServerState,
-    accept_encoding: Annotated[
-        str, Header(description="With gzip, the answer is compressed.")
-    ] = "",
+    session_id: str, video_id: str, request: Request, server: ServerState
 ) -> Response:
-    """Return the time of every picture, in order of display; films are read one at a time."""
+    """Return the time of every picture, in order of display."""
     folder, video = await run_in_threadpool(_read, session_id, video_id, server)
-    key = f"{video.sha256}|{video.film.capture_rate_hz}"
-    make = partial(run_with_usage_errors, partial(_encode_times, folder, video))
-    return await numbers_response(
-        request, make, _DECODING, sealed_key=key, accept_encoding=accept_encoding
+    path = require_file(folder / TIMES_NAME)
+    return stored_file_response(
+        request, path, video.times_sha256, media_type=JSON, filename=f"{video.id}.json"
     )
-
-
-def _encode_times(folder: Path, video: Video) -> bytes:
-    path, rate_hz = get_film_path(folder, video), video.film.capture_rate_hz
-    times_s = run_film_task("read", require_file(path), capture_rate_hz=rate_hz)["times_s"]
-    return json.dumps({"film_s": times_s}).encode()
 
 
 @router.put(
@@ -269,7 +256,8 @@ async def align_video(
     )
     aligned = run_with_usage_errors(fit)
     folder = (await run_in_threadpool(_read, session_id, video_id, server))[0]
-    return await run_in_threadpool(store_alignment, folder, aligned, replaces=replace)
+    store = partial(store_alignment, folder, aligned, replaces=replace)
+    return await run_in_threadpool(run_with_usage_errors, store)
 
 
 @router.post(

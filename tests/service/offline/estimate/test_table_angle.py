@@ -206,7 +206,8 @@ def test_a_films_table_takes_the_alignment_beside_it(tmp_path: Path) -> None:
         capture_rate_hz=None,
     )
     video = Video(
-        id="0" * 12, name="a.mp4", suffix=".mp4", size_bytes=1, sha256="0" * 64, added_t_ns=1,
+        id="0" * 12, name="a.mp4", suffix=".mp4", size_bytes=1, sha256="0" * 64,
+        times_sha256="0" * 64, added_t_ns=1,
         film=film, alignment=alignment,
     )  # fmt: skip
     write_video(tmp_path, video)
