@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 from tests.service.fake_node import Play
+from tests.tokens import SHARED_TOKEN
 from tests.waiting import until
 from tests.web.firefox import ENTER, ESCAPE, FIREFOX, RIGHT, Firefox
 from tests.web.scripted import Scripted
+from tests.web.session_film import SHOWN, align, make_film
 
 pytestmark = [
     pytest.mark.real_time,
@@ -95,6 +98,35 @@ def test_what_stands_on_the_foot_is_watched_recorded_marked_looked_at_and_downlo
     assert session["name"] == "in Firefox"
     assert table.num_rows == session["frames"] > 300
     assert (np.diff(table["seq"].to_numpy()) == 1).all()
+
+
+def test_a_film_is_added_moves_with_the_cursor_and_gives_stills(
+    scripted: Scripted, firefox: Firefox, tmp_path: Path
+) -> None:
+    session = scripted.recorded("walk")
+    film = make_film(tmp_path / "walk.webm", "libvpx-vp9")
+    firefox.open(f"{scripted.url}/sessions/{session.id}#token={SHARED_TOKEN}")
+    firefox.wait("document.querySelector('#plots')?.dataset.settled === 'true'")
+    firefox.find("#video-file").send_keys(str(film))
+    firefox.click("#video-send")
+    firefox.wait_for_text("#videos-list", "320 \u00d7 180, 25.0 pictures/s, 2.4 s, vp9")
+    firefox.wait_for_text("#film-at", "Picture 1 of 60: 0.000 s of the film, not aligned")
+    (video,) = session.running.http.get(f"{session.url}/videos").json()["items"]
+    align(session, video, 0.0)
+    firefox.open(f"{scripted.url}/sessions/{session.id}?at=0.0")
+    at = "document.querySelector('#film-card[data-still=true]')?.dataset.picture === arguments[0]"
+    for number in range(3):
+        firefox.wait(at, str(number))
+        assert firefox.run(f"return ({SHOWN})()") == number
+        firefox.keys(".")
+    cursor = "Number(document.getElementById('plots').getAttribute('aria-valuenow'))"
+    firefox.wait(f"Math.abs({cursor} - 0.12) < 0.002")
+    firefox.drag("#plots", (57, 200), (57, 200))
+    firefox.wait(at, "0")
+    firefox.click("#still-add")
+    firefox.wait("document.getElementById('strip-canvas').dataset.stills === '1'")
+    firefox.click("#strip-save")
+    assert firefox.downloaded(".png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_on_a_phone_nothing_is_wider_than_the_screen(scripted: Scripted, firefox: Firefox) -> None:

@@ -11,48 +11,16 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
-from studies.reproduce.leg_film import Camera, write_film
 from tests.service.recording import Recording
 from tests.service.running import Running
 from tests.waiting import until
 from tests.web.pages import DESK, PHONE, OpenPage, complaints_at
+from tests.web.session_film import BEGIN_S, BLOCK_PX, RATE_HZ, SHOWN, added, make_film
 from tests.web.session_page import recorded_walk, settled, url_of
 
 pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
-PICTURES, RATE_HZ, BITS = 60, 25.0, 6
-BLOCK_PX = 40
 NAME = "<img src=x onerror=alert(1)> walk.webm"
-BEGIN_S = 1.0
-"""Of the film, after the session's first frame."""
-SHOWN = """(pictures) => {
-  const film = document.getElementById("film");
-  const canvas = new OffscreenCanvas(film.videoWidth, film.videoHeight);
-  const context = canvas.getContext("2d", { willReadFrequently: true });
-  context.drawImage(film, 0, 0);
-  let number = 0;
-  for (let bit = 0; bit < pictures.bits; bit++) {
-    const at = pictures.block * (bit + 0.5);
-    number = 2 * number + Number(context.getImageData(at, pictures.block / 2, 1, 1).data[0] > 128);
-  }
-  return number;
-}"""
-
-
-def numbered(number: int) -> np.ndarray:
-    """A picture with its number in black and white blocks."""
-    picture = np.full((180, 320), 90, np.uint8)
-    for bit in range(BITS):
-        is_white = number >> (BITS - 1 - bit) & 1
-        picture[:BLOCK_PX, bit * BLOCK_PX : (bit + 1) * BLOCK_PX] = 255 if is_white else 0
-    cv2.circle(picture, (20 + 4 * number, 120), 18, 230, -1)
-    return picture
-
-
-def make_film(path: Path, codec: str) -> Path:
-    camera = Camera(rate_hz=RATE_HZ, codec=codec, width=320, height=180)
-    pictures = [numbered(number) for number in range(PICTURES)]
-    return write_film(path, camera, pictures, np.arange(PICTURES) / RATE_HZ)
 
 
 @pytest.fixture(scope="module")
@@ -74,22 +42,6 @@ def videos(session: Recording) -> Any:
         assert session.running.http.delete(f"{address}/{video['id']}").status_code == 204
 
 
-def added(session: Recording, film: Path, *, begin_s: float | None = BEGIN_S) -> dict[str, Any]:
-    """A video of the session, aligned or not."""
-    http, address = session.running.http, f"{session.url}/videos"
-    answer = http.post(address, params={"name": film.name}, content=film.read_bytes())
-    assert answer.status_code == 201, answer.text
-    video: dict[str, Any] = answer.json()
-    if begin_s is not None:
-        t_ns = int(session.column("t_ns")[0]) + round(1e9 * begin_s)
-        pair = {"film_s": 0.0, "t_ns": t_ns, "sigma_ns": 1e6}
-        body = {"method": "hand", "pairs": [pair]}
-        answer = http.put(f"{address}/{video['id']}/alignment", json=body)
-        assert answer.status_code == 200, answer.text
-        video = answer.json()
-    return video
-
-
 def still(page: Page, number: int | None = None) -> int:
     """The number of the picture, once the film stands; it is in the picture, too."""
     card = page.locator("#film-card[data-still=true]")
@@ -97,7 +49,7 @@ def still(page: Page, number: int | None = None) -> int:
         card = page.locator(f"#film-card[data-still=true][data-picture='{number}']")
     expect(card).to_have_count(1)
     shown = int(card.get_attribute("data-picture") or "-1")
-    assert page.evaluate(SHOWN, {"bits": BITS, "block": BLOCK_PX}) == shown
+    assert page.evaluate(SHOWN) == shown
     return shown
 
 
@@ -125,7 +77,7 @@ def test_a_film_is_added_aligned_by_hand_and_removed(
     page.click("#video-send")
     row = page.locator("#videos-list li")
     expect(row.locator("strong")).to_have_text(NAME)
-    expect(row).to_contain_text("320 × 180, 25.0 pictures/s, 2.4 s, vp9")
+    expect(row).to_contain_text("320 \u00d7 180, 25.0 pictures/s, 2.4 s, vp9")
     expect(page.locator("#alignment-line")).to_contain_text("Not aligned")
     still(page, 0)
     expect(page.locator("#film-at")).to_contain_text("Picture 1 of 60: 0.000 s of the film")
@@ -165,6 +117,33 @@ def test_a_film_is_added_aligned_by_hand_and_removed(
     page.click("#ask-yes")
     expect(row).to_have_count(0)
     expect(page.locator("#film-card")).to_be_hidden()
+    assert session.running.http.get(videos).json()["items"] == []
+
+
+def test_an_upload_shows_its_progress_ends_on_demand_and_tells_why_it_is_refused(
+    session: Recording, videos: str, tmp_path: Path, open_page: OpenPage
+) -> None:
+    page = open_page(url_of(session), *PHONE)
+    settled(page)
+    page.hover("#video-upload")
+    broken = tmp_path / "broken.mp4"
+    broken.write_bytes(bytes(4 << 20))
+    network = page.context.new_cdp_session(page)
+    limits = {"offline": False, "latency": 0, "downloadThroughput": -1}
+    network.send("Network.enable")
+    network.send("Network.emulateNetworkConditions", {**limits, "uploadThroughput": 1 << 18})
+    page.set_input_files("#video-file", broken)
+    page.click("#video-send")
+    expect(page.locator("#upload-text")).to_contain_text(
+        re.compile(r"broken\.mp4: \d+ % of 4.2 MB")
+    )
+    assert complaints_at(page, PHONE) == []
+    page.click("#upload-abort")
+    expect(page.locator("#notices")).to_contain_text("Upload aborted")
+    expect(page.locator("#upload")).to_be_hidden()
+    network.send("Network.emulateNetworkConditions", {**limits, "uploadThroughput": -1})
+    page.click("#video-send")
+    expect(page.locator("#notices")).to_contain_text("Not done: broken.mp4")
     assert session.running.http.get(videos).json()["items"] == []
 
 
@@ -221,6 +200,30 @@ def test_film_and_cursor_move_together(
     until(lambda: abs(cursor_s(page) - BEGIN_S - still(page) / RATE_HZ) < 0.5 / RATE_HZ + 0.002)
 
 
+def test_an_alignment_that_contradicts_another_one_replaces_it_only_if_confirmed(
+    session: Recording, videos: str, film: Path, open_page: OpenPage
+) -> None:
+    added(session, film)
+    page = open_page(url_of(session, "?at=2.1"), 1280, 900)
+    settled(page)
+    still(page, round(1.1 * RATE_HZ))
+    page.click("#alignment summary")
+    page.fill("#film-slider", "0")
+    still(page, 0)
+    assert cursor_s(page) == 2.1  # they are apart
+    page.click("#pair-contact")
+    expect(page.locator("#pairs li")).to_contain_text("Picture 1 \u2194 contact at 2.0")
+    page.click("#align-pairs")
+    expect(page.locator("#ask-dialog")).to_contain_text("Replace alignment")
+    assert session.running.http.get(videos).json()["items"][0]["alignment"]["method"] == "hand"
+    page.click("#ask-yes")
+    expect(page.locator("#alignment-line")).to_contain_text(
+        "Aligned by contact: the film begins at 2.0"
+    )
+    page.click("#alignment summary")
+    still(page, round(0.1 * RATE_HZ))
+
+
 def test_a_strip_of_stills_is_one_picture(
     session: Recording, videos: str, film: Path, open_page: OpenPage, tmp_path: Path
 ) -> None:
@@ -257,3 +260,29 @@ def test_a_film_that_the_browser_cannot_play_is_said(
     page.click("#alignment summary")
     expect(page.locator("#align-clock")).to_be_enabled()
     assert complaints_at(page, DESK, PHONE) == []
+
+
+def test_slow_motion_plays_in_the_time_of_the_session(
+    session: Recording, videos: str, tmp_path: Path, open_page: OpenPage
+) -> None:
+    added(session, make_film(tmp_path / "hop.webm", "libvpx-vp9"), capture_rate_hz=250.0)
+    page = open_page(url_of(session, "?at=1.0"), 1280, 900)
+    settled(page)
+    still(page, 0)
+    expect(page.locator("#videos-list li")).to_contain_text("250 pictures/s, slow motion, 0.2 s")
+    put_cursor(page, 1.1)
+    until(lambda: abs(cursor_s(page) - 1.1) < 0.02)
+    still(page, round((cursor_s(page) - BEGIN_S) * 250.0))
+    page.fill("#film-slider", "2")
+    still(page, 2)
+    page.click("#speeds [data-speed='0.1']")
+    page.click("#play")
+    rate = "document.getElementById('film').playbackRate"
+    until(
+        lambda: (
+            0.7 < page.evaluate(rate) < 1.3
+            and int(page.get_attribute("#film-card", "data-picture") or 0) > 5
+        )
+    )
+    page.click("#play")
+    still(page)

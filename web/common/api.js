@@ -132,10 +132,11 @@ export const removeVideo = (session, video) => call("DELETE", ofVideo(session, v
 export const filmAddress = (session, video) => PREFIX + ofVideo(session, video, "/film");
 /** @type {(session: string, video: string) => Promise<TimesView>} */
 export const filmTimes = (session, video) => call("GET", ofVideo(session, video, "/times"), { timeoutS: 120 });
-/** @type {(session: string, video: string, pairs: object) => Promise<Video>} */
-export const setAlignment = (session, video, pairs) => call("PUT", ofVideo(session, video, "/alignment"), { body: pairs });
-/** Let the server find it in the pictures: slow. @type {(session: string, video: string, method: string) => Promise<Video>} */
-export const findAlignment = (session, video, method) => call("POST", ofVideo(session, video, `/alignment?method=${method}`), { timeoutS: 3600 });
+/** `replace`: also an alignment that it contradicts. @type {(session: string, video: string, pairs: object, replace: boolean) => Promise<Video>} */
+export const setAlignment = (session, video, pairs, replace) => call("PUT", ofVideo(session, video, `/alignment?replace=${replace}`), { body: pairs });
+/** Let the server find it in the pictures: slow. @type {(session: string, video: string, method: string, replace: boolean) => Promise<Video>} */
+export const findAlignment = (session, video, method, replace) =>
+  call("POST", ofVideo(session, video, `/alignment?${encoded({ method, replace: String(replace) })}`), { timeoutS: 3600 });
 /** @type {(session: string, video: string) => Promise<Video>} */
 export const removeAlignment = (session, video) => call("DELETE", ofVideo(session, video, "/alignment"));
 /** @type {(session: string) => Promise<SessionView>} */

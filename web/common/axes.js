@@ -5,9 +5,9 @@
  * @param {HTMLCanvasElement} canvas
  * @param {number} width
  * @param {number} height
+ * @param {number} [ratio]
  */
-export function fit(canvas, width, height) {
-  const ratio = devicePixelRatio || 1;
+export function fit(canvas, width, height, ratio = devicePixelRatio || 1) {
   const [across, down] = [Math.round(width * ratio), Math.round(height * ratio)];
   if (canvas.width !== across || canvas.height !== down) {
     canvas.width = across;

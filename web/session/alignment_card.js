@@ -1,6 +1,7 @@
 // Alignment of a film: pairs of a picture and an instant of the session, or found by the server in its pictures.
 
 import * as api from "../common/api.js";
+import { ask } from "../common/dialogs.js";
 import { notice, quietly } from "../common/notices.js";
 import { byId, el, setText } from "../common/text.js";
 import { pairOf } from "./film_time.js";
@@ -18,7 +19,7 @@ export class AlignmentCard {
     this.pairs = [];
     this.shown = null; // id of the video that they are of
     const buttons = {
-      "pair-hand": () => this.add("hand"), "pair-contact": () => this.add("contact"), "align-pairs": () => this.change(() => this.send()),
+      "pair-hand": () => this.add("hand"), "pair-contact": () => this.add("contact"), "align-pairs": () => this.change((replace) => this.send(replace)),
       "align-light": () => this.find("light"), "align-clock": () => this.find("clock_page"),
       "align-undo": () => this.change(() => api.removeAlignment(this.page.session.id, this.card.video.id)),
     };
@@ -61,10 +62,10 @@ export class AlignmentCard {
     byId("align-pairs", HTMLButtonElement).disabled = !this.pairs.length;
   }
 
-  send() {
+  send(replace) {
     const pairs = this.pairs.map(({ film_s, t_ns, sigma_ns }) => ({ film_s, t_ns, sigma_ns }));
     const method = this.pairs.every((pair) => pair.method === "contact") ? "contact" : "hand";
-    return api.setAlignment(this.page.session.id, this.card.video.id, { method, pairs });
+    return api.setAlignment(this.page.session.id, this.card.video.id, { method, pairs }, replace);
   }
 
   /** Let the server look for instants in the pictures. @param {"light" | "clock_page"} method */
@@ -73,20 +74,23 @@ export class AlignmentCard {
     const say = () => setText(byId("align-wait"), `The server looks through the film: ${Math.round((performance.now() - startedMs) / 1e3)} s`);
     say();
     const timer = setInterval(say, 1000);
-    this.change(() => api.findAlignment(this.page.session.id, this.card.video.id, method).finally(() => {
+    this.change((replace) => api.findAlignment(this.page.session.id, this.card.video.id, method, replace)).finally(() => {
       clearInterval(timer);
       setText(byId("align-wait"), "");
-    }));
+    });
   }
 
-  /** Change the alignment; buttons wait meanwhile. @param {() => Promise<Video>} asked */
+  /** Change the alignment, one that contradicts it only if that is confirmed; buttons wait meanwhile. @param {(replace: boolean) => Promise<Video>} asked */
   change(asked) {
     const tools = byId("alignment-tools", HTMLFieldSetElement);
     tools.disabled = true;
-    quietly(async () => {
-      const video = await asked();
+    return quietly(async () => {
+      const video = await asked(false).catch(async (error) => {
+        if (error.status !== 409 || !this.card.line || !await ask("Replace alignment", error.message, "Replace")) throw error;
+        return asked(true);
+      });
       await this.onVideo(video);
-      notice(video.alignment ? this.card.line?.text ?? "Aligned." : `“${video.name}” is no longer aligned.`);
+      notice(this.card.line?.text ?? `“${video.name}” is no longer aligned.`);
     }).finally(() => { tools.disabled = false; });
   }
 }

@@ -10,12 +10,12 @@ const INSTANT_S = 1e-4; // last digit of a picture's instant
 
 /** Player of a film. */
 export class FilmCard {
-  /** @param {import("./plotted.js").Plotted} page @param {() => void} onShown */
-  constructor(page, onShown) {
+  /** @param {import("./plotted.js").Plotted} page */
+  constructor(page) {
     this.page = page;
     this.box = byId("film-card");
     this.slider = byId("film-slider", HTMLInputElement);
-    this.film = new Film(byId("film", HTMLVideoElement), () => { this.draw(); onShown(); }, () => this.refuse());
+    this.film = new Film(byId("film", HTMLVideoElement), () => this.draw(), () => this.refuse());
     /** @type {Video | null} */
     this.video = null;
     /** @type {Line | null} */
@@ -25,9 +25,10 @@ export class FilmCard {
     this.isApart = false; // while it is aligned by hand
     byId("picture-before").addEventListener("click", () => this.step(-1));
     byId("picture-next").addEventListener("click", () => this.step(1));
-    byId("film-play").addEventListener("click", () => this.toggle());
+    const { element } = this.film;
+    byId("film-play").addEventListener("click", () => (element.paused ? this.film.play(page.replay.playing.speed) : this.film.show(this.film.index)));
     this.slider.addEventListener("input", () => this.goTo(Number(this.slider.value)));
-    for (const name of ["play", "pause"]) this.film.element.addEventListener(name, () => this.draw());
+    for (const name of ["play", "pause"]) element.addEventListener(name, () => this.draw());
   }
 
   /** Show a video; again after its alignment has changed. @param {Video | null} video */
@@ -35,39 +36,43 @@ export class FilmCard {
     const isOther = this.video?.id !== video?.id;
     this.video = video;
     this.line = video?.alignment ? new Line(video.alignment, this.page.plots.whole.beginNs) : null;
-    this.followedS = null;
     this.box.hidden = !video;
     if (isOther) {
       this.film.close();
       setText(byId("film-problem"), "");
+      this.draw();
+      setText(byId("film-at"), "The server reads the times of its pictures …");
       const { id } = this.page.session;
       const times = video && (await api.filmTimes(id, video.id)).film_s;
-      if (this.video !== video) return; // another one was asked for meanwhile
+      if (this.video?.id !== video?.id) return; // another one was asked for meanwhile
       if (video) this.film.open(api.filmAddress(id, video.id), times, video.film.rate_hz / video.film.play_rate_hz || 1);
     }
+    this.update();
+  }
+
+  update() {
+    this.followedS = null;
     this.draw();
     this.follow();
   }
 
   refuse() {
     this.film.close();
-    setText(byId("film-problem"), `This browser cannot play ${this.video.film.codec} in ${this.video.suffix.slice(1).toUpperCase()}: open the page in another browser, or add a copy in `
-      + "H.264 (ffmpeg -i FILM -c:v libx264 COPY.mp4); alignment by light or clock page works nevertheless.");
+    const { film: { codec }, suffix } = this.video;
+    setText(byId("film-problem"), `This browser cannot play ${codec} in ${suffix.slice(1).toUpperCase()}: open the page in another one, or add a copy made by `
+      + "“ffmpeg -i FILM -c:v libx264 COPY.mp4”; alignment by light or clock page works nevertheless.");
     this.draw();
   }
 
-  get isPlayable() { return this.film.times.length > 0; }
-  get inStep() { return this.line !== null && !this.isApart && this.isPlayable; }
+  get inStep() { return this.line !== null && !this.isApart && this.film.times.length > 0; }
 
   setApart(isApart) {
     this.isApart = isApart;
-    this.followedS = null;
-    this.draw();
-    this.follow();
+    this.update();
   }
 
   step(by) {
-    if (!this.isPlayable) return;
+    if (!this.film.times.length) return;
     this.page.replay.playing.stop();
     this.goTo(this.film.wanted + by);
   }
@@ -82,30 +87,20 @@ export class FilmCard {
     this.draw();
   }
 
-  toggle() {
-    if (this.film.element.paused) this.film.play(this.page.replay.playing.speed);
-    else this.film.show(this.film.index);
-  }
-
   /** Follow the cursor, if it has moved or the playback has begun or ended. */
   follow() {
-    const { cursorS, replay: { playing } } = this.page;
-    const isOutside = this.inStep && cursorS !== null && !this.hasInstant(this.line.toFilm(cursorS));
+    const { film: { times }, page: { cursorS, replay: { playing } } } = this;
+    const isLed = this.inStep && cursorS !== null;
+    const filmS = isLed ? this.line.toFilm(cursorS) : 0;
+    const isOutside = isLed && (filmS < -intervalOf(times, 0) / 2 || filmS > times.at(-1) + intervalOf(times, times.length - 1));
+    const [from, to] = isOutside ? [0, times.at(-1)].map((endS) => timeText(this.line.toSession(endS), 0.01)) : [];
     setData(this.box, "outside", String(isOutside));
-    setText(byId("film-over"), isOutside ? `Outside the film: it runs from ${this.textOf(0)} to ${this.textOf(this.film.times.length - 1)}` : "");
-    if (!this.inStep || cursorS === null || (cursorS === this.followedS && playing.going === this.wasGoing)) return;
+    setText(byId("film-over"), isOutside ? `Outside the film: it runs from ${from} to ${to}` : "");
+    if (!isLed || (cursorS === this.followedS && playing.going === this.wasGoing)) return;
     [this.followedS, this.wasGoing] = [cursorS, playing.going];
-    const filmS = this.line.toFilm(cursorS);
     if (playing.going && !playing.calm.matches && !isOutside) this.film.follow(filmS, playing.speed);
-    else this.film.show(pictureAt(this.film.times, filmS));
+    else this.film.show(pictureAt(times, filmS));
   }
-
-  hasInstant(filmS) {
-    const { times } = this.film;
-    return filmS >= -intervalOf(times, 0) / 2 && filmS <= times.at(-1) + intervalOf(times, times.length - 1);
-  }
-
-  textOf(index) { return timeText(this.line.toSession(this.film.times[index]), 0.01); }
 
   draw() {
     const { film, inStep } = this;

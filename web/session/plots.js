@@ -14,7 +14,7 @@ const FOOT_PX = 6;
 const ROOM_PX = 200; // of the window, above and below the plots
 const RIGHT_PX = 12;
 const FONT = "600 12px system-ui, sans-serif";
-const NAMES = [
+export const COLOURS = [
   "page", "text", "soft", "edge", "grid", "series", "other", "interval", "stance", "contact", "warn-line", "bad-line", "cop",
   "heat-0", "heat-1", "heat-2", "heat-3",
 ];
@@ -28,9 +28,10 @@ function clipTo(context, box, left, right) {
 
 /** Canvas of the plots. */
 export class Plots {
-  constructor() {
-    this.box = byId("plots");
-    this.canvas = byId("plots-canvas", HTMLCanvasElement);
+  /** @param {HTMLElement} [box] @param {HTMLCanvasElement} [canvas] */
+  constructor(box = byId("plots"), canvas = byId("plots-canvas", HTMLCanvasElement)) {
+    this.box = box;
+    this.canvas = canvas;
     this.over = byId("cursor-canvas", HTMLCanvasElement);
     this.whole = null;
     this.detail = null;
@@ -58,6 +59,7 @@ export class Plots {
   }
 
   get width() { return this.box.clientWidth; }
+  get ratio() { return devicePixelRatio || 1; }
   get left() { return this.width < 600 ? 40 : 56; }
   get plotWidth() { return Math.max(1, this.width - this.left - RIGHT_PX); }
   get height() {
@@ -100,9 +102,9 @@ export class Plots {
 
   draw(view, current = -1) {
     if (!this.whole || this.width < 50) return;
-    this.colours ??= coloursOf(this.box, NAMES);
+    this.colours ??= coloursOf(this.box, COLOURS);
     this.box.style.height = `${this.height}px`;
-    const context = fit(this.canvas, this.width, this.height);
+    const context = fit(this.canvas, this.width, this.height, this.ratio);
     context.font = FONT;
     context.fillStyle = this.colours.page;
     context.fillRect(0, 0, this.width, this.height);
@@ -269,7 +271,7 @@ export class Plots {
   /** Draw the cursor and the range that is being selected. */
   drawCursor(view, timeS, chosen = null) {
     if (!this.whole) return;
-    this.colours ??= coloursOf(this.box, NAMES);
+    this.colours ??= coloursOf(this.box, COLOURS);
     const context = fit(this.over, this.width, this.height);
     const x = this.x(view);
     const bottom = this.height - AXIS_PX;

@@ -142,8 +142,9 @@ export class Plotted {
   async showVideos() {
     const found = await unlessRefused(api.listVideos(this.session.id));
     const card = byId("videos-card");
-    card.hidden = !found || (!found.items.length && !isOperator());
+    card.hidden = !found || (!found.items.length && !found.problems.length && !isOperator());
     if (card.hidden) return;
+    setText(byId("videos-problem"), found.problems.join(" "));
     const load = async () => {
       const { Videos } = await loadModule(() => import("./videos.js"));
       this.videos ??= new Videos(this);
@@ -319,7 +320,7 @@ export class Plotted {
       ArrowLeft: () => this.replay.walk(-1, event.shiftKey), ArrowRight: () => this.replay.walk(1, event.shiftKey),
     };
     if (!onButton) acts[" "] = () => this.replay.toggle();
-    if (this.videos) Object.assign(acts, { ",": () => this.videos.step(-1), ".": () => this.videos.step(1) });
+    if (this.videos) Object.assign(acts, { ",": () => this.videos.card.step(-1), ".": () => this.videos.card.step(1) });
     if (event.target.closest?.("#stances-scroll, .scroll")) { // they scroll the table there
       delete acts.ArrowLeft;
       delete acts.ArrowRight;
@@ -377,7 +378,7 @@ export class Plotted {
     const text = this.readout.draw(bins, this.cursorS === null ? -1 : bins.at(this.cursorS), plots.panels,
       this.cursorS === null ? [] : plots.beside?.readings(view, this.cursorS));
     this.replay.draw();
-    this.videos?.draw();
+    this.videos?.card.follow();
     if (!this.replay.playing.going) this.describeCursor(text); // not while playing: too fast for a screen reader
     byId("as-heat").setAttribute("aria-pressed", String(plots.panels.some((panel) => panel.kind === "heat")));
     setText(byId("marker-at"), this.cursorS === null ? "at mid-view" : "at cursor");

@@ -22,7 +22,7 @@ export class Videos {
     this.page = page;
     /** @type {Video[]} */
     this.items = [];
-    this.card = new FilmCard(page, () => {});
+    this.card = new FilmCard(page);
     this.alignment = new AlignmentCard(page, this.card, (video) => this.put(video));
     this.strip = new Strip(page, this.card);
     this.stopping = null; // of an upload
@@ -34,8 +34,7 @@ export class Videos {
     choose();
     send.addEventListener("click", () => quietly(async () => {
       const rate = byId("capture-rate", HTMLInputElement);
-      await this.add(file.files[0], rate.value ? Number(rate.value) : null);
-      file.value = rate.value = "";
+      if (await this.add(file.files[0], rate.value ? Number(rate.value) : null)) file.value = rate.value = "";
       choose();
     }));
     const box = byId("video-upload");
@@ -46,9 +45,6 @@ export class Videos {
       choose();
     });
   }
-
-  draw() { this.card.follow(); }
-  step(by) { this.card.step(by); }
 
   /** Show a list of videos, and one of them. @param {Video[]} items @param {string} [chosen] id; default: the first that is aligned */
   async show(items, chosen = items.find((video) => video.alignment)?.id ?? items[0]?.id) {
@@ -84,7 +80,7 @@ export class Videos {
     await this.show(this.items.filter(({ id }) => id !== video.id));
   }
 
-  /** Upload a file. @param {File} file @param {number | null} captureRateHz null: as the file says */
+  /** Upload a file; resolve to false if it was aborted. @param {File} file @param {number | null} captureRateHz null: as the file says */
   async add(file, captureRateHz) {
     this.stopping = new AbortController();
     const box = byId("upload");
@@ -99,9 +95,11 @@ export class Videos {
       const video = await upload(api.videosAddress(this.page.session.id, file.name, captureRateHz), file, say, this.stopping.signal);
       await this.put(video);
       notice(`Added video “${video.name}”.`);
+      return true;
     } catch (error) {
       if (!this.stopping.signal.aborted) throw error;
       notice("Upload aborted; nothing was kept.");
+      return false;
     } finally {
       box.hidden = true;
       this.stopping = null;
