@@ -20,9 +20,15 @@ from devices.arrays import Floats
 from devices.lamp_code import BIT_NS, CODE_BITS, make_code
 
 _WINDOW_S = 6.0
-"""Length of a window: 64 bits."""
-_PEAK_MIN = 0.6
-"""Least correlation with the code: by chance 64 bits reach half of it in 10^5 offsets."""
+"""Length of a window: 64 bits. In a shorter one chance finds the code anywhere."""
+_EDGE_S = 0.1
+"""Time that a film may lack of its last window."""
+_PICTURES_PER_S_MIN = 10.0
+_PEAK_MIN, _NEXT_PEAK_MIN = 0.8, 0.6
+"""Least correlation with the code, in the first window and, at an offset near its, in others.
+
+By chance motions of 2 Hz in 1000 parts reach 0.67 in the offsets of an hour.
+"""
 _GRID_STEPS = 96
 """Offsets of the fine grid."""
 _PARTS_MAX = 1024
@@ -89,28 +95,32 @@ def find_lamp(
         Pairs of the windows in which a part follows the code; empty if none does.
     """
     found: list[LampPair] = []
-    begin_s, last_s = times_s[0], times_s[-1]
-    count = max(1, int((last_s - begin_s) // _WINDOW_S))
-    for edge_s in np.linspace(begin_s, max(begin_s, last_s - _WINDOW_S), count):
-        rows = (times_s >= edge_s) & (times_s <= edge_s + _WINDOW_S)
+    begin_s, last_s = float(times_s[0]), float(times_s[-1])
+    edge_s = begin_s
+    while edge_s + _WINDOW_S <= last_s + _EDGE_S:
         on_window()
-        if rows.sum() < 2 * _WINDOW_S:  # a film of less than two pictures a second
-            continue
+        rows = (times_s >= edge_s) & (times_s <= edge_s + _WINDOW_S)
+        within, peak_min = (begin_ns, end_ns), _PEAK_MIN
         if found:  # later windows follow within the drift of any camera
             expected_ns = found[0].t_mono_ns + 1e9 * (begin_s - found[0].film_s)
             margin_ns = 1e-3 * 1e9 * (edge_s - found[0].film_s) + 2 * BIT_NS
-            within = expected_ns - margin_ns, expected_ns + margin_ns
-        else:
-            within = begin_ns, end_ns
-        part = np.asarray(brightness[rows], dtype=np.float64)
-        pair = _find_in_window(times_s[rows] - begin_s, part, *within)
+            within, peak_min = (expected_ns - margin_ns, expected_ns + margin_ns), _NEXT_PEAK_MIN
+        pair = None
+        if rows.sum() >= _PICTURES_PER_S_MIN * _WINDOW_S:
+            part = np.asarray(brightness[rows], dtype=np.float64)
+            pair = _find_in_window(times_s[rows] - begin_s, part, *within, peak_min)
         if pair is not None:
             found.append(pair._replace(film_s=pair.film_s + begin_s))
+            edge_s += _WINDOW_S
+        else:
+            # The lamp may begin anywhere: windows overlap until it is found, and at the end.
+            end_s = last_s - _WINDOW_S
+            edge_s = end_s if edge_s < end_s < edge_s + _WINDOW_S / 2 else edge_s + _WINDOW_S / 2
     return found
 
 
 def _find_in_window(
-    film_s: Floats, brightness: Floats, begin_ns: float, end_ns: float
+    film_s: Floats, brightness: Floats, begin_ns: float, end_ns: float, peak_min: float
 ) -> LampPair | None:
     # Coarse: a quarter of a bit is enough to see a peak, in pictures and in offsets.
     step_ns = BIT_NS / 4
@@ -131,7 +141,7 @@ def _find_in_window(
         at, part = np.unravel_index(int(np.argmax(correlation)), correlation.shape)
         offset_ns = begin_ns + chunk_ns + step_ns * float(at)
         best = max(best, (float(correlation[at, part]), offset_ns, int(lively[part])))
-    if best[0] < _PEAK_MIN:
+    if best[0] < peak_min:
         return None
     interval_ns = 1e9 * float(np.median(np.diff(film_s)))
     lamp = _normalize(brightness[:, best[2] : best[2] + 1])[:, 0]

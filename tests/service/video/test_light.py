@@ -99,6 +99,14 @@ def test_a_film_without_the_lamp_has_no_pair() -> None:
     assert find_lamp(times_s, constant, 0.0, SESSION_S * 1e9) == []
 
 
+def test_motion_in_the_picture_is_no_lamp_in_a_long_session() -> None:
+    generator = np.random.default_rng(6)
+    times_s = np.arange(300) / 50.0
+    kernel = np.exp(-0.5 * (2.0 * np.pi * 2.0 * np.arange(-60, 61) / 50.0) ** 2)
+    motion = [np.convolve(generator.normal(0.0, 1.0, 420), kernel, "valid") for _ in range(200)]
+    assert find_lamp(times_s, 100.0 + 20.0 * np.array(motion).T, 0.0, 3600e9) == []
+
+
 def test_a_wrong_pair_is_left_out_and_two_that_contradict_are_refused() -> None:
     film_s = np.array([1.0, 5.0, 9.0, 14.0])
     t_ns = 1e9 * film_s * (1.0 + 20e-6) + 7e9
