@@ -25,7 +25,7 @@ from storage.sessions.videos import Alignment, AlignmentMethod
 DRIFT_SIGMA = 50e-6
 """Standard deviation of a camera's drift before anything is measured."""
 CAPTURE_RATE_SIGMA = 1e-3
-"""The same for a film whose capture rate is stated."""
+"""Standard deviation of the drift of a film whose capture rate is stated."""
 _OUTLIER_SIGMAS = 4.0
 
 

@@ -158,7 +158,7 @@ def test_a_film_of_the_lamp_of_a_node_is_aligned_with_its_session(
     from tests.service.video.test_methods import add_film
 
     process = leg("--record", "trial", output="code")
-    until(lambda: chip.is_high(27), 30.0)
+    until(lambda: chip.is_high(27), 90.0)
     time.sleep(10.0)
     process.process.send_signal(signal.SIGTERM)
     assert process.ended(30.0) == 0, process.err
