@@ -1,6 +1,6 @@
-"""A big sealed session of noise, and one who downloads it, in a process of their own.
+"""A big sealed session of noise, and one who downloads it or adds a film, in their own process.
 
-    python benchmarks/big_download.py URL [--mb-s 10]
+    python benchmarks/big_download.py URL [--mb-s 10] [--upload-mb 1000]
 
 What is downloaded has the size of a session; what is in it does not matter to who sends it.
 """
@@ -10,13 +10,16 @@ from __future__ import annotations
 import argparse
 import asyncio
 import os
+import struct
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
 from many_sessions import sealed
+from served import TOKEN
 
 from storage.documents import write_checksummed_json
 from storage.parquet_hash import compute_sha256
@@ -54,9 +57,31 @@ def download(url: str, mb_s: float) -> None:
     print(f"downloaded {size * 1e-6:.0f} MB in {took_s:.1f} s", flush=True)
 
 
-async def begun(url: str, mb_s: float) -> asyncio.subprocess.Process:
-    """Somebody else who downloads it."""
-    command = [sys.executable, __file__, url, f"--mb-s={mb_s:g}"]
+def upload(url: str, megabytes: float, mb_s: float) -> None:
+    """Add a film with so many MB behind it that players skip, as fast as `download` reads."""
+    from tests.service.video.short_film import short_film
+
+    size = round(megabytes * 1e6 / _CHUNK_BYTES) * _CHUNK_BYTES
+    head, chunk = short_film() + struct.pack(">I4s", 8 + size, b"free"), os.urandom(_CHUNK_BYTES)
+    began_s = time.monotonic()
+
+    def pieces() -> Iterator[bytes]:
+        yield head
+        for sent in range(0, size, _CHUNK_BYTES):
+            yield chunk
+            if mb_s:
+                time.sleep(max(0.0, began_s + sent * 1e-6 / mb_s - time.monotonic()))
+
+    url = f"{url.partition('/data?')[0]}/videos?name=film.mp4"
+    headers = {"Authorization": f"Bearer {TOKEN}", "Content-Length": str(len(head) + size)}
+    with httpx.Client(timeout=600.0, trust_env=False) as client:
+        client.post(url, content=pieces(), headers=headers).raise_for_status()
+    print(f"added {size * 1e-6:.0f} MB in {time.monotonic() - began_s:.1f} s", flush=True)
+
+
+async def begun(url: str, mb_s: float, upload_mb: float) -> asyncio.subprocess.Process:
+    """Somebody else who downloads it, or adds a film to it."""
+    command = [sys.executable, __file__, url, f"--mb-s={mb_s:g}", f"--upload-mb={upload_mb:g}"]
     return await asyncio.create_subprocess_exec(*command, stdout=subprocess.PIPE)
 
 
@@ -67,15 +92,19 @@ async def ended(process: asyncio.subprocess.Process) -> str:
     except TimeoutError:
         process.kill()
         await process.wait()
-        return "the download was not finished"
+        return "it was not finished"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("url")
     parser.add_argument("--mb-s", type=float, default=10.0, help="0: as fast as it goes")
+    parser.add_argument("--upload-mb", type=float, default=0.0, help="add a film of so many MB")
     asked = parser.parse_args()
-    download(asked.url, asked.mb_s)
+    if asked.upload_mb:
+        upload(asked.url, asked.upload_mb, asked.mb_s)
+    else:
+        download(asked.url, asked.mb_s)
 
 
 if __name__ == "__main__":

@@ -60,6 +60,7 @@ class Options:
     seal: bool = False
     download_mb: float = 0.0
     download_mb_s: float = 0.0
+    upload_mb: float = 0.0
 
 
 @dataclass
@@ -202,7 +203,7 @@ async def _watch(
             screen.messages = screen.dropped = 0
         if big is not None:
             url = f"{server.url}/api/v1{big}"
-            downloading = await big_download.begun(url, options.download_mb_s)
+            downloading = await big_download.begun(url, options.download_mb_s, options.upload_mb)
         before = await asyncio.to_thread(Look.at, server)
         end_s = time.monotonic() + options.seconds
         while time.monotonic() < end_s:
@@ -271,6 +272,7 @@ def main() -> None:
     parser.add_argument("--soak", action="store_true")
     parser.add_argument("--download-mb", type=float)
     parser.add_argument("--download-mb-s", type=float, default=10.0)
+    parser.add_argument("--upload-mb", type=float, default=0.0, help="add a film to a session")
     a = parser.parse_args()
     rate_hz = a.rate_hz or RATE_HZ.get(a.tiles) or parser.error("say --rate-hz for so many tiles")
     seconds = a.seconds or (SOAK_S if a.soak else 20.0)
@@ -280,7 +282,10 @@ def main() -> None:
         look_s=LOOK_S if a.soak else seconds,
         record=a.record,
         seal=a.soak and a.record,
-        download_mb=(2000.0 if a.soak else 0.0) if a.download_mb is None else a.download_mb,
+        download_mb=(2000.0 if a.soak else float(a.upload_mb > 0))
+        if a.download_mb is None
+        else a.download_mb,
+        upload_mb=a.upload_mb,
         download_mb_s=a.download_mb_s,
     )
     what = played(a.tiles, rate_hz)

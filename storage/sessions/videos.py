@@ -280,7 +280,7 @@ class IncomingVideo:
             self._file.close()
         shutil.rmtree(self._folder, ignore_errors=True)
 
-    def write(self, chunk: bytes) -> None:
+    def write(self, *pieces: bytes) -> None:
         """Append to the file, and wait for the disk: a backlog would delay the sync of journals.
 
         Raises:
@@ -288,11 +288,12 @@ class IncomingVideo:
             StorageError: the disk is not writable, or would have too little space left.
         """
         with translate_storage_errors(self._path):
-            _check_space(self._folder, len(chunk))
-            self._file.write(chunk)
+            _check_space(self._folder, sum(map(len, pieces)))
+            for piece in pieces:
+                self._file.write(piece)
+                self._hash.update(piece)
             self._file.flush()
             os.fdatasync(self._file.fileno())
-        self._hash.update(chunk)
 
     def keep(self, describe: Callable[[Path], tuple[FilmInfo, bytes]]) -> Video:
         """Describe the film that is now complete, and put the video in place.

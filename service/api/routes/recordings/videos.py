@@ -163,12 +163,8 @@ async def _receive(request: Request, incoming: IncomingVideo) -> None:
     async for part in request.stream():
         parts.append(part)
         if not part or sum(map(len, parts)) >= _CHUNK_BYTES:
-            await to_thread.run_sync(_write, incoming, parts, limiter=_WRITING)
+            await to_thread.run_sync(incoming.write, *parts, limiter=_WRITING)
             parts = []
-
-
-def _write(incoming: IncomingVideo, parts: list[bytes]) -> None:
-    incoming.write(b"".join(parts))
 
 
 @router.get("/{video_id}", summary="A video", responses=_UNKNOWN)
