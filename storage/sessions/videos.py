@@ -75,7 +75,7 @@ class FilmInfo(StrictModel):
     rate_hz: float
     """Pictures per second: the inverse of their median interval."""
     play_rate_hz: float
-    """The same as it plays: lower in slow motion."""
+    """Pictures per second as it plays: lower in slow motion."""
     is_variable: bool
     """True if intervals differ: a variable rate, or dropped pictures."""
     capture_rate_hz: float | None

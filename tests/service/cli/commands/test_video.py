@@ -60,7 +60,8 @@ def test_a_film_is_kept_as_it_is_and_the_session_unchanged(
     assert kept.read_bytes() == film.read_bytes() == short_film()
     assert f"{added['id']} walk.mp4: 64 x 48, 0.22 s, 12" in run("video", "list", folder).out
     assert added["film"]["rate_hz"] == pytest.approx(50.0)
-    run("verify", folder).succeeds()
+    for whole in (folder, "data"):
+        run("verify", whole).succeeds()
     run("video", "remove", folder, added["id"]).succeeds()
     assert contents(folder) == before
     run("video", "remove", folder, added["id"]).fails(1, "no video", "it has none")
