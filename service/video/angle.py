@@ -20,7 +20,7 @@ from storage.sessions.reader import SealedFileReader
 from storage.sessions.videos import Video, get_film_path, read_picture_times
 
 _POINT_SIGMA = 1e-4
-"""Least uncertainty of another program's points, relative to their distance."""
+"""Error of another program's points that neighbours share, relative to their distance."""
 _INTERVAL_TOLERANCE = 0.1
 
 

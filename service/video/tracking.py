@@ -6,9 +6,9 @@ the upper marker against the picture's upright, positive as the foot rolls forwa
 user says: a camera is seldom level. It is known in the picture's plane; a camera that looks
 obliquely by `a` turns it by up to (1 / cos a - 1) of its sine.
 
-The uncertainty is measured on the film itself: the distance of each angle from a parabola through
-its neighbours is noise of the detection (and motion faster than the film shows, which makes it
-greater, never less). A picture in which a marker is hidden has no angle.
+The uncertainty is mostly measured on the film itself: the distance of each angle from a parabola
+through its neighbours is noise of the detection (and motion faster than the film shows, which
+makes it greater, never less). A picture in which a marker is hidden has no angle.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ _DOT_ROUNDNESS = 0.6
 """Least ratio of a dot's area to that of the circle around it."""
 _WINDOW = 7
 """Pictures of the parabola that measures the noise."""
-PLACE_SIGMA_PX = 0.03
-"""Least uncertainty of a marker's place: no detection is better on real pictures."""
+PLACE_SIGMA_PX = 0.05
+"""Error of a place by the grid of pixels: neighbours share it, so a parabola does not show it."""
 _COLOURS_HUE = {"red": 0, "orange": 12, "yellow": 28, "green": 60, "blue": 112, "magenta": 150}
 """Hues in OpenCV's half degrees."""
 _HUE_WITHIN = 11
@@ -95,7 +95,7 @@ def track_markers(
             where=str(path),
             remedy="Look at the film: tags need a white border, and 5 pixels a square",
         )
-    return places_px if lens is None else _undistort(places_px, lens)
+    return places_px if lens is None else undistort(places_px, lens)
 
 
 def compute_angle(
@@ -106,12 +106,12 @@ def compute_angle(
     Args:
         places: (pictures, 2, 2), of the lower and the upper marker, forward and up.
         zero_rad: angle of the line between them at which the segment's is 0.
-        place_sigma: least standard deviation of a place, in the unit of `places`.
+        place_sigma: error of a place that neighbours share, in the unit of `places`.
     """
     forward, up = np.moveaxis(places[:, 1] - places[:, 0], 1, 0)
     angle_rad = np.remainder(np.arctan2(forward, up) - zero_rad + math.pi, 2.0 * math.pi) - math.pi
-    least_rad = math.sqrt(2.0) * place_sigma / np.hypot(forward, up)
-    return angle_rad, np.maximum(least_rad, _measure_noise_rad(angle_rad))
+    shared_rad = math.sqrt(2.0) * place_sigma / np.hypot(forward, up)
+    return angle_rad, np.hypot(shared_rad, _measure_noise_rad(angle_rad))
 
 
 def _measure_noise_rad(angle_rad: Floats) -> float:
@@ -198,23 +198,30 @@ def make_dot_finder(colour: str) -> FindMarkers:
             f"no dots of the colour {colour!r}", expected=", ".join(("bright", *_COLOURS_HUE))
         )
 
-    def weigh(picture: Picture) -> Floats:
-        """Return how much each pixel belongs to a dot: its light, where the colour fits."""
+    away = np.abs((np.arange(256) - _COLOURS_HUE.get(colour, 0) + 90) % 180 - 90)
+    is_hue = np.where(away <= _HUE_WITHIN, 255, 0).astype(np.uint8)
+
+    def weigh(picture: Picture) -> npt.NDArray[Any]:
+        """Return how much each pixel belongs to a dot: its light, or where it fits its colour."""
         if colour == "bright":
-            return np.where(picture >= _BRIGHT_MIN, picture.astype(np.float64), 0.0)
-        hsv = cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_BGR2HSV).astype(np.int16)
-        away = np.abs((hsv[..., 0] - _COLOURS_HUE[colour] + 90) % 180 - 90)
-        fits = (away <= _HUE_WITHIN) & (hsv[..., 2] >= _VALUE_MIN)
-        fits &= hsv[..., 1] >= _SATURATION_MIN
-        return np.where(fits, hsv[..., 1].astype(np.float64), 0.0)
+            bright = cv2.threshold(picture, _BRIGHT_MIN - 1, 255, cv2.THRESH_TOZERO)
+            return np.asarray(bright[1])
+        hsv = cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_BGR2HSV)
+        fits = cv2.inRange(hsv, (0, _SATURATION_MIN, _VALUE_MIN), (255, 255, 255))
+        fits = cv2.bitwise_and(fits, cv2.LUT(hsv[..., 0], is_hue))
+        return np.asarray(cv2.bitwise_and(hsv[..., 1], fits))
 
     def find(picture: Picture) -> Floats | None:
-        weights = weigh(picture)
-        count, labels, stats, _ = cv2.connectedComponentsWithStats((weights > 0).astype(np.uint8))
+        whole = weigh(picture)
+        left, top, width, height = cv2.boundingRect(whole)
+        weights = np.ascontiguousarray(whole[top : top + height, left : left + width])
+        if not weights.size:
+            return None
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(weights)
         areas = stats[1:, cv2.CC_STAT_AREA].astype(np.float64)
         sizes = stats[1:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)
         least, most = _DOT_AREA_PX
-        is_dot = (areas >= least) & (areas <= most * weights.size)
+        is_dot = (areas >= least) & (areas <= most * whole.size)
         is_dot &= areas >= _DOT_ROUNDNESS * math.pi / 4 * sizes**2
         dots = np.flatnonzero(is_dot) + 1
         if count < 3 or len(dots) < 2:
@@ -223,17 +230,17 @@ def make_dot_finder(colour: str) -> FindMarkers:
         if len(np.flatnonzero(is_dot)) > 2 and areas[dots[1] - 1] < 2 * np.sort(areas[is_dot])[-3]:
             return None  # a third one is as large: which two are meant is not known
         places = np.stack([_weighted_middle(weights, labels, stats, int(dot)) for dot in dots])
-        return np.asarray(places[np.argsort(-places[:, 1])])
+        return np.asarray(places[np.argsort(-places[:, 1])] + np.array([left, top]))
 
     return find
 
 
 def _weighted_middle(
-    weights: Floats, labels: npt.NDArray[Any], stats: npt.NDArray[Any], dot: int
+    weights: npt.NDArray[Any], labels: npt.NDArray[Any], stats: npt.NDArray[Any], dot: int
 ) -> Floats:
     x, y, width, height = (int(value) for value in stats[dot, :4])
     part = slice(y, y + height), slice(x, x + width)
-    inside = np.where(labels[part] == dot, weights[part], 0.0)
+    inside = np.where(labels[part] == dot, weights[part].astype(np.float64), 0.0)
     total = inside.sum()
     return np.array(
         [
@@ -243,17 +250,17 @@ def _weighted_middle(
     )
 
 
-def _undistort(places_px: Floats, lens: Lens) -> Floats:
+def undistort(places_px: Floats, lens: Lens) -> Floats:
+    """Remove the lens's distortion from places (n, 2, 2); unknown ones stay so."""
     import cv2
 
-    shape = places_px.shape
-    points = places_px.reshape(-1, 1, 2)
+    points = places_px.reshape(-1, 1, 2).copy()
     seen = np.isfinite(points).all(axis=(1, 2))
     if seen.any():
         points[seen] = cv2.undistortPoints(
             points[seen], lens.matrix, lens.distortion, P=lens.matrix
         )
-    return points.reshape(shape)
+    return points.reshape(places_px.shape)
 
 
 def calibrate_lens(path: Path, columns: int, rows: int, film: FilmInfo) -> Lens:

@@ -18,7 +18,11 @@ _SUPER = 3
 """Pixels of the drawing for one of the picture."""
 _TIME_BASE = Fraction(1, 90_000)
 LOWER_TAG, UPPER_TAG = 3, 7
-_FAST = {"libx264": {"preset": "veryfast"}, "libvpx-vp9": {"deadline": "realtime", "cpu-used": "8"}}
+_ENCODING = {
+    "libx264": {"preset": "veryfast", "crf": "16"},
+    "libvpx-vp9": {"deadline": "realtime", "cpu-used": "8", "crf": "20", "b:v": "0"},
+}
+"""Options of codecs: fast, and of a camera's quality at any rate."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +93,8 @@ def film_leg(
 ) -> list[Picture]:
     """Film a leg.
 
-    Motion within an exposure is drawn at three instants, and rows are exposed one after the other.
+    Motion within an exposure is drawn at three instants; of a rolling shutter at one, and rows in
+    twelve bands are exposed one after the other.
 
     Args:
         camera: the camera.
@@ -103,14 +108,14 @@ def film_leg(
     readout_s = camera.readout / camera.rate_hz
     pictures = []
     for at_s in begin_s:
-        bands = 4 if readout_s else 1
+        bands, parts = (12, (1 / 2,)) if readout_s else (1, (1 / 6, 1 / 2, 5 / 6))
         rows = []
         for band in range(bands):
             delay_s = readout_s * (band + 0.5) / bands
             drawn = np.mean(
                 [
                     draw_leg(camera, angle_at(at_s + delay_s + part * exposure_s), marks)
-                    for part in (1 / 6, 1 / 2, 5 / 6)
+                    for part in parts
                 ],
                 axis=0,
             )
@@ -134,8 +139,7 @@ def write_film(
         stream.width, stream.height = pictures[0].shape[1], pictures[0].shape[0]
         stream.pix_fmt = "yuv420p"
         stream.codec_context.time_base = stream.time_base = _TIME_BASE
-        stream.codec_context.bit_rate = 8_000_000
-        stream.codec_context.options = _FAST.get(camera.codec, {})
+        stream.codec_context.options = _ENCODING.get(camera.codec, {})
         for picture, t_s in zip(pictures, times_s, strict=True):
             frame = av.VideoFrame.from_ndarray(picture, format="gray").reformat(format="yuv420p")
             frame.pts, frame.time_base = round(t_s / _TIME_BASE), _TIME_BASE
