@@ -80,7 +80,7 @@ def find_lamp(
     brightness: npt.NDArray[np.floating],
     begin_ns: float,
     end_ns: float,
-    on_window: Callable[[], None] = lambda: None,
+    report_progress: Callable[[], None] = lambda: None,
 ) -> list[LampPair]:
     """Find the lamp in the brightness of a film's parts, one pair a window.
 
@@ -89,7 +89,7 @@ def find_lamp(
         brightness: (pictures, parts).
         begin_ns: earliest possible instant of the film's first picture, by the node's clock.
         end_ns: latest one.
-        on_window: called before each window.
+        report_progress: called every few seconds.
 
     Returns:
         Pairs of the windows in which a part follows the code; empty if none does.
@@ -98,7 +98,6 @@ def find_lamp(
     begin_s, last_s = float(times_s[0]), float(times_s[-1])
     edge_s = begin_s
     while edge_s + _WINDOW_S <= last_s + _EDGE_S:
-        on_window()
         rows = (times_s >= edge_s) & (times_s <= edge_s + _WINDOW_S)
         within, peak_min = (begin_ns, end_ns), _PEAK_MIN
         if found:  # later windows follow within the drift of any camera
@@ -108,7 +107,8 @@ def find_lamp(
         pair = None
         if rows.sum() >= _PICTURES_PER_S_MIN * _WINDOW_S:
             part = np.asarray(brightness[rows], dtype=np.float64)
-            pair = _find_in_window(times_s[rows] - begin_s, part, *within, peak_min)
+            since_s = times_s[rows] - begin_s
+            pair = _find_in_window(since_s, part, *within, peak_min, report_progress)
         if pair is not None:
             found.append(pair._replace(film_s=pair.film_s + begin_s))
             edge_s += _WINDOW_S
@@ -120,17 +120,23 @@ def find_lamp(
 
 
 def _find_in_window(
-    film_s: Floats, brightness: Floats, begin_ns: float, end_ns: float, peak_min: float
+    film_s: Floats,
+    brightness: Floats,
+    begin_ns: float,
+    end_ns: float,
+    peak_min: float,
+    report_progress: Callable[[], None],
 ) -> LampPair | None:
     # Coarse: a quarter of a bit is enough to see a peak, in pictures and in offsets.
     step_ns = BIT_NS / 4
     count = int(1e9 * (film_s[-1] - film_s[0]) / step_ns)
     binned = _average_bins(film_s, brightness, count)
-    lively = np.argsort(-(np.diff(binned, axis=0) ** 2).sum(axis=0))[:_PARTS_MAX]
-    series = _normalize(binned[:, lively]).astype(np.float32)
+    most_varying = np.argsort(-(np.diff(binned, axis=0) ** 2).sum(axis=0))[:_PARTS_MAX]
+    series = _normalize(binned[:, most_varying]).astype(np.float32)
     bins_ns = begin_ns + 1e9 * film_s[0] + step_ns * (np.arange(0.0, count) + 0.5)
     best = 0.0, 0.0, 0
     for chunk_ns in range(0, max(1, round(end_ns - begin_ns)), _CHUNK * round(step_ns)):
+        report_progress()
         offsets = min(_CHUNK, int((end_ns - begin_ns - chunk_ns) / step_ns) + 2)
         code_ns = bins_ns[0] + chunk_ns + step_ns * np.arange(0.0, offsets + count - 1)
         code = compute_mean_code(code_ns, step_ns).astype(np.float32)
@@ -140,7 +146,7 @@ def _find_in_window(
         correlation = (model @ series) / length[:, None]
         at, part = np.unravel_index(int(np.argmax(correlation)), correlation.shape)
         offset_ns = begin_ns + chunk_ns + step_ns * float(at)
-        best = max(best, (float(correlation[at, part]), offset_ns, int(lively[part])))
+        best = max(best, (float(correlation[at, part]), offset_ns, int(most_varying[part])))
     if best[0] < peak_min:
         return None
     interval_ns = 1e9 * float(np.median(np.diff(film_s)))

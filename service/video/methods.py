@@ -41,9 +41,9 @@ from storage.sessions.videos import (
 )
 
 _NEAR_S = 5.0
-"""Error of a stated begin of the film."""
-_LAMP_MARGIN_NS = 6_000_000_000
-"""Time around a part in which its lamp's window may have its middle."""
+"""Largest error of `near_s`."""
+_LAMP_MARGIN_NS = 3_000_000_000
+"""Time around a part in which its lamp's window may have its middle: half a window."""
 
 
 @dataclass(frozen=True)
@@ -223,7 +223,7 @@ def _pair_by_light(film: _Film, time: SessionTime, options: AlignmentOptions) ->
             begin_ns = max(begin_ns, near_ns - round(1e9 * _NEAR_S))
             end_ns = min(end_ns, near_ns + round(1e9 * _NEAR_S))
         windows.append((begin_ns, end_ns))
-    found: dict[float, tuple[float, float]] = {}
+    found: dict[float, tuple[float, float, float]] = {}
     for span, pairs in zip(
         time.spans, film.run("find_lamp", windows=windows)["pairs"], strict=True
     ):
@@ -232,7 +232,8 @@ def _pair_by_light(film: _Film, time: SessionTime, options: AlignmentOptions) ->
         for pair in pairs:
             t_mono_ns = pair["t_mono_ns"]
             if first_ns - _LAMP_MARGIN_NS <= t_mono_ns <= last_ns + _LAMP_MARGIN_NS:
-                found[pair["film_s"]] = t_mono_ns + to_session_ns, pair["sigma_ns"]
+                row = pair["correlation"], t_mono_ns + to_session_ns, pair["sigma_ns"]
+                found[pair["film_s"]] = max(row, found.get(pair["film_s"], row))
     if not found:
         raise FileFormatError(
             "no part of the picture blinks the lamp's code",
@@ -240,7 +241,7 @@ def _pair_by_light(film: _Film, time: SessionTime, options: AlignmentOptions) ->
             expected="the node's lamp in the picture for at least 6 s while it records",
             remedy="Look for it in the film, or align by clock, contact or hand",
         )
-    t_ns, sigma_ns = np.array(list(found.values())).T
+    _, t_ns, sigma_ns = np.array(list(found.values())).T
     # A switch is late, never early.
     late_ns = LAMP_LATE_NS / 2.0
     return _Pairs(np.array(list(found)), t_ns + late_ns, sigma_ns, late_ns / math.sqrt(3.0))

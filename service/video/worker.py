@@ -39,6 +39,7 @@ _PROGRESS_PICTURES = 50
 _PART_PX = 16
 """Least size of the parts of a picture in which a lamp is looked for."""
 _PARTS_MAX = 8192
+_PARTS_BYTES_MAX = 1 << 30
 _CLOCK_LOOK_S = 0.1
 """Interval of pictures in which a clock page is looked for."""
 _ERRORS: dict[str, type[FootTileError]] = {
@@ -208,7 +209,8 @@ def _find_lamp(
     from service.video.light import find_lamp
 
     film, times_s = read_film(path, capture_rate_hz)
-    part_px = max(_PART_PX, math.sqrt(film.width_px * film.height_px / _PARTS_MAX))
+    parts_max = min(_PARTS_MAX, _PARTS_BYTES_MAX / (2 * len(times_s)))
+    part_px = max(_PART_PX, math.sqrt(film.width_px * film.height_px / parts_max))
     size = max(1, int(film.width_px / part_px)), max(1, int(film.height_px / part_px))
     # Half precision is a tenth of a step.
     rows = np.full((len(times_s), size[0] * size[1]), np.nan, dtype=np.float16)
@@ -217,12 +219,12 @@ def _find_lamp(
         rows[index] = small.ravel()
         _report(index)
     seen = ~np.isnan(rows[:, 0])
-    times_s, rows = times_s[seen], rows[seen]
+    times_s, rows = times_s[seen], rows if seen.all() else rows[seen]
 
-    def show_life() -> None:
+    def report_progress() -> None:
         _print({"picture": film.picture_count})
 
-    found = [find_lamp(times_s, rows, *window, show_life) for window in windows]
+    found = [find_lamp(times_s, rows, *window, report_progress) for window in windows]
     return {"pairs": [[pair._asdict() for pair in pairs] for pairs in found]}
 
 
