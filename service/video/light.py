@@ -200,9 +200,12 @@ def _refine(
         weight = np.exp(log_posterior - log_posterior.max())
         weight /= weight.sum()
         offset_ns, sigma_ns = _compute_moments(weight.sum(axis=1), offsets_ns)
-        exposure, spread = _compute_moments(weight.sum(axis=0), exposures)
+        exposure, width = _compute_moments(weight.sum(axis=0), exposures)
         reach_ns = 6.0 * sigma_ns
-        low, high = max(_EXPOSURES[0], exposure - 4.0 * spread), min(1.0, exposure + 4.0 * spread)
+        low, high = (
+            max(float(_EXPOSURES[0]), exposure - 4.0 * width),
+            min(1.0, exposure + 4.0 * width),
+        )
         exposures = np.linspace(low, high, len(_EXPOSURES))
     # At the mean instant of all that tells the offset, a drift does not change it.
     shift_ns = max(sigma_ns, interval_ns / _GRID_STEPS)
