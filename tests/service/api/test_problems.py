@@ -101,6 +101,7 @@ def test_no_route_finds_an_unknown_id(shared: Running) -> None:
     for path, methods in shared.http.get("/openapi.json").json()["paths"].items():
         for method in methods if "{" in path else ():
             queries = {"data": {"format": "mcap"}, "videos": {"name": "walk.mp4"}}
+            queries["alignment"] = {"method": "light"}
             query = queries.get(path.rsplit("/", 1)[-1], {})
             is_sent = method in ("post", "put", "patch")
             body = bodies.get(path.rsplit("/", 1)[-1], {}) if is_sent else None
