@@ -32,6 +32,9 @@ _DOT_AREA_PX = (6.0, 0.02)
 """Area of a dot: at least so many pixels, at most this part of the picture."""
 _DOT_ROUNDNESS = 0.6
 """Least ratio of a dot's area to that of the circle around it."""
+_LENGTH_TOLERANCE = 0.1
+"""Largest deviation of the markers' distance from its median, relative to it."""
+_NOISE_PICTURES = 50
 _WINDOW = 7
 """Pictures of the parabola that measures the noise."""
 PLACE_SIGMA_PX = 0.05
@@ -109,24 +112,38 @@ def compute_angle(
         place_sigma: error of a place that neighbours share, in the unit of `places`.
     """
     forward, up = np.moveaxis(places[:, 1] - places[:, 0], 1, 0)
+    length = np.hypot(forward, up)
     angle_rad = np.remainder(np.arctan2(forward, up) - zero_rad + math.pi, 2.0 * math.pi) - math.pi
-    shared_rad = math.sqrt(2.0) * place_sigma / np.hypot(forward, up)
+    # The leg is rigid: at another length something else was taken for a marker.
+    is_leg = np.abs(length / np.nanmedian(length) - 1.0) <= _LENGTH_TOLERANCE
+    angle_rad = np.where(is_leg, angle_rad, math.nan)
+    shared_rad = math.sqrt(2.0) * place_sigma / np.where(length > 0.0, length, math.nan)
     return angle_rad, np.hypot(shared_rad, _measure_noise_rad(angle_rad))
 
 
-def _measure_noise_rad(angle_rad: Floats) -> float:
-    """Measure the noise of the angle over the whole film: the median residual of a parabola."""
-    if len(angle_rad) < _WINDOW:
-        return 0.0
+def _measure_noise_rad(angle_rad: Floats) -> Floats:
+    """Measure the noise of the angle: median residuals of a parabola, (pictures,).
+
+    That of `_NOISE_PICTURES` around a picture, at least that of the film: a foot at rest says
+    nothing of a moving one.
+    """
+    count = len(angle_rad)
+    if count < _WINDOW:
+        return np.zeros(count)
     x = np.arange(_WINDOW) - _WINDOW // 2
     design = np.stack([np.ones(_WINDOW), x, x**2], axis=1)
     weights = np.eye(_WINDOW)[_WINDOW // 2] - (design @ np.linalg.pinv(design))[_WINDOW // 2]
-    left_rad = np.convolve(angle_rad, weights[::-1], "valid")
-    seen_rad = left_rad[np.isfinite(left_rad)]
-    if not len(seen_rad):
-        return 0.0
+    left_rad = np.full(-(-count // _NOISE_PICTURES) * _NOISE_PICTURES, math.nan)
+    middle = slice(_WINDOW // 2, count - _WINDOW // 2)
+    left_rad[middle] = np.abs(np.convolve(angle_rad, weights[::-1], "valid"))
+    blocks = np.sort(left_rad.reshape(-1, _NOISE_PICTURES), axis=1)  # NaN comes last
+    seen = np.isfinite(blocks).sum(axis=1)
+    medians = np.nan_to_num(blocks[np.arange(len(blocks)), np.maximum(seen - 1, 0) // 2])
+    known = left_rad[np.isfinite(left_rad)]
+    whole = float(np.median(known)) if len(known) else 0.0
     # Of a normal distribution the median of absolute values is 0.6745 sigma.
-    return float(np.median(np.abs(seen_rad))) / 0.6745 / math.sqrt(float(weights @ weights))
+    scale = 0.6745 * math.sqrt(float(weights @ weights))
+    return np.asarray(np.maximum(medians, whole).repeat(_NOISE_PICTURES)[:count] / scale)
 
 
 def make_tag_finder(lower_id: int, upper_id: int) -> FindMarkers:

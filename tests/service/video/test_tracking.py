@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from devices.arrays import Floats
 from devices.errors import FileFormatError, UsageError
 from service.video.container import Picture, iterate_pictures, read_film
 from service.video.tracking import (
@@ -174,6 +175,31 @@ def test_a_zero_turns_the_angle_and_no_angle_is_beyond_half_a_turn() -> None:
     angle_rad, sigma_rad = compute_angle(places, zero_rad=-1.0)
     assert angle_rad == pytest.approx(4.0 - 2.0 * math.pi)
     assert sigma_rad == pytest.approx(0.05 * math.sqrt(2.0) / 200.0)
+
+
+def make_places(angle_rad: Floats, generator: np.random.Generator) -> Floats:
+    upper = 200.0 * np.stack([np.sin(angle_rad), np.cos(angle_rad)], axis=1)
+    places = np.stack([np.zeros_like(upper), upper], axis=1)
+    return np.asarray(places + generator.normal(0.0, 0.05, places.shape))
+
+
+def test_another_dot_than_the_legs_has_no_angle() -> None:
+    places = make_places(np.full(100, 0.2), np.random.default_rng(1))
+    places[40:43, 1] = 200.0, 150.0  # a reflection
+    angle_rad, _ = compute_angle(places, zero_rad=0.0)
+    assert np.isnan(angle_rad[40:43]).all()
+    assert np.isfinite(np.delete(angle_rad, [40, 41, 42])).all()
+
+
+def test_a_foot_at_rest_does_not_vouch_for_a_moving_one() -> None:
+    generator = np.random.default_rng(2)
+    truth_rad = np.zeros(1000)
+    places = make_places(truth_rad, generator)
+    places[900:] += generator.normal(0.0, 2.0, places[900:].shape)
+    angle_rad, sigma_rad = compute_angle(places, zero_rad=0.0)
+    for part in (slice(0, 900), slice(900, 1000)):
+        ratio = np.sqrt(np.mean((angle_rad[part] / sigma_rad[part]) ** 2))
+        assert 0.5 < ratio < 1.3
 
 
 def test_a_film_without_markers_and_one_that_breaks_off_are_refused(tmp_path: Path) -> None:
