@@ -222,18 +222,19 @@ def test_the_bound_contains_what_debouncing_delays() -> None:
 
 
 class LateClock:
-    """A clock whose sleeps end late, and block after some of them."""
+    """A clock whose sleeps begin on a sign, end late, and block after some of them."""
 
     def __init__(self, late_ns: list[int]) -> None:
         self.late_ns = late_ns
         self.edges_ns: list[int] = []
-        self.is_over = threading.Event()
+        self.may_begin, self.is_over = threading.Event(), threading.Event()
         self._t_ns = 10**13
 
     def now_ns(self) -> int:
         return self._t_ns
 
     def sleep_until_ns(self, t_ns: int) -> None:
+        self.may_begin.wait(5.0)
         if len(self.edges_ns) == len(self.late_ns):
             self.is_over.set()
             threading.Event().wait(0.01)
@@ -260,6 +261,7 @@ def test_the_lamp_has_the_level_of_each_bit_from_its_edge_while_recording(
     monkeypatch.setattr(RecordingLine, "_set_level", drive)
     line = RecordingLine(lamp_scene, 27, clock)
     line.drive(high=True)
+    clock.may_begin.set()
     assert clock.is_over.wait(5.0)
     assert line.warning == ""
     line.close()
@@ -279,6 +281,7 @@ def test_a_lamp_that_is_late_is_a_warning_until_it_is_not(
         clock = LateClock([late_ns] * 70)
         line = RecordingLine(lamp_scene, 27, clock)
         line.drive(high=True)
+        clock.may_begin.set()
         assert clock.is_over.wait(5.0)
         assert ("the lamp is switched late" in line.warning) == is_warned
         line.close()
