@@ -99,10 +99,8 @@ def make_clock_reader() -> Callable[[Picture], ClockReading | None]:
     detector = cv2.aruco.ArucoDetector(dictionary, cv2.aruco.DetectorParameters())
     square = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], dtype=np.float64) * TAG_UNITS
     places = np.concatenate([square + corner for corner in TAGS.values()]) * _PX
-    left, top = CELLS_AT
-    numbers = np.arange(CELLS)
-    cells_x = left + (numbers % CELLS_PER_ROW + 0.5) * CELL_UNITS
-    cells_y = top + (numbers // CELLS_PER_ROW + 0.5) * CELL_UNITS
+    grid = np.column_stack(np.divmod(np.arange(CELLS), CELLS_PER_ROW))[:, ::-1]
+    cells_xy = (grid + 0.5) * CELL_UNITS + np.array(CELLS_AT)
     middles = np.array(list(TAGS.values())) + TAG_UNITS / 2
     ring = np.array([(x, y) for x in range(-4, 5) for y in range(-4, 5) if max(abs(x), abs(y)) > 3])
     reach = TAG_UNITS / 2
@@ -125,7 +123,6 @@ def make_clock_reader() -> Callable[[Picture], ClockReading | None]:
             np.linalg.lstsq(design, np.median(_sample(upright, xy), axis=1), rcond=None)[0]
             for xy in (black_xy, white_xy)
         ]
-        cells_xy = np.column_stack([cells_x, cells_y])
         black, white = (np.column_stack([np.ones(CELLS), cells_xy]) @ plane for plane in planes)
         if np.min(white - black) < _CONTRAST_MIN:
             return None

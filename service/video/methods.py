@@ -193,17 +193,15 @@ def _check_overlap(video: Video, alignment: Alignment, time: SessionTime) -> Non
     """
     ends_s = np.array([0.0, video.film.duration_s])
     begin_ns, end_ns = (alignment.t_ns + alignment.to_session_ns(ends_s).astype(np.int64)).tolist()
-    for apart_ns, what in (
-        (time.begin_t_ns - end_ns, "ends {:.1f} s before the session"),
-        (begin_ns - time.end_t_ns, "begins {:.1f} s after the session"),
-    ):
-        if apart_ns > 0:
-            raise FileFormatError(
-                f"by {alignment.method} the film {what.format(1e-9 * apart_ns)}",
-                where=video.name,
-                expected="a film of this session",
-                remedy="Add it to the session that was recorded meanwhile",
-            )
+    early_s, late_s = 1e-9 * (time.begin_t_ns - end_ns), 1e-9 * (begin_ns - time.end_t_ns)
+    if early_s > 0 or late_s > 0:
+        where = f"ends {early_s:.1f} s before" if early_s > 0 else f"begins {late_s:.1f} s after"
+        raise FileFormatError(
+            f"by {alignment.method} the film {where} the session",
+            where=video.name,
+            expected="a film of this session",
+            remedy="Add it to the session that was recorded meanwhile",
+        )
 
 
 def _pair_by_light(film: _Film, time: SessionTime, options: AlignmentOptions) -> _Pairs:
