@@ -792,6 +792,7 @@ type Video = {
   suffix: string;
   size_bytes: number;
   sha256: string;
+  times_sha256: string;
   added_t_ns: number;
   film: FilmInfo;
   alignment?: Alignment | null;
