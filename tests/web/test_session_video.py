@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
-from studies.reproduce.leg_film import Camera, write_film
 from tests.service.recording import Recording
 from tests.service.running import Running
 from tests.waiting import until
