@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser
 
+from storage.sessions.videos import Alignment
 from tests.service.running import Running
 
 pytestmark = pytest.mark.real_time
@@ -420,3 +421,59 @@ def test_the_shortest_round_trip_tells_the_servers_time_until_it_is_too_old(ask:
     assert ahead_ms == pytest.approx((5095.5, 5000.0, 5000.0, 4997.5, 37996.5))
     assert bound_ms == pytest.approx((5.0, 2.0, 2.1006, 3.0, 4.0))
     assert stated == [1, 3, 63, 63, 63]
+
+
+def test_a_films_time_and_the_sessions_are_those_of_the_server(ask: Ask) -> None:
+    alignment = Alignment(
+        method="contact",
+        film_s=3.0,
+        t_ns=1_764_268_887_000_000_000,
+        drift=30e-6,
+        sigma_ns=2e6,
+        sigma_drift=20e-6,
+        pair_count=4,
+        rejected_count=1,
+    )
+    begin_ns = alignment.t_ns - 5_000_000_000
+    film_s = np.array([0.0, 3.0, 603.0])
+    session_s, back_s, half_s, text = ask(
+        "session/film_time",
+        """({ Line }, [alignment, beginNs, films]) => {
+          const line = new Line(alignment, beginNs);
+          const sessions = films.map((filmS) => line.toSession(filmS));
+          const halves = films.map((filmS) => line.halfWidth(filmS));
+          return [sessions, sessions.map((timeS) => line.toFilm(timeS)), halves, line.text];
+        }""",
+        [alignment.model_dump(), begin_ns, film_s.tolist()],
+    )
+    expected_s = 5.0 + 1e-9 * alignment.to_session_ns(film_s)
+    np.testing.assert_allclose(session_s, expected_s, atol=1e-6)
+    np.testing.assert_allclose(back_s, film_s, atol=1e-9)
+    np.testing.assert_allclose(half_s, 1.96e-9 * alignment.compute_sigma_ns(film_s))
+    assert text.replace("\xa0", " ") == (
+        "Aligned by contact: the film begins at 1.9999 s \u00b1 3.9 ms (95 %), "
+        "drift 30 \u00b1 39 ppm, from 4 pairs of instants, 1 left out: they contradict the others."
+    )
+
+
+def test_a_picture_is_the_nearest_one_and_a_pair_is_as_sure_as_a_person(ask: Ask) -> None:
+    nearest, pairs, texts = ask(
+        "session/film_time",
+        """({ pictureAt, pairOf, halfWidthText }) => {
+          const times = [0, 0.02, 0.04, 0.1]; // two pictures are dropped
+          const at = [-1, 0.009, 0.011, 0.069, 0.071, 9];
+          return [
+            at.map((filmS) => pictureAt(times, filmS)),
+            ["hand", "contact"].map((method) => pairOf(method, times, 2, 1.5, 1e18, 0.012)),
+            [1.2e-3, 45.4e-3, 1.26, 5e-5].map(halfWidthText),
+          ];
+        }""",
+    )
+    assert nearest == [0, 0, 1, 2, 3, 3]
+    by_hand, by_contact = pairs
+    assert (by_hand["film_s"], by_contact["film_s"]) == pytest.approx((0.04, 0.03))
+    assert by_hand["t_ns"] == by_contact["t_ns"] == 1_000_000_001_500_000_000
+    assert by_hand["sigma_ns"] == pytest.approx(1e9 * np.hypot(0.04, 0.012) / 12**0.5)
+    assert [text.replace("\xa0", " ").removesuffix(" (95 %)") for text in texts] == [
+        *("\u00b1 1.2 ms", "\u00b1 45 ms", "\u00b1 1.3 s", "\u00b1 0.050 ms"),
+    ]

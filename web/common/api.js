@@ -124,7 +124,7 @@ export const removeMarker = (session, marker, said) =>
   call("DELETE", `/sessions/${id(session)}/markers/${id(marker)}`, { said });
 /** @type {(session: string) => Promise<VideosView>} */
 export const listVideos = (session) => call("GET", `/sessions/${id(session)}/videos`);
-/** Return the address to upload a film to. @param {string} session @param {string} name @param {number | null} captureRateHz */
+/** Return the address to upload a film to. @param {string} session @param {string} name @param {string} captureRateHz */
 export const videosAddress = (session, name, captureRateHz) =>
   `${PREFIX}/sessions/${id(session)}/videos?${encoded({ name, ...(captureRateHz && { capture_rate_hz: captureRateHz }) })}`;
 const ofVideo = (session, video, part = "") => `/sessions/${id(session)}/videos/${id(video)}${part}`;

@@ -15,7 +15,8 @@ export class Film {
     this.element = element;
     this.onShown = onShown;
     this.close();
-    element.addEventListener("seeked", () => this.arrive());
+    element.addEventListener("seeked", () => { if (!element.seeking) this.arrive(); }); // else another one was begun
+    element.addEventListener("ended", () => this.show(this.times.length - 1));
     element.addEventListener("loadedmetadata", () => {
       if (!element.videoWidth) onBroken(); // sound alone
       else this.waiting = setTimeout(() => this.begin(0), FIRST_MS);
@@ -77,9 +78,10 @@ export class Film {
 
   /** Show a picture; while one is sought, the latest wins. */
   show(index) {
+    const isMoving = !this.element.paused; // and a picture further than was noted
     this.element.pause();
     this.wanted = Math.min(this.times.length - 1, Math.max(0, index));
-    if (this.startS !== null && this.seeking === null && this.index !== this.wanted) this.seek();
+    if (this.startS !== null && this.seeking === null && (isMoving || this.index !== this.wanted)) this.seek();
   }
 
   /** Seek the middle of a picture's interval: stamps are rounded. */

@@ -34,7 +34,7 @@ export class Videos {
     choose();
     send.addEventListener("click", () => quietly(async () => {
       const rate = byId("capture-rate", HTMLInputElement);
-      if (await this.add(file.files[0], rate.value ? Number(rate.value) : null)) file.value = rate.value = "";
+      if (await this.add(file.files[0], rate.value.trim())) file.value = rate.value = "";
       choose();
     }));
     const box = byId("video-upload");
@@ -80,7 +80,7 @@ export class Videos {
     await this.show(this.items.filter(({ id }) => id !== video.id));
   }
 
-  /** Upload a file; resolve to false if it was aborted. @param {File} file @param {number | null} captureRateHz null: as the file says */
+  /** Upload a file; resolve to false if it was aborted. @param {File} file @param {string} captureRateHz "": as the file says */
   async add(file, captureRateHz) {
     this.stopping = new AbortController();
     const box = byId("upload");
