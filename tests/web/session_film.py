@@ -43,7 +43,8 @@ def numbered(number: int) -> Picture:
 def make_film(path: Path, codec: str) -> Path:
     camera = Camera(rate_hz=RATE_HZ, codec=codec, width=320, height=180)
     pictures = [numbered(number) for number in range(PICTURES)]
-    return write_film(path, camera, pictures, np.arange(PICTURES) / RATE_HZ)
+    times_s = [number / RATE_HZ for number in range(PICTURES)]
+    return write_film(path, camera, pictures, times_s)
 
 
 def added(

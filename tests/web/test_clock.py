@@ -36,7 +36,8 @@ def test_a_picture_of_the_page_has_the_servers_time(
     shot = page.screenshot()
     end_ns = time.time_ns()
     picture = cv2.imdecode(np.frombuffer(shot, np.uint8), cv2.IMREAD_GRAYSCALE)
-    reading = make_clock_reader()(picture)
+    assert picture is not None
+    reading = make_clock_reader()(picture.astype(np.uint8))
     assert reading is not None
     begin_n, end_n = (t_ns // TICK_NS for t_ns in (begin_ns, end_ns))
     slack = 1 + reading.bound_ms * 1_000_000 // TICK_NS
