@@ -16,7 +16,7 @@ type AlignVideo = {
 };
 
 type Alignment = {
-  method: "light" | "clock page" | "contact" | "hand";
+  method: "light" | "clock" | "contact" | "hand";
   film_s: number;
   t_ns: number;
   drift: number;

@@ -241,7 +241,7 @@ class SyncSection(SceneSection):
     debounce_us: Annotated[int, Field(ge=0, le=1_000_000)] = 0
     """Time for which a level has to last, us. The kernel then stamps the edge that much later."""
     output_line: GpioLineNumber | None = None
-    """Line that says that a session is recorded; absent: not wired."""
+    """Line that is high, or blinks the code, while a session is recorded; absent: not wired."""
     output: Literal["recording", "code"] = "recording"
     """Signal meanwhile: high, or the code of a lamp that films show (`devices.lamp_code`)."""
 

@@ -15,12 +15,7 @@ from service.cli.options import SECONDS_MAX, echo, print_json, remark, show_prog
 if TYPE_CHECKING:
     from storage.sessions.videos import AlignmentMethod, Video
 
-_METHODS: dict[str, AlignmentMethod] = {
-    "light": "light",
-    "clock": "clock page",
-    "contact": "contact",
-    "hand": "hand",
-}
+_METHODS: tuple[AlignmentMethod, ...] = ("light", "clock", "contact", "hand")
 _NEEDED_BY = {"picture": "contact", "pair": "hand"}
 _DRIFT_KNOWN = 0.9
 """Greatest uncertainty of a drift, of that before any measurement, that says something."""
@@ -87,7 +82,7 @@ def align_and_report(
     from service.video.methods import AlignmentOptions, align_video
     from storage.sessions.videos import find_video_folder, read_video
 
-    method = _METHODS.get(arguments.by or "")
+    method = next((each for each in _METHODS if each == arguments.by), None)
     if method is None:
         raise UsageError(f"--by {arguments.by or 'is missing'}", expected=", ".join(_METHODS))
     for name, by in _NEEDED_BY.items():

@@ -1,8 +1,7 @@
 """Instants of touchdown in a film, from the height of the foot's lower marker.
 
 In flight the marker moves on a parabola. On touchdown its fall ends: at once on a plate, within
-some milliseconds on soft ground. So around each end of a fall
-the height is fitted by
+some milliseconds on soft ground. So around each end of a fall the height is fitted by
 
     parabola + A (t' - s (1 - exp(-t' / s))) + B t'^2,   t' = max(t - touchdown, 0)
 

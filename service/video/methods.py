@@ -305,7 +305,7 @@ def _pair_by_hand(film: _Film, time: SessionTime, options: AlignmentOptions) -> 
 
 _METHODS: dict[AlignmentMethod, Callable[[_Film, SessionTime, AlignmentOptions], _Pairs]] = {
     "light": _pair_by_light,
-    "clock page": _pair_by_clock_page,
+    "clock": _pair_by_clock_page,
     "contact": _pair_by_contact,
     "hand": _pair_by_hand,
 }

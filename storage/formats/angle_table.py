@@ -141,6 +141,9 @@ def _parse(content: bytes, *, is_csv: bool) -> pa.Table:
     else:
         table = pq.read_table(source)
     names = [name for name in _TYPES if name in table.column_names]
+    twice = [name for name in names if table.column_names.count(name) > 1]
+    if twice:
+        raise FileFormatError(f"column {twice[0]} is there twice", expected="each column once")
     missing = {"angle_rad", "sigma_rad"} - set(names)
     if missing or not {"film_s", "t_ns"} & set(names):
         raise FileFormatError(

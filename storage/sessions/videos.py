@@ -57,7 +57,7 @@ _VIDEO_ID = "[0-9a-f]{12}"
 _FOLDER = re.compile(f"video-({_VIDEO_ID})")
 
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-AlignmentMethod = Literal["light", "clock page", "contact", "hand"]
+AlignmentMethod = Literal["light", "clock", "contact", "hand"]
 
 
 class FilmInfo(StrictModel):
@@ -79,7 +79,7 @@ class FilmInfo(StrictModel):
     is_variable: bool
     """True if intervals differ: a variable rate, or dropped pictures."""
     capture_rate_hz: float | None
-    """Rate at which it was taken, if it plays at another one; stamps are shortened by it."""
+    """Rate of taking, if the file plays at another rate: times are scaled to it."""
 
 
 class Alignment(StrictModel):
@@ -151,7 +151,8 @@ def find_video_folders(session_folder: Path) -> dict[str, Path]:
         raise StorageError(
             f"cannot be read: {error.strerror}", where=str(session_folder), errno=error.errno
         ) from error
-    return {found[1]: session_folder / name for name in names if (found := _FOLDER.fullmatch(name))}
+    found = ((_FOLDER.fullmatch(name), session_folder / name) for name in names)
+    return {match[1]: path for match, path in found if match and not path.is_symlink()}
 
 
 def find_video_folder(session_folder: Path, video_id: str) -> Path:

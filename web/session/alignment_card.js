@@ -20,7 +20,7 @@ export class AlignmentCard {
     this.shown = null; // id of the video that they are of
     const buttons = {
       "pair-hand": () => this.add("hand"), "pair-contact": () => this.add("contact"), "align-pairs": () => this.change((replace) => this.send(replace)),
-      "align-light": () => this.find("light"), "align-clock": () => this.find("clock_page"),
+      "align-light": () => this.find("light"), "align-clock": () => this.find("clock"),
       "align-undo": () => this.change(() => api.removeAlignment(this.page.session.id, this.card.video.id)),
     };
     for (const [name, act] of Object.entries(buttons)) byId(name).addEventListener("click", act);
@@ -68,7 +68,7 @@ export class AlignmentCard {
     return api.setAlignment(this.page.session.id, this.card.video.id, { method, pairs }, replace);
   }
 
-  /** Let the server look for instants in the pictures. @param {"light" | "clock_page"} method */
+  /** Let the server look for instants in the pictures. @param {"light" | "clock"} method */
   find(method) {
     const startedMs = performance.now();
     const say = () => setText(byId("align-wait"), `The server looks through the film: ${Math.round((performance.now() - startedMs) / 1e3)} s`);

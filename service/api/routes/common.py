@@ -55,7 +55,7 @@ def require_file(path: Path) -> Path:
     Raises:
         UnknownError: it does not exist.
     """
-    if not path.is_file():
+    if path.is_symlink() or not path.is_file():  # a link may name any file of the machine
         raise UnknownError(f"the file {path.name} is missing", where=str(path))
     return path
 

@@ -183,7 +183,7 @@ def _parse_numbers(rows: Sequence[Row], columns: Sequence[int], width: int) -> F
     """Return the numbers of columns, (rows, columns); empty cells are NaN."""
     numbers = np.empty((len(rows), len(columns)))
     for k, (line, cells) in enumerate(rows):
-        if len(cells) > width:
+        if any(cells[width:]):  # some programs end a line by a separator
             raise FileFormatError(f"line {line} has {len(cells)} cells", expected=f"{width}")
         for i, column in enumerate(columns):
             cell = cells[column] if column < len(cells) else ""

@@ -249,7 +249,7 @@ def test_what_is_not_in_the_film_is_no_alignment(session: Recording) -> None:
     http, video = session.running.http, content_of(upload(session), 201)
     url = f"{session.url}/videos/{video['id']}/alignment"
     assert_refused(http.post(url, params={"method": "light"}), 422, "no lamp in this session")
-    assert_refused(http.post(url, params={"method": "clock_page"}), 422, "shows the clock page")
+    assert_refused(http.post(url, params={"method": "clock"}), 422, "shows the clock page")
     assert http.post(url, params={"method": "hand"}).status_code == 422
     assert http.post(url, params={"method": "light", "near_s": "nan"}).status_code == 422
     missing = f"{session.url}/videos/{'0' * 12}/alignment"

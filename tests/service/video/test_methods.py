@@ -135,7 +135,7 @@ def test_a_film_of_the_clock_page_is_aligned_by_the_servers_time(session: Path) 
     pictures += [film_screen(screen, k * 1e9 / 30, 20e6, generator) for k in range(10, 60)]
     pictures += [np.full((400, 640), 120, np.uint8)] * 120
     added = add_film(session, camera, pictures)
-    video = align_video(session, added.id, "clock page")
+    video = align_video(session, added.id, "clock")
     off_ns, sigma_ns = measure_error_ns(video, 1.0, offset_s + 1.0 - 0.01)
     assert abs(off_ns) < 3.0 * sigma_ns
     assert 5e6 < sigma_ns < 20e6
@@ -192,7 +192,7 @@ def test_a_film_of_nothing_or_of_another_session_is_refused_with_a_reason(tmp_pa
     with pytest.raises(FileFormatError, match="no part of the picture blinks"):
         align_video(session, video_id, "light")
     with pytest.raises(FileFormatError, match="no picture shows the clock page"):
-        align_video(session, video_id, "clock page")
+        align_video(session, video_id, "clock")
     late = AlignmentOptions(pictures=(0,), instants_s=(21.0,))
     with pytest.raises(FileFormatError, match=r"begins 1\.0 s after the session"):
         align_video(session, video_id, "hand", late)
@@ -204,4 +204,4 @@ def test_a_film_of_nothing_or_of_another_session_is_refused_with_a_reason(tmp_pa
     with pytest.raises(UsageError, match="no lamp"):
         align_video(alone, video_id, "light")
     with pytest.raises(StateError, match="not compared with a server"):
-        align_video(alone, video_id, "clock page")
+        align_video(alone, video_id, "clock")

@@ -267,7 +267,7 @@ async def find_alignment(
     session_id: str,
     video_id: str,
     method: Annotated[
-        Literal["light", "clock_page"],
+        Literal["light", "clock"],
         Query(description="The node's lamp, or the page /clock, is in the picture."),
     ],
     server: ServerState,
@@ -287,7 +287,7 @@ async def find_alignment(
     find = partial(
         methods.align_video,
         *(_find_folder(session_id, server), video_id),
-        "light" if method == "light" else "clock page",
+        method,
         AlignmentOptions(near_s=near_s, replaces=replace),
     )
     return await to_thread.run_sync(partial(run_with_usage_errors, find), limiter=_DECODING)
