@@ -107,6 +107,7 @@ def test_a_film_is_added_moves_with_the_cursor_and_gives_stills(
     film = make_film(tmp_path / "walk.webm", "libvpx-vp9")
     firefox.open(f"{scripted.url}/sessions/{session.id}#token={SHARED_TOKEN}")
     firefox.wait("document.querySelector('#plots')?.dataset.settled === 'true'")
+    firefox.wait("!document.getElementById('videos-card').hidden")
     firefox.find("#video-file").send_keys(str(film))
     firefox.click("#video-send")
     firefox.wait_for_text("#videos-list", "320 \u00d7 180, 25.0 pictures/s, 2.4 s, vp9")
