@@ -267,7 +267,11 @@ def test_a_film_that_the_browser_cannot_play_is_said(
     expect(page.locator("#film-tools")).to_be_hidden()
     expect(page.locator("#videos-list li")).to_have_count(1)
     page.click("#alignment summary")
-    expect(page.locator("#align-clock")).to_be_enabled()
+    page.click("#pair-hand")
+    expect(page.locator("#notices")).to_contain_text("does not show the film")
+    page.click("#align-clock")
+    expect(page.locator("#notices")).to_contain_text("Not done: ")
+    expect(page.locator("#notices")).not_to_contain_text("does not show the film")
     assert complaints_at(page, DESK, PHONE) == []
 
 

@@ -5,7 +5,7 @@ import { parseResponse, TIMEOUT_S, Refusal, sendRequest } from "./request.js";
 
 export { Refusal };
 
-const PREFIX = "/api/v1";
+export const PREFIX = "/api/v1";
 const JSON_TYPE = "application/json";
 
 /**
@@ -34,9 +34,9 @@ export function resultOf(response, text) {
   throw new Refusal(String(answer?.detail || answer?.title || `The server refused (${response.status}).`), response.status);
 }
 
-const id = encodeURIComponent;
+export const id = encodeURIComponent;
 /** @param {Record<string, string | number>} query */
-const encoded = (query) => new URLSearchParams(Object.entries(query).map(([name, value]) => [name, String(value)]));
+export const encoded = (query) => new URLSearchParams(Object.entries(query).map(([name, value]) => [name, String(value)]));
 export const recent = (node, seconds, before, tiles) =>
   call("GET", `/nodes/${id(node)}/history?seconds=${seconds}${before === undefined ? "" : `&before_seq=${before}`}${tiles ? `&tiles=${tiles}` : ""}`);
 export const tareNow = (node) => call("POST", `/nodes/${id(node)}/tare`, { body: {} });
@@ -122,23 +122,6 @@ export const changeMarker = (session, marker, changes, said) =>
   call("PATCH", `/sessions/${id(session)}/markers/${id(marker)}`, { body: changes, said });
 export const removeMarker = (session, marker, said) =>
   call("DELETE", `/sessions/${id(session)}/markers/${id(marker)}`, { said });
-/** @type {(session: string) => Promise<VideosView>} */
-export const listVideos = (session) => call("GET", `/sessions/${id(session)}/videos`);
-/** Return the address to upload a film to. @param {string} session @param {string} name @param {string} captureRateHz */
-export const videosAddress = (session, name, captureRateHz) =>
-  `${PREFIX}/sessions/${id(session)}/videos?${encoded({ name, ...(captureRateHz && { capture_rate_hz: captureRateHz }) })}`;
-const ofVideo = (session, video, part = "") => `/sessions/${id(session)}/videos/${id(video)}${part}`;
-export const removeVideo = (session, video) => call("DELETE", ofVideo(session, video));
-export const filmAddress = (session, video) => PREFIX + ofVideo(session, video, "/film");
-/** @type {(session: string, video: string) => Promise<TimesView>} */
-export const filmTimes = (session, video) => call("GET", ofVideo(session, video, "/times"), { timeoutS: 120 });
-/** `replace`: also an alignment that it contradicts. @type {(session: string, video: string, pairs: object, replace: boolean) => Promise<Video>} */
-export const setAlignment = (session, video, pairs, replace) => call("PUT", ofVideo(session, video, `/alignment?replace=${replace}`), { body: pairs });
-/** Let the server find it in the pictures: slow. @type {(session: string, video: string, method: string, replace: boolean) => Promise<Video>} */
-export const findAlignment = (session, video, method, replace) =>
-  call("POST", ofVideo(session, video, `/alignment?${encoded({ method, replace: String(replace) })}`), { timeoutS: 3600 });
-/** @type {(session: string, video: string) => Promise<Video>} */
-export const removeAlignment = (session, video) => call("DELETE", ofVideo(session, video, "/alignment"));
 /** @type {(session: string) => Promise<SessionView>} */
 export const sealSession = (session) => call("POST", `/sessions/${id(session)}/abandon-missing`);
 export const deleteSession = (session) => call("DELETE", `/sessions/${id(session)}`);

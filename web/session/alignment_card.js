@@ -1,11 +1,11 @@
 // Alignment of a film: pairs of a picture and an instant of the session, or found by the server in its pictures.
 
-import * as api from "../common/api.js";
 import { ask } from "../common/dialogs.js";
 import { notice, quietly } from "../common/notices.js";
 import { byId, el, setText } from "../common/text.js";
 import { pairOf } from "./film_time.js";
 import { timeText } from "./overlay.js";
+import * as videoApi from "./video_api.js";
 
 const NOT_ALIGNED = "Not aligned: where this film lies in the session is not known. Align it here: by light or clock page if it shows one, else by hand.";
 
@@ -21,7 +21,7 @@ export class AlignmentCard {
     const buttons = {
       "pair-hand": () => this.add("hand"), "pair-contact": () => this.add("contact"), "align-pairs": () => this.change((replace) => this.send(replace)),
       "align-light": () => this.find("light"), "align-clock": () => this.find("clock"),
-      "align-undo": () => this.change(() => api.removeAlignment(this.page.session.id, this.card.video.id)),
+      "align-undo": () => this.change(() => videoApi.removeAlignment(this.page.session.id, this.card.video.id)),
     };
     for (const [name, act] of Object.entries(buttons)) byId(name).addEventListener("click", act);
     byId("alignment", HTMLDetailsElement).addEventListener("toggle", () => this.card.setApart(byId("alignment", HTMLDetailsElement).open));
@@ -43,6 +43,7 @@ export class AlignmentCard {
     const { film } = this.card;
     const aboutS = cursorS ?? middle;
     const contacts = plots.stances.filter((stance) => stance.begun).map((stance) => stance.from);
+    if (!film.times.length) return notice("this browser does not show the film.", { bad: true });
     if (method === "hand" && cursorS === null) return notice("put the cursor on the instant first.", { bad: true });
     if (method === "contact" && !contacts.length) return notice("the session has no contact that begins in it.", { bad: true });
     const timeS = method === "hand" ? cursorS : contacts.reduce((best, one) => (Math.abs(one - aboutS) < Math.abs(best - aboutS) ? one : best));
@@ -65,7 +66,7 @@ export class AlignmentCard {
   send(replace) {
     const pairs = this.pairs.map(({ film_s, t_ns, sigma_ns }) => ({ film_s, t_ns, sigma_ns }));
     const method = this.pairs.every((pair) => pair.method === "contact") ? "contact" : "hand";
-    return api.setAlignment(this.page.session.id, this.card.video.id, { method, pairs }, replace);
+    return videoApi.setAlignment(this.page.session.id, this.card.video.id, { method, pairs }, replace);
   }
 
   /** Let the server look for instants in the pictures. @param {"light" | "clock"} method */
@@ -74,7 +75,7 @@ export class AlignmentCard {
     const say = () => setText(byId("align-wait"), `The server looks through the film: ${Math.round((performance.now() - startedMs) / 1e3)} s`);
     say();
     const timer = setInterval(say, 1000);
-    this.change((replace) => api.findAlignment(this.page.session.id, this.card.video.id, method, replace)).finally(() => {
+    this.change((replace) => videoApi.findAlignment(this.page.session.id, this.card.video.id, method, replace)).finally(() => {
       clearInterval(timer);
       setText(byId("align-wait"), "");
     });

@@ -1,10 +1,10 @@
 // Film beside the plots, in step with their cursor both ways if it is aligned.
 
-import * as api from "../common/api.js";
 import { byId, setData, setText } from "../common/text.js";
 import { Film } from "./film.js";
 import { halfWidthText, intervalOf, Line, pictureAt } from "./film_time.js";
 import { timeText } from "./overlay.js";
+import * as videoApi from "./video_api.js";
 
 const INSTANT_S = 1e-4; // last digit of a picture's instant
 
@@ -43,9 +43,9 @@ export class FilmCard {
       this.draw();
       setText(byId("film-at"), "The server reads the times of its pictures …");
       const { id } = this.page.session;
-      const times = video && (await api.filmTimes(id, video.id)).film_s;
+      const times = video && (await videoApi.filmTimes(id, video.id)).film_s;
       if (this.video?.id !== video?.id) return; // another one was asked for meanwhile
-      if (video) this.film.open(api.filmAddress(id, video.id), times, video.film.rate_hz / video.film.play_rate_hz || 1);
+      if (video) this.film.open(videoApi.filmAddress(id, video.id), times, video.film.rate_hz / video.film.play_rate_hz || 1);
     }
     this.update();
   }

@@ -20,6 +20,7 @@ import { Readout, drawSummary } from "./readout.js";
 import { Replay } from "./replay.js";
 import { Stances, stanceAt, withSeconds } from "./stances.js";
 import * as views from "./view.js";
+import * as videoApi from "./video_api.js";
 
 const KEY_ZOOM = 1.5;
 const SETTLED_MS = 250;
@@ -140,7 +141,7 @@ export class Plotted {
 
   /** Show the session's videos; their modules load with the first one, or for an upload. */
   async showVideos() {
-    const found = await unlessRefused(api.listVideos(this.session.id));
+    const found = await unlessRefused(videoApi.listVideos(this.session.id));
     const card = byId("videos-card");
     card.hidden = !found || (!found.items.length && !found.problems.length && !isOperator());
     if (card.hidden) return;

@@ -62,8 +62,7 @@ export class Strip {
     const scale = Math.min(1, STILL.width / width, STILL.height / height);
     const picture = el("canvas", { width: Math.round(width * scale), height: Math.round(height * scale) });
     picture.getContext("2d").drawImage(film.element, 0, 0, picture.width, picture.height);
-    this.stills.push({ timeS, picture, text: halfWidthText(line.halfWidth(filmS)) });
-    this.stills.sort((a, b) => a.timeS - b.timeS);
+    this.stills = [...this.stills, { timeS, picture, text: halfWidthText(line.halfWidth(filmS)) }].sort((a, b) => a.timeS - b.timeS);
     return this.draw();
   }
 

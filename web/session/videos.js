@@ -1,6 +1,5 @@
 // Videos of a session: list, upload, removal; the chosen one is shown beside the plots.
 
-import * as api from "../common/api.js";
 import { ask } from "../common/dialogs.js";
 import { notice, quietly } from "../common/notices.js";
 import { byId, bytes, duration, el, number, perSecond, setText } from "../common/text.js";
@@ -8,6 +7,7 @@ import { AlignmentCard } from "./alignment_card.js";
 import { FilmCard } from "./film_card.js";
 import { Strip } from "./strip.js";
 import { upload } from "./upload.js";
+import * as videoApi from "./video_api.js";
 
 /** Return what a film is, such as "1920 × 1080, 50.0 pictures/s, 12.4 s, h264, 34.0 MB". @param {Video} video */
 function factsOf({ film, size_bytes: size }) {
@@ -69,13 +69,13 @@ export class Videos {
     show.addEventListener("click", () => quietly(() => this.show(this.items, video.id)));
     const remove = el("button", { type: "button", cls: "small requires-operator", text: "Remove …", "aria-label": `Remove ${video.name}` });
     remove.addEventListener("click", () => quietly(() => this.remove(video)));
-    const download = el("a", { href: api.filmAddress(this.page.session.id, video.id), download: "", text: "Download", "aria-label": `Download ${video.name}` });
+    const download = el("a", { href: videoApi.filmAddress(this.page.session.id, video.id), download: "", text: "Download", "aria-label": `Download ${video.name}` });
     return el("li", {}, show, el("span", {}, el("strong", { text: video.name }), ` ${factsOf(video)}, `, el("em", { text: state })), download, remove);
   }
 
   async remove(video) {
     if (!await ask("Remove video", `“${video.name}” and its alignment are deleted from the server. The session's frames stay.`, "Remove")) return;
-    await api.removeVideo(this.page.session.id, video.id);
+    await videoApi.removeVideo(this.page.session.id, video.id);
     notice(`Removed video “${video.name}”.`);
     await this.show(this.items.filter(({ id }) => id !== video.id));
   }
@@ -92,7 +92,7 @@ export class Videos {
     box.hidden = false;
     say(0);
     try {
-      const video = await upload(api.videosAddress(this.page.session.id, file.name, captureRateHz), file, say, this.stopping.signal);
+      const video = await upload(videoApi.videosAddress(this.page.session.id, file.name, captureRateHz), file, say, this.stopping.signal);
       await this.put(video);
       notice(`Added video “${video.name}”.`);
       return true;
