@@ -1,20 +1,20 @@
 """Film in a file: its time stamps and pictures, read by PyAV.
 
 Times are those of the container: presentation stamps, after edit lists, in rising order, whatever
-the order in the file (B-frames). A picture's time is the begin of its display; cameras write the
-end or the middle of its exposure there, which the alignment cannot tell apart from its offset.
+the order in the file (B-frames). A stamp is the begin of display; the exposure may be earlier by a
+constant, which the offset absorbs for light and contact, but not for the clock page.
 
 A high-speed film that plays slowly states its capture rate in a tag of some cameras, else the user
-does: stamps are then shortened by play rate / capture rate.
+does: times are then scaled by play rate / capture rate.
 """
 
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,16 +35,27 @@ Picture = npt.NDArray[np.uint8]
 _CAPTURE_RATE_TAGS = ("com.android.capture.fps",)
 """Tags with the rate of a film that plays slower than it was taken."""
 _CAPTURE_RATES_HZ = (1.0, 1e6)
+_GAP_BEYOND = 0.5
+"""Intervals that differ by more than this part of their median do not count for the rate."""
 _VARIABLE_BEYOND = 0.2
 """A film's rate is variable if an interval differs by more than this part of their median."""
 _PIXELS_MAX = 8192 * 8192
+_PICTURES_MAX = 5_000_000
+_THREADS = 4
+_OPEN_OPTIONS = {
+    "format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi",
+    "protocol_whitelist": "none",
+}
+"""Options that keep the library from playlists and descriptions that name files and addresses."""
 _DURATION = re.compile(r"(\d{1,4}):(\d\d):(\d\d\.\d+)")
 _MISSING_INTERVALS_MAX = 5.0
 """Longest part that may lack at the end, in the film's longest interval: it is shown longer."""
 
 
 def read_film(path: Path, capture_rate_hz: float | None = None) -> tuple[FilmInfo, Floats]:
-    """Read what a film is, and the time of each picture in s from the first; nothing is decoded.
+    """Read what a film is, and the time of each picture in s from the first.
+
+    Of the pictures the first one is decoded.
 
     Args:
         path: the film.
@@ -55,15 +66,15 @@ def read_film(path: Path, capture_rate_hz: float | None = None) -> tuple[FilmInf
         UsageError: the rate is impossible.
     """
     with _open_container(path) as (container, stream):
-        times_s = _read_stamps(container, stream, path)
+        stamps = _read_stamps(container, stream, path)
+        times_s = np.asarray((stamps - stamps[0]) * float(stream.time_base or 1))
         _check_length(container, stream, times_s, path)
         tagged = _find_capture_rate_hz(container, stream)
-        rotation_deg = _read_rotation_deg(path)
+        rotation_deg = _decode_rotation_deg(path)
         sideways = rotation_deg % 180 != 0
         width, height = stream.codec_context.width, stream.codec_context.height
         codec = stream.codec_context.name
-    intervals_s = np.diff(times_s)
-    play_rate_hz = 1.0 / float(np.median(intervals_s)) if len(intervals_s) else 0.0
+    play_rate_hz = _compute_rate_hz(times_s)
     captured_hz = capture_rate_hz or tagged
     if captured_hz is not None:
         low, high = _CAPTURE_RATES_HZ
@@ -74,9 +85,8 @@ def read_film(path: Path, capture_rate_hz: float | None = None) -> tuple[FilmInf
                 expected=f"a rate between {low:g} and {high:g}, and at least two pictures",
             )
         times_s = times_s * (play_rate_hz / captured_hz)
-        intervals_s = np.diff(times_s)
-    rate_hz = 1.0 / float(np.median(intervals_s)) if len(intervals_s) else 0.0
-    uneven = np.abs(intervals_s * rate_hz - 1.0) > _VARIABLE_BEYOND
+    rate_hz = _compute_rate_hz(times_s)
+    uneven = np.abs(np.diff(times_s) * rate_hz - 1.0) > _VARIABLE_BEYOND
     return FilmInfo(
         codec=codec,
         width_px=height if sideways else width,
@@ -89,6 +99,18 @@ def read_film(path: Path, capture_rate_hz: float | None = None) -> tuple[FilmInf
         is_variable=bool(uneven.any()),
         capture_rate_hz=captured_hz,
     ), times_s
+
+
+def _compute_rate_hz(times_s: Floats) -> float:
+    """Compute pictures per second, without gaps; of one picture it is 0.
+
+    It is no median: stamps of Matroska are rounded to milliseconds.
+    """
+    intervals_s = np.diff(times_s)
+    if not len(intervals_s):
+        return 0.0
+    regular_s = intervals_s[np.abs(intervals_s / np.median(intervals_s) - 1.0) < _GAP_BEYOND]
+    return 1.0 / float(regular_s.mean())
 
 
 def iterate_pictures(
@@ -108,7 +130,7 @@ def iterate_pictures(
     import av
 
     with _open_container(path) as (container, stream):
-        stamps = np.sort(_list_packet_stamps(container, stream))
+        stamps = _read_stamps(container, stream, path)
         end = len(stamps) if end is None else min(end, len(stamps))
         if begin >= end:
             return
@@ -137,11 +159,13 @@ def iterate_pictures(
 def _open_container(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     with require_extra("video", "a film"):
         import av
-    # PyAV would open addresses, and playlists that name other files.
     if not path.is_file():
         raise FileFormatError("no such file", where=str(path), expected="a film")
     try:
-        with path.open("rb") as file, av.open(file, "r", metadata_errors="replace") as container:
+        with (
+            path.open("rb") as file,
+            av.open(file, "r", options=_OPEN_OPTIONS, metadata_errors="replace") as container,
+        ):
             if not container.streams.video:
                 raise FileFormatError("the file has no pictures", where=str(path))
             stream = container.streams.video[0]
@@ -150,6 +174,7 @@ def _open_container(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
             if stream.codec_context.width * stream.codec_context.height > _PIXELS_MAX:
                 raise FileFormatError("its pictures are too large", where=str(path))
             stream.thread_type = "AUTO"
+            stream.codec_context.thread_count = min(_THREADS, os.cpu_count() or 1)
             yield container, stream
     except (av.error.FFmpegError, OSError) as error:
         why = getattr(error, "strerror", None) or error
@@ -161,27 +186,42 @@ def _open_container(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
         ) from error
 
 
-def _list_packet_stamps(container: InputContainer, stream: VideoStream) -> npt.NDArray[np.int64]:
-    found = [
-        packet.dts if packet.pts is None else packet.pts  # AVI has no order but that of decoding
-        for packet in container.demux(stream)
-        if not packet.is_discard and packet.size
-    ]
-    return np.array([stamp for stamp in found if stamp is not None], dtype=np.int64)
-
-
-def _read_stamps(container: InputContainer, stream: VideoStream, path: Path) -> Floats:
-    stamps = np.unique(_list_packet_stamps(container, stream))
-    if not len(stamps):
+def _read_stamps(
+    container: InputContainer, stream: VideoStream, path: Path
+) -> npt.NDArray[np.int64]:
+    """Read the different stamps of all pictures, rising, in the stream's time base."""
+    stamps: list[int] = []
+    packet_count = 0
+    for packet in container.demux(stream):
+        if not packet.size:
+            continue
+        packet_count += 1
+        if packet_count > _PICTURES_MAX:
+            raise FileFormatError(
+                "the film is too long", where=str(path), expected=f"{_PICTURES_MAX} pictures"
+            )
+        # AVI has no order but that of decoding.
+        stamp = packet.dts if packet.pts is None else packet.pts
+        if stamp is not None and not packet.is_discard:
+            stamps.append(stamp)
+    if not stamps:
         raise FileFormatError("the film has no picture with a time", where=str(path))
-    base = stream.time_base or Fraction(1, 1)
-    return np.asarray((stamps - stamps[0]) * float(base))
+    if packet_count < stream.frames and "mp4" in container.format.name:
+        raise FileFormatError(
+            f"the film breaks off after {packet_count} of {stream.frames} pictures",
+            where=str(path),
+            remedy="Copy the file from the camera again",
+        )
+    return np.unique(np.array(stamps, dtype=np.int64))
 
 
 def _check_length(
     container: InputContainer, stream: VideoStream, times_s: Floats, path: Path
 ) -> None:
-    """Check that a film is as long as its header says: formats without a table break off unseen."""
+    """Check that a film is as long as its header says, as a cut one opens, too.
+
+    Matroska and AVI have no index of all pictures.
+    """
     stated_s = 0.0
     if found := _DURATION.fullmatch(stream.metadata.get("DURATION", "")):  # Matroska, WebM
         stated_s = int(found[1]) * 3600 + int(found[2]) * 60 + float(found[3])
@@ -208,9 +248,9 @@ def _find_capture_rate_hz(container: InputContainer, stream: VideoStream) -> flo
     return None
 
 
-def _read_rotation_deg(path: Path) -> int:
-    """Return the rotation of the first picture: it stands in no place before it is decoded."""
+def _decode_rotation_deg(path: Path) -> int:
+    """Return the rotation of the first picture, which has to be decoded for it."""
     with _open_container(path) as (container, stream):
         for frame in container.decode(stream):
             return round(frame.rotation / 90) * 90 % 360
-    return 0
+    raise FileFormatError("its first picture cannot be decoded", where=str(path))

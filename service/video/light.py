@@ -202,11 +202,8 @@ def _refine(
         offset_ns, sigma_ns = _compute_moments(weight.sum(axis=1), offsets_ns)
         exposure, width = _compute_moments(weight.sum(axis=0), exposures)
         reach_ns = 6.0 * sigma_ns
-        low, high = (
-            max(float(_EXPOSURES[0]), exposure - 4.0 * width),
-            min(1.0, exposure + 4.0 * width),
-        )
-        exposures = np.linspace(low, high, len(_EXPOSURES))
+        around = exposure + 4.0 * width * np.linspace(-1.0, 1.0, len(_EXPOSURES))
+        exposures = np.clip(around, _EXPOSURES[0], 1.0)
     # At the mean instant of all that tells the offset, a drift does not change it.
     shift_ns = max(sigma_ns, interval_ns / _GRID_STEPS)
     change = np.subtract(

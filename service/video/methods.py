@@ -42,6 +42,8 @@ from storage.sessions.videos import (
 
 _NEAR_S = 5.0
 """Largest error of `near_s`."""
+COMMON_OF_TOUCHDOWNS = 0.5
+"""Part of a touchdown's uncertainty that all of a film share: the ground is the same."""
 _LAMP_MARGIN_NS = 3_000_000_000
 """Time around a part in which its lamp's window may have its middle: half a window."""
 
@@ -287,6 +289,7 @@ def _pair_by_contact(film: _Film, time: SessionTime, options: AlignmentOptions) 
         film_s=at_s[rows],
         t_ns=1e9 * contacts.at_s[numbers],
         sigma_ns=1e9 * np.hypot(sigma_s[rows], contacts.sigma_s[numbers]),
+        common_ns=1e9 * COMMON_OF_TOUCHDOWNS * float(np.median(sigma_s[rows])),
     )
 
 

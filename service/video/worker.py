@@ -34,7 +34,7 @@ _MEMORY_BYTES_MAX = 4 << 30
 _SILENT_S_MAX = 60.0
 """Longest time without a line: a film of 4K shows several pictures a second."""
 _READ_BYTES_PER_S_MIN = 10e6
-"""Rate of a slow disk: a film's time stamps are all over its file."""
+"""Rate of a slow disk, in two passes: a film's time stamps are all over its file."""
 _PROGRESS_PICTURES = 50
 _PART_PX = 16
 """Least size of the parts of a picture in which a lamp is looked for."""
@@ -54,8 +54,9 @@ def check_extra_installed() -> None:
         MissingExtraError: a package is not installed.
     """
     with require_extra("video", "a film"):
-        if find_spec("av") is None:  # not imported: that is for the process of its own
-            raise ModuleNotFoundError(name="av")
+        for name in ("av", "cv2"):  # not imported: that is for the process of its own
+            if find_spec(name) is None:
+                raise ModuleNotFoundError(name=name)
 
 
 def describe_film(
@@ -188,7 +189,6 @@ def _read(path: Path, capture_rate_hz: float | None = None) -> dict[str, Any]:
     from service.video.container import iterate_pictures, read_film
 
     film, times_s = read_film(path, capture_rate_hz)
-    next(iterate_pictures(path, is_grey=True))
     last = film.picture_count - 1
     if last not in (index for index, _ in iterate_pictures(path, is_grey=True, begin=last)):
         raise FileFormatError(

@@ -17,7 +17,10 @@ from service.video.alignment import (
     fit_alignment,
     match_contacts,
 )
+from service.video.contact import find_touchdowns
+from service.video.methods import COMMON_OF_TOUCHDOWNS
 from storage.sessions.videos import Alignment
+from tests.service.video.test_contact import SECONDS, draw_marker_height
 
 SESSION_S = 60.0
 
@@ -41,11 +44,16 @@ def draw_steps(
     return touchdowns, contacts, offset_s, drift
 
 
-def align(touchdowns: Instants, contacts: Instants) -> Alignment:
+def align(touchdowns: Instants, contacts: Instants, common: float = 0.0) -> Alignment:
     film, contact = map(np.array, zip(*match_contacts(touchdowns, contacts), strict=True))
     sigma_s = np.hypot(touchdowns.sigma_s[film], contacts.sigma_s[contact])
     return fit_alignment(
-        "contact", touchdowns.at_s[film], 1e9 * contacts.at_s[contact], 1e9 * sigma_s, begin_t_ns=0
+        "contact",
+        touchdowns.at_s[film],
+        1e9 * contacts.at_s[contact],
+        1e9 * sigma_s,
+        begin_t_ns=0,
+        common_ns=common * 1e9 * float(np.median(touchdowns.sigma_s[film])),
     )
 
 
@@ -76,6 +84,35 @@ def test_the_uncertainty_by_contact_is_that_of_many_walks() -> None:
         drifts.append((found.drift - drift) / found.sigma_drift)
     assert 0.90 <= np.mean(np.abs(ratios) < 1.96) <= 0.99
     assert 0.90 <= np.mean(np.abs(drifts) < 1.96) <= 0.99
+
+
+def test_films_of_hops_are_aligned_within_a_picture_as_surely_as_they_say() -> None:
+    generator = np.random.default_rng(12)
+    ratios, off_pictures = [], []
+    for draw in range(120):
+        rate_hz = (30.0, 50.0, 240.0)[draw % 3]
+        film_s, height_px, true_s = draw_marker_height(rate_hz, 0.3, generator)
+        offset_s = generator.uniform(2.0, 20.0)
+        # The session has hops before and after the film, too.
+        others_s = np.cumsum(generator.uniform(0.45, 0.85, (2, 6)), axis=1)
+        hops_s = np.concatenate([true_s[0] - others_s[0][::-1], true_s, true_s[-1] + others_s[1]])
+        sigma_s = 2e-3
+        contacts_s = offset_s + hops_s + generator.normal(0.0, sigma_s, len(hops_s))
+        kept = contacts_s > 0
+        contacts = Instants(contacts_s[kept], np.full(kept.sum(), sigma_s), SESSION_S)
+        at_s, film_sigma_s = np.array(find_touchdowns(film_s, height_px)).T
+        try:
+            touchdowns = Instants(at_s, film_sigma_s, SECONDS)
+            found = align(touchdowns, contacts, COMMON_OF_TOUCHDOWNS)
+        except FileFormatError:  # three hops of sixteen: another match is as likely
+            continue
+        middle_s = np.array([found.film_s])
+        off_ns = found.t_ns - 1e9 * (offset_s + found.film_s)
+        off_pictures.append(off_ns * 1e-9 * rate_hz)
+        ratios.append(off_ns / found.compute_sigma_ns(middle_s)[0])
+    assert len(ratios) > 100
+    assert np.abs(off_pictures).max() < 1.0
+    assert 0.90 <= np.mean(np.abs(ratios) < 1.96) <= 0.99
 
 
 def test_equal_steps_need_a_film_of_all_of_them_or_a_hint() -> None:
