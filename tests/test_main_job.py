@@ -25,7 +25,7 @@ pytestmark = pytest.mark.skipif(
     "FOOTTILE_BIN" not in os.environ, reason="scripts/lowest runs it in an environment of its own"
 )
 
-COMPILE_S = 300.0
+COMPILE_S = 700.0
 """In an environment that is new the first command compiles the models, beside other tests."""
 
 
