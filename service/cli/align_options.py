@@ -117,7 +117,6 @@ def align_and_report(
 def _report(session_folder: Path, video: Video) -> None:
     import numpy as np
 
-    from service.video.alignment import DRIFT_SIGMA
     from service.video.session_time import read_session_time
     from storage.sessions.folder import FRAMES_NAME
 
@@ -135,8 +134,8 @@ def _report(session_folder: Path, video: Video) -> None:
     )
     echo(
         f"drift: {1e6 * alignment.drift:.1f} +- {1.96e6 * alignment.sigma_drift:.1f} ppm (95 %)"
-        if alignment.sigma_drift < _DRIFT_KNOWN * DRIFT_SIGMA
-        else f"drift: not measured, {1.96e6 * DRIFT_SIGMA:.0f} ppm are allowed for"
+        if alignment.sigma_drift < _DRIFT_KNOWN * video.film.drift_sigma
+        else f"drift: not measured, {1.96e6 * video.film.drift_sigma:.0f} ppm are allowed for"
     )
     if alignment.rejected_count:
         remark(f"{alignment.rejected_count} instants contradict the others, and were left out")

@@ -20,12 +20,8 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.errors import FileFormatError
-from storage.sessions.videos import Alignment, AlignmentMethod
+from storage.sessions.videos import DRIFT_SIGMA, Alignment, AlignmentMethod
 
-DRIFT_SIGMA = 50e-6
-"""Standard deviation of a camera's drift before anything is measured."""
-CAPTURE_RATE_SIGMA = 1e-3
-"""Standard deviation of the drift of a film whose capture rate is stated."""
 _OUTLIER_SIGMAS = 4.0
 
 

@@ -18,8 +18,6 @@ from devices.arrays import Floats
 from devices.errors import FileFormatError, StateError, UsageError
 from devices.lamp_code import LAMP_LATE_NS
 from service.video.alignment import (
-    CAPTURE_RATE_SIGMA,
-    DRIFT_SIGMA,
     Instants,
     describe_contradiction,
     fit_alignment,
@@ -107,11 +105,6 @@ class _Film:
         return np.asarray(read_picture_times(self.path.parent)[list(pictures)])
 
     @property
-    def drift_sigma(self) -> float:
-        """Standard deviation of the drift before anything is measured."""
-        return DRIFT_SIGMA if self.video.film.capture_rate_hz is None else CAPTURE_RATE_SIGMA
-
-    @property
     def pick_sigma_s(self) -> float:
         """Standard deviation of a picture that a person chose: one too early or too late."""
         return 1.0 / (max(self.video.film.rate_hz, 1e-3) * math.sqrt(3.0))
@@ -152,7 +145,7 @@ def align_video(
         pairs.sigma_ns,
         begin_t_ns=time.begin_t_ns,
         common_ns=pairs.common_ns,
-        drift_sigma=film.drift_sigma,
+        drift_sigma=film.video.film.drift_sigma,
     )
     return store_alignment(folder, alignment, replaces=options.replaces)
 
@@ -282,7 +275,9 @@ def _pair_by_contact(film: _Film, time: SessionTime, options: AlignmentOptions) 
         near_s = options.near_s - _NEAR_S, options.near_s + _NEAR_S
     contacts = time.load_contacts()
     pairs = match_contacts(
-        Instants(at_s, sigma_s, film.video.film.duration_s, film.drift_sigma), contacts, near_s
+        Instants(at_s, sigma_s, film.video.film.duration_s, film.video.film.drift_sigma),
+        contacts,
+        near_s,
     )
     rows, numbers = np.array(pairs).T
     return _Pairs(

@@ -60,6 +60,10 @@ Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 AlignmentMethod = Literal["light", "clock", "contact", "hand"]
 
 
+DRIFT_SIGMA, CAPTURE_RATE_SIGMA = 50e-6, 1e-3
+"""Standard deviations of a camera's drift beforehand: by its crystal; by a stated capture rate."""
+
+
 class FilmInfo(StrictModel):
     """Facts of a film."""
 
@@ -80,6 +84,11 @@ class FilmInfo(StrictModel):
     """True if intervals differ: a variable rate, or dropped pictures."""
     capture_rate_hz: float | None
     """Rate of taking, if the file plays at another rate: times are scaled to it."""
+
+    @property
+    def drift_sigma(self) -> float:
+        """Standard deviation of its clock's drift before anything is measured."""
+        return DRIFT_SIGMA if self.capture_rate_hz is None else CAPTURE_RATE_SIGMA
 
 
 class Alignment(StrictModel):

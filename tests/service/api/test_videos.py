@@ -245,6 +245,20 @@ def test_an_alignment_by_hand(session: Recording) -> None:
     assert content_of(http.delete(f"{url}/alignment")) == video
 
 
+def test_a_stated_capture_rate_may_be_off_by_a_thousandth(session: Recording) -> None:
+    video = content_of(upload(session, capture_rate_hz=1000), 201)
+    begin_t_ns = int(session.column("t_ns")[0])
+    pairs = [
+        {"film_s": at_s, "t_ns": begin_t_ns + round(at_s * 1.001e9), "sigma_ns": 1e3}
+        for at_s in (0.0, (PICTURES - 1) / 1000)
+    ]
+    url = f"{session.url}/videos/{video['id']}/alignment"
+    body = {"method": "hand", "pairs": pairs}
+    found = content_of(session.running.http.put(url, json=body))["alignment"]
+    assert found["pair_count"] == 2
+    assert 5e-5 < found["sigma_drift"] <= 1e-3
+
+
 def test_what_is_not_in_the_film_is_no_alignment(session: Recording) -> None:
     http, video = session.running.http, content_of(upload(session), 201)
     url = f"{session.url}/videos/{video['id']}/alignment"

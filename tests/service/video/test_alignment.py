@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
 from service.video.alignment import (
-    DRIFT_SIGMA,
     Instants,
     describe_contradiction,
     fit_alignment,
@@ -19,7 +18,7 @@ from service.video.alignment import (
 )
 from service.video.contact import find_touchdowns
 from service.video.methods import COMMON_OF_TOUCHDOWNS
-from storage.sessions.videos import Alignment
+from storage.sessions.videos import DRIFT_SIGMA, Alignment
 from tests.service.video.test_contact import SECONDS, draw_marker_height
 
 SESSION_S = 60.0

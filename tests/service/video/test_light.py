@@ -8,9 +8,9 @@ import pytest
 from devices.arrays import Floats
 from devices.errors import FileFormatError
 from devices.lamp_code import BIT_NS, CODE_BITS, is_lamp_on, make_code
-from service.video.alignment import DRIFT_SIGMA, fit_alignment
+from service.video.alignment import fit_alignment
 from service.video.light import compute_mean_code, find_lamp
-from storage.sessions.videos import Alignment
+from storage.sessions.videos import DRIFT_SIGMA, Alignment
 
 SESSION_S = 120.0
 

@@ -241,6 +241,7 @@ async def align_video(
 ) -> Video:
     """Fit offset and drift of the film's clock to pairs of instants."""
     session = _require_sealed_with_frames(session_id, server)
+    folder, video = await run_in_threadpool(_read, session_id, video_id, server)
     begin_t_ns = session.started_t_ns
     fit = partial(
         fit_alignment,
@@ -249,9 +250,9 @@ async def align_video(
         np.array([float(pair.t_ns - begin_t_ns) for pair in body.pairs]),
         np.array([pair.sigma_ns for pair in body.pairs]),
         begin_t_ns=begin_t_ns,
+        drift_sigma=video.film.drift_sigma,
     )
     aligned = run_with_usage_errors(fit)
-    folder = (await run_in_threadpool(_read, session_id, video_id, server))[0]
     store = partial(store_alignment, folder, aligned, replaces=replace)
     return await run_in_threadpool(run_with_usage_errors, store)
 
