@@ -2,8 +2,8 @@
 
     python benchmarks/video.py [--pictures 150]
 
-A film of each kind is rendered (H.264; tags, dots) and tracked in a thread of its own, decoding
-alone beside it. Decoder and OpenCV are kept to one thread.
+A film of each kind (H.264; tags, dots) is rendered, decoded alone, then decoded and tracked, all on
+one core; OpenCV has one thread.
 """
 
 from __future__ import annotations

@@ -42,16 +42,16 @@ class AlignArguments:
         list[int] | None,
         typer.Option(
             metavar="N",
-            help="align --by contact: picture of a touchdown, from 0 (repeat for several); "
-            "or name markers with --tags or --dots.",
+            help="align --by contact: first picture of a contact, from 0: the page's number less 1 "
+            "(repeat for several); or name markers with --tags or --dots.",
         ),
     ] = None
     pair: Annotated[
         list[str] | None,
         typer.Option(
             metavar="N=SECONDS",
-            help="align --by hand: picture and its instant, seconds after the first frame (repeat "
-            "for several).",
+            help="align --by hand: picture, from 0 (the page's number less 1), and its instant, "
+            "seconds after the first frame (repeat for several).",
         ),
     ] = None
     replace: Annotated[

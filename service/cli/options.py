@@ -37,6 +37,9 @@ SEED_MAX = 2**63 - 1
 SECONDS_MAX = NUMBER_MAX = 1e9
 """Upper bounds of options: thirty years, and more than any plausible length, force or factor."""
 
+DataOption = Annotated[
+    Path | None, typer.Option(help="Data folder of the server; default: the user's.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 UnquantizedOption = Annotated[
     bool,

@@ -268,7 +268,9 @@ def _pair_by_contact(film: _Film, time: SessionTime, options: AlignmentOptions) 
         found = find_touchdowns(np.array(track["film_s"]), height_px)
         at_s, sigma_s = np.array(found, dtype=np.float64).reshape(-1, 2).T
     else:
-        at_s = np.sort(film.find_pictures(options.pictures))
+        # The foot was put down between the picture before and the first one.
+        half_s = 0.5 / max(film.video.film.rate_hz, 1e-3)
+        at_s = np.sort(film.find_pictures(options.pictures)) - half_s
         sigma_s = np.full(len(at_s), film.pick_sigma_s)
     near_s = (-math.inf, math.inf)
     if options.near_s is not None:

@@ -77,7 +77,7 @@ def compare_angle_sources(
         run_simulation(
             SimulationOptions(scene, seconds, with_truth=True, foot=foot), recording, None
         )
-        truth = _read(recording, _COLUMNS[:3:2])
+        truth = _read(recording, ("t_ns", "true_angle_rad"))
         t_s = (truth["t_ns"] - truth["t_ns"][0]) * 1e-9
         begin_s = np.arange(0.0, t_s[-1], 1.0 / camera.rate_hz)
         angle_at = partial(np.interp, xp=t_s, fp=truth["true_angle_rad"])

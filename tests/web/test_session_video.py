@@ -200,7 +200,7 @@ def test_film_and_cursor_move_together(
         0.25, rel=0.3
     )
     page.click("#play")
-    shown = still(page)
+    still(page)
     until(lambda: abs(cursor_s(page) - BEGIN_S - still(page) / RATE_HZ) < 0.5 / RATE_HZ + 0.002)
 
 

@@ -19,9 +19,9 @@ export class AlignmentCard {
     this.pairs = [];
     this.shown = null; // id of the video that they are of
     const buttons = {
-      "pair-hand": () => this.add("hand"), "pair-contact": () => this.add("contact"), "align-pairs": () => this.change((replace) => this.send(replace)),
+      "pair-hand": () => this.add("hand"), "pair-contact": () => this.add("contact"), "align-pairs": () => this.change((id, replace) => this.send(id, replace)),
       "align-light": () => this.find("light"), "align-clock": () => this.find("clock"),
-      "align-undo": () => this.change(() => videoApi.removeAlignment(this.page.session.id, this.card.video.id)),
+      "align-undo": () => this.change((id) => videoApi.removeAlignment(this.page.session.id, id)),
     };
     for (const [name, act] of Object.entries(buttons)) byId(name).addEventListener("click", act);
     byId("alignment", HTMLDetailsElement).addEventListener("toggle", () => this.card.setApart(byId("alignment", HTMLDetailsElement).open));
@@ -44,6 +44,7 @@ export class AlignmentCard {
     const aboutS = cursorS ?? middle;
     const contacts = plots.stances.filter((stance) => stance.begun).map((stance) => stance.from);
     if (!film.times.length) return notice("this browser does not show the film.", { bad: true });
+    if (!film.isStill) return notice("the film is moving: pause it.", { bad: true });
     if (method === "hand" && cursorS === null) return notice("put the cursor on the instant first.", { bad: true });
     if (method === "contact" && !contacts.length) return notice("the session has no contact that begins in it.", { bad: true });
     const timeS = method === "hand" ? cursorS : contacts.reduce((best, one) => (Math.abs(one - aboutS) < Math.abs(best - aboutS) ? one : best));
@@ -63,10 +64,10 @@ export class AlignmentCard {
     byId("align-pairs", HTMLButtonElement).disabled = !this.pairs.length;
   }
 
-  send(replace) {
+  send(id, replace) {
     const pairs = this.pairs.map(({ film_s, t_ns, sigma_ns }) => ({ film_s, t_ns, sigma_ns }));
     const method = this.pairs.every((pair) => pair.method === "contact") ? "contact" : "hand";
-    return videoApi.setAlignment(this.page.session.id, this.card.video.id, { method, pairs }, replace);
+    return videoApi.setAlignment(this.page.session.id, id, { method, pairs }, replace);
   }
 
   /** Let the server look for instants in the pictures. @param {"light" | "clock"} method */
@@ -75,20 +76,21 @@ export class AlignmentCard {
     const say = () => setText(byId("align-wait"), `The server looks through the film: ${Math.round((performance.now() - startedMs) / 1e3)} s`);
     say();
     const timer = setInterval(say, 1000);
-    this.change((replace) => videoApi.findAlignment(this.page.session.id, this.card.video.id, method, replace)).finally(() => {
+    this.change((id, replace) => videoApi.findAlignment(this.page.session.id, id, method, replace)).finally(() => {
       clearInterval(timer);
       setText(byId("align-wait"), "");
     });
   }
 
-  /** Change the alignment, one that contradicts it only if that is confirmed; buttons wait meanwhile. @param {(replace: boolean) => Promise<Video>} asked */
+  /** Change the alignment, one that contradicts it only if that is confirmed; buttons wait meanwhile. @param {(id: string, replace: boolean) => Promise<Video>} asked */
   change(asked) {
     const tools = byId("alignment-tools", HTMLFieldSetElement);
+    const { video: { id }, line } = this.card; // another film may be shown meanwhile
     tools.disabled = true;
     return quietly(async () => {
-      const video = await asked(false).catch(async (error) => {
-        if (error.status !== 409 || !this.card.line || !await ask("Replace alignment", error.message, "Replace")) throw error;
-        return asked(true);
+      const video = await asked(id, false).catch(async (error) => {
+        if (error.status !== 409 || !line || !await ask("Replace alignment", error.message, "Replace")) throw error;
+        return asked(id, true);
       });
       await this.onVideo(video);
       notice(this.card.line?.text ?? `“${video.name}” is no longer aligned.`);

@@ -19,7 +19,7 @@ export class Film {
     element.addEventListener("ended", () => this.show(this.times.length - 1));
     element.addEventListener("loadedmetadata", () => {
       if (!element.videoWidth) onBroken(); // sound alone
-      else this.waiting = setTimeout(() => this.begin(0), FIRST_MS);
+      else this.waiting = setInterval(() => this.beginUnseen(), FIRST_MS);
     });
     element.addEventListener("error", () => { if (element.hasAttribute("src")) onBroken(); });
     if (typeof element.requestVideoFrameCallback === "function") this.listen();
@@ -27,6 +27,11 @@ export class Film {
       element.addEventListener("loadeddata", () => this.begin(0));
       element.addEventListener("timeupdate", () => this.note(element.currentTime));
     }
+  }
+
+  /** Begin at 0 if no picture was reported although the film is loaded and the page is seen. */
+  beginUnseen() {
+    if (!document.hidden && this.element.networkState === this.element.NETWORK_IDLE) this.begin(0);
   }
 
   listen() {

@@ -33,11 +33,12 @@ export class FilmCard {
 
   /** Show a video; again after its alignment has changed. @param {Video | null} video */
   async show(video) {
-    const isOther = this.video?.id !== video?.id;
+    const isOther = !this.isOpen || this.video?.id !== video?.id;
     this.video = video;
     this.line = video?.alignment ? new Line(video.alignment, this.page.plots.whole.beginNs) : null;
     this.box.hidden = !video;
     if (isOther) {
+      this.isOpen = false;
       this.film.close();
       setText(byId("film-problem"), "");
       this.draw();
@@ -45,6 +46,7 @@ export class FilmCard {
       const { id } = this.page.session;
       const times = video && (await videoApi.filmTimes(id, video.id)).film_s;
       if (this.video?.id !== video?.id) return; // another one was asked for meanwhile
+      this.isOpen = true;
       if (video) this.film.open(videoApi.filmAddress(id, video.id), times, video.film.rate_hz / video.film.play_rate_hz || 1);
     }
     this.update();

@@ -49,13 +49,14 @@ export function halfWidthText(halfS) {
 
 /**
  * Return a pair of instants. A person finds a picture to within one on both sides, and points to within a pixel;
- * of a touchdown the last picture before it and the first after it are known.
+ * of a touchdown the last picture or frame before it and the first after it are known.
  * @param {"hand" | "contact"} method @param {number[]} times @param {number} index
  * @param {number} sessionS @param {number} beginNs @param {number} resolutionS of the session's instant
  */
 export function pairOf(method, times, index, sessionS, beginNs, resolutionS) {
   const intervalS = intervalOf(times, Math.max(0, index - 1));
+  const contactS = sessionS - (method === "contact" ? resolutionS / 2 : 0);
   const filmS = times[index] - (method === "contact" ? intervalS / 2 : 0);
   const sigmaS = Math.hypot(2 * intervalS, resolutionS) / Math.sqrt(12);
-  return { film_s: filmS, t_ns: Math.round(beginNs + 1e9 * sessionS), sigma_ns: 1e9 * sigmaS };
+  return { film_s: filmS, t_ns: Math.round(beginNs + 1e9 * contactS), sigma_ns: 1e9 * sigmaS };
 }

@@ -69,10 +69,12 @@ export class Strip {
   /** Remove all: another film, or another alignment. */
   clear() {
     this.stills = [];
+    this.canvas.height = 0; // else the next strip shows old instants until it is drawn
     this.draw();
   }
 
   draw() {
+    byId("strip-save", HTMLButtonElement).disabled = true; // until it is drawn
     byId("strip-card").hidden = !this.stills.length;
     byId("stills").replaceChildren(...this.stills.map((still) => {
       const remove = el("button", { type: "button", cls: "small", text: `${timeText(still.timeS, 1e-3)} ×`, "aria-label": `Remove the still at ${timeText(still.timeS, 1e-3)}` });
@@ -118,5 +120,6 @@ export class Strip {
       context.stroke();
     });
     this.canvas.dataset.stills = String(stills.length);
+    byId("strip-save", HTMLButtonElement).disabled = false;
   }
 }

@@ -52,8 +52,9 @@ export class Videos {
     const video = items.find(({ id }) => id === chosen) ?? null;
     byId("videos-list").replaceChildren(...items.map((one) => this.row(one, one === video)));
     this.strip.clear();
-    await this.card.show(video);
-    this.alignment.show();
+    const shown = this.card.show(video);
+    this.alignment.show(); // at once: its pairs are of another film
+    await shown;
   }
 
   /** Show a video in its present state, and choose it. @param {Video} video */

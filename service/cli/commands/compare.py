@@ -19,6 +19,7 @@ from service.cli.multi_session import (
     run_jobs_with_report,
 )
 from service.cli.options import (
+    DataOption,
     JsonOption,
     add_options,
     echo,
@@ -204,9 +205,7 @@ def compare_command(
             "3. They are lower limits for coverage, R² and counts, upper limits else.",
         ),
     ] = None,
-    data: Annotated[
-        Path | None, typer.Option(help="Data folder of the server; default: the user's.")
-    ] = None,
+    data: DataOption = None,
     batch: BatchOptions,
     as_json: JsonOption = False,
 ) -> None:

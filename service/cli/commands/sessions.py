@@ -21,6 +21,7 @@ from service.cli.multi_session import (
 from service.cli.options import (
     SESSION_REMEDY,
     CaOption,
+    DataOption,
     EndOption,
     JsonOption,
     StartOption,
@@ -251,9 +252,7 @@ def export_command(
             "URIs.",
         ),
     ] = None,
-    data: Annotated[
-        Path | None, typer.Option(help="Data folder of the server; default: the user's.")
-    ] = None,
+    data: DataOption = None,
     start_s: StartOption = None,
     end_s: EndOption = None,
     columns: ColumnsOption = None,

@@ -10,7 +10,15 @@ import typer
 from devices.errors import UsageError
 from service.cli.align_options import AlignArguments, align_and_report
 from service.cli.commands.sessions import find_sealed_file
-from service.cli.options import JsonOption, add_options, echo, print_json, remark, show_progress
+from service.cli.options import (
+    DataOption,
+    JsonOption,
+    add_options,
+    echo,
+    print_json,
+    remark,
+    show_progress,
+)
 from service.cli.track_options import TrackArguments, track_angle
 from storage.sessions.folder import FRAMES_NAME
 
@@ -40,9 +48,7 @@ def video_command(
     *,
     aligning: AlignArguments,
     tracking: TrackArguments,
-    data: Annotated[
-        Path | None, typer.Option(help="Data folder of the server; default: the user's.")
-    ] = None,
+    data: DataOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Keep films beside a session: add, list, remove, align, track.

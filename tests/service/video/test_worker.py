@@ -17,6 +17,7 @@ from devices.errors import FileFormatError, MissingExtraError
 from service.video import worker
 from service.video.worker import check_extra_installed, describe_film
 from tests.service.video.short_film import PICTURES, RATE_HZ, short_film
+from tests.waiting import until
 
 pytestmark = pytest.mark.process
 
@@ -125,8 +126,7 @@ def test_a_decoder_ends_with_the_process_that_waits_for_it(film: Path) -> None:
         "worker.describe_film(Path(sys.argv[1]), 'x')"
     )
     with subprocess.Popen([sys.executable, "-c", code, str(film)]) as process:
-        while not begun.exists():
-            time.sleep(0.05)
+        until(begun.exists)
         children = psutil.Process(process.pid).children()
         process.kill()
     assert len(children) == 1

@@ -99,11 +99,9 @@ def test_a_hostile_name_is_only_shown(folder: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["", ".mp4", "walk", "walk.mp4/", "a.sh", "a.html", "a.m3u8", "x."]
+    "name", ["", ".mp4", "walk", "walk.mp4/x", "a.sh", "a.html", "a.m3u8", "x."]
 )
 def test_another_suffix_is_refused_at_once(folder: Path, name: str) -> None:
-    if name == "walk.mp4/":
-        name = "walk.mp4/x"
     with pytest.raises(FileFormatError, match="no film"):
         IncomingVideo(folder, name)
     assert names(folder) == {"session.json"}

@@ -19,10 +19,11 @@ from storage.formats.angle_table import ANGLE_NAME, AngleTable
 from storage.formats.slice import Slice
 from storage.schema import ANGLE_COLUMNS, ESTIMATE_COLUMNS, MEASURED_COLUMNS
 from storage.sessions.reader import SealedFileReader
-from storage.sessions.videos import Alignment, FilmInfo, Video, write_video
+from storage.sessions.videos import Alignment, Video, write_video
 from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array, make_servo
 from tests.service.sessions.pieces import calibration, frames, hopping
+from tests.storage.sessions.test_videos import INFO
 
 N = 3000
 INTERVAL_NS = 20_000_000
@@ -193,18 +194,7 @@ def test_a_films_table_takes_the_alignment_beside_it(tmp_path: Path) -> None:
         pair_count=1,
         rejected_count=0,
     )
-    film = FilmInfo(
-        codec="h264",
-        width_px=2,
-        height_px=2,
-        rotation_deg=0,
-        picture_count=4,
-        duration_s=0.06,
-        rate_hz=50.0,
-        play_rate_hz=50.0,
-        is_variable=False,
-        capture_rate_hz=None,
-    )
+    film = INFO.model_copy(update={"picture_count": 4, "duration_s": 0.06})
     video = Video(
         id="0" * 12, name="a.mp4", suffix=".mp4", size_bytes=1, sha256="0" * 64,
         times_sha256="0" * 64, added_t_ns=1,
