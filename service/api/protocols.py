@@ -217,6 +217,9 @@ class LimitedHttp(HttpToolsProtocol):
 
     def _on_timeout(self) -> None:
         self._timer = None
+        if self.flow.read_paused and self._unanswered and self._unanswered[0].more_body:
+            self._start_next_timeout()  # the server itself does not read: no fault of the client
+            return
         self._refuse_and_close(HTTPStatus.REQUEST_TIMEOUT, "The request did not come in time")
 
     def _refuse_and_close(self, status: HTTPStatus, detail: str) -> None:

@@ -44,7 +44,7 @@ log = logging.getLogger("foottile.nodes")
 
 _NODES_MAX = 1000
 """Limit on node names, so that ever new names fill neither memory nor disk."""
-_READABLE_PROTOCOLS = (5, PROTOCOL)
+_READABLE_PROTOCOLS = (5, 6)
 """Protocols of a stored hello that can be read: 6 differs from 5 only by vitals."""
 _NODE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,63}")
 

@@ -181,8 +181,13 @@ def _make_table(
     film_s: Floats, places: Floats, place_sigma: float, options: TrackOptions, video: Video | None
 ) -> TrackedAngle:
     angle_rad, sigma_rad = compute_angle(places, zero_rad=options.zero_rad, place_sigma=place_sigma)
-    alignment = None if video is None else video.alignment
-    t_ns, sigma_ns = (None, None) if alignment is None else alignment.place(film_s)
+    if np.isnan(sigma_rad[~np.isnan(angle_rad)]).any():
+        raise FileFormatError(
+            "no seven pictures in a row show both markers, by which their noise is measured",
+            where="" if video is None else video.name,
+            remedy="Film the leg without hiding the markers",
+        )
+    t_ns, sigma_ns = (None, None) if video is None else video.place_pictures(film_s)
     table = AngleTable(angle_rad, sigma_rad, film_s, t_ns, sigma_ns, np.full(len(film_s), VIDEO))
     in_m: dict[str, Floats] = {}
     if options.scale_m is not None:

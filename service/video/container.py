@@ -34,6 +34,8 @@ Picture = npt.NDArray[np.uint8]
 
 _CAPTURE_RATE_TAGS = ("com.android.capture.fps",)
 """Tags with the rate of a film that plays slower than it was taken."""
+_SLOWED_MIN = 1.5
+"""Least ratio of a tagged rate to the played one: normal films of phones have the tag, too."""
 _CAPTURE_RATES_HZ = (1.0, 1e6)
 _GAP_BEYOND = 0.5
 """Intervals that differ by more than this part of their median do not count for the rate."""
@@ -75,6 +77,8 @@ def read_film(path: Path, capture_rate_hz: float | None = None) -> tuple[FilmInf
         width, height = stream.codec_context.width, stream.codec_context.height
         codec = stream.codec_context.name
     play_rate_hz = _compute_rate_hz(times_s)
+    if tagged is not None and tagged < _SLOWED_MIN * play_rate_hz:
+        tagged = None
     captured_hz = capture_rate_hz or tagged
     if captured_hz is not None:
         low, high = _CAPTURE_RATES_HZ
@@ -109,7 +113,8 @@ def _compute_rate_hz(times_s: Floats) -> float:
     intervals_s = np.diff(times_s)
     if not len(intervals_s):
         return 0.0
-    regular_s = intervals_s[np.abs(intervals_s / np.median(intervals_s) - 1.0) < _GAP_BEYOND]
+    middle_s = np.sort(intervals_s)[len(intervals_s) // 2]  # one of them, unlike a median
+    regular_s = intervals_s[np.abs(intervals_s / middle_s - 1.0) < _GAP_BEYOND]
     return 1.0 / float(regular_s.mean())
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.errors import FileFormatError, StateError, UsageError
-from devices.lamp_code import LAMP_LATE_NS
+from devices.lamp_code import BIT_NS, CODE_BITS, LAMP_LATE_NS
 from service.video.alignment import (
     Instants,
     describe_contradiction,
@@ -27,6 +27,7 @@ from service.video.contact import find_touchdowns
 from service.video.session_time import SessionTime, read_session_time
 from service.video.worker import run_film_task
 from storage.sessions.folder import FRAMES_NAME
+from storage.sessions.time_axis import PartSpan
 from storage.sessions.videos import (
     Alignment,
     AlignmentMethod,
@@ -44,6 +45,10 @@ COMMON_OF_TOUCHDOWNS = 0.5
 """Part of a touchdown's uncertainty that all of a film share: the ground is the same."""
 _LAMP_MARGIN_NS = 3_000_000_000
 """Time around a part in which its lamp's window may have its middle: half a window."""
+
+
+_LAMP_AMBIGUOUS_NS = 1e9
+"""Difference of two pairs of a film that is no drift: they are of different times."""
 
 
 @dataclass(frozen=True)
@@ -207,7 +212,7 @@ def _pair_by_light(film: _Film, time: SessionTime, options: AlignmentOptions) ->
             expected='output = "code" in [sync] of its scene',
             remedy="Align by clock, contact or hand",
         )
-    windows = []
+    spans, windows = list[PartSpan](), list[tuple[int, int]]()
     for span in time.spans:
         begin_ns = span.t_mono_ns[0] - round(1e9 * film.video.film.duration_s)
         end_ns = span.t_mono_ns[1]
@@ -215,11 +220,19 @@ def _pair_by_light(film: _Film, time: SessionTime, options: AlignmentOptions) ->
             near_ns = time.begin_t_ns + round(1e9 * options.near_s) - time.get_mono_offset_ns(span)
             begin_ns = max(begin_ns, near_ns - round(1e9 * _NEAR_S))
             end_ns = min(end_ns, near_ns + round(1e9 * _NEAR_S))
-        windows.append((begin_ns, end_ns))
+        if begin_ns <= end_ns:
+            spans.append(span)
+            windows.append((begin_ns, end_ns))
+    if not windows:
+        raise UsageError(
+            f"--near {options.near_s:g} is outside the session",
+            where=film.video.name,
+            expected="seconds from the session's begin to that of the film",
+        )
+    if max(end_ns - begin_ns for begin_ns, end_ns in windows) > CODE_BITS * BIT_NS:
+        raise _make_ambiguity_error(film)
     found: dict[float, tuple[float, float, float]] = {}
-    for span, pairs in zip(
-        time.spans, film.run("find_lamp", windows=windows)["pairs"], strict=True
-    ):
+    for span, pairs in zip(spans, film.run("find_lamp", windows=windows)["pairs"], strict=True):
         first_ns, last_ns = span.t_mono_ns
         to_session_ns = time.get_mono_offset_ns(span) - time.begin_t_ns
         for pair in pairs:
@@ -234,14 +247,26 @@ def _pair_by_light(film: _Film, time: SessionTime, options: AlignmentOptions) ->
             expected="the node's lamp in the picture for at least 6 s while it records",
             remedy="Look for it in the film, or align by clock, contact or hand",
         )
-    _, t_ns, sigma_ns = np.array(list(found.values())).T
+    film_s = np.array(sorted(found))
+    _, t_ns, sigma_ns = np.array([found[each] for each in film_s]).T
+    if np.any(np.abs(np.diff(t_ns) - 1e9 * np.diff(film_s)) > _LAMP_AMBIGUOUS_NS):
+        raise _make_ambiguity_error(film)
     # A switch is late, never early.
     late_ns = LAMP_LATE_NS / 2.0
-    return _Pairs(np.array(list(found)), t_ns + late_ns, sigma_ns, late_ns / math.sqrt(3.0))
+    return _Pairs(film_s, t_ns + late_ns, sigma_ns, late_ns / math.sqrt(3.0))
+
+
+def _make_ambiguity_error(film: _Film) -> FileFormatError:
+    return FileFormatError(
+        "the lamp's code fits at more than one time of the session: it starts anew with the node's "
+        "machine, and after 27 hours",
+        where=film.video.name,
+        remedy="Say about when the film begins with --near",
+    )
 
 
 def _pair_by_clock_page(film: _Film, time: SessionTime, _: AlignmentOptions) -> _Pairs:
-    pairs = film.run("find_clock", near_ns=time.compute_server_begin())["pairs"]
+    pairs = film.run("find_clock", near_ns=time.get_any_server_time())["pairs"]
     if not pairs:
         raise FileFormatError(
             "no picture shows the clock page",
@@ -259,6 +284,11 @@ def _pair_by_clock_page(film: _Film, time: SessionTime, _: AlignmentOptions) -> 
             for pair, (_, bound_ns) in zip(pairs, rows, strict=True)
         ),
     )
+
+
+def compute_common_ns(method: AlignmentMethod, sigma_ns: Floats) -> float:
+    """Compute the standard deviation of what the instants of a film share, from their own."""
+    return COMMON_OF_TOUCHDOWNS * float(np.median(sigma_ns)) if method == "contact" else 0.0
 
 
 def _pair_by_contact(film: _Film, time: SessionTime, options: AlignmentOptions) -> _Pairs:
@@ -286,7 +316,7 @@ def _pair_by_contact(film: _Film, time: SessionTime, options: AlignmentOptions) 
         film_s=at_s[rows],
         t_ns=1e9 * contacts.at_s[numbers],
         sigma_ns=1e9 * np.hypot(sigma_s[rows], contacts.sigma_s[numbers]),
-        common_ns=1e9 * COMMON_OF_TOUCHDOWNS * float(np.median(sigma_s[rows])),
+        common_ns=compute_common_ns("contact", 1e9 * sigma_s[rows]),
     )
 
 

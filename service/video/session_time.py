@@ -62,21 +62,21 @@ class SessionTime(NamedTuple):
         _, t_ns, bound_ns = min(found)
         return t_ns, bound_ns
 
-    def compute_server_begin(self) -> int:
-        """Return the server's UTC at the session's begin.
+    def get_any_server_time(self) -> int:
+        """Return the server's UTC at the begin of the first part whose clock was compared.
 
         Raises:
             StateError: the node's clock was never compared with the server's.
         """
-        first = self.spans[0]
-        server_ns, _ = self._to_server_time(first.t_mono_ns[0], first.t_ns[0], first.number)
-        if server_ns == UNKNOWN_T_NS:
-            raise StateError(
-                "the node's clock was not compared with a server's, whose time the film shows",
-                where=str(self.path.parent),
-                remedy="Align by light, contact or hand",
-            )
-        return server_ns
+        for span in self.spans:
+            server_ns, _ = self._to_server_time(span.t_mono_ns[0], span.t_ns[0], span.number)
+            if server_ns != UNKNOWN_T_NS:
+                return server_ns
+        raise StateError(
+            "the node's clock was not compared with a server's, whose time the film shows",
+            where=str(self.path.parent),
+            remedy="Align by light, contact or hand",
+        )
 
     def _to_server_time(self, t_mono_ns: int, t_ns: int, part: int) -> tuple[int, int]:
         if self.clock is None:

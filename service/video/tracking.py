@@ -125,11 +125,11 @@ def _measure_noise_rad(angle_rad: Floats) -> Floats:
     """Measure the noise of the angle: median residuals of a parabola, (pictures,).
 
     That of `_NOISE_PICTURES` around a picture, at least that of the film: a foot at rest says
-    nothing of a moving one.
+    nothing of a moving one. NaN: there are no `_WINDOW` pictures in a row that show both markers.
     """
     count = len(angle_rad)
     if count < _WINDOW:
-        return np.zeros(count)
+        return np.full(count, math.nan)
     x = np.arange(_WINDOW) - _WINDOW // 2
     design = np.stack([np.ones(_WINDOW), x, x**2], axis=1)
     weights = np.eye(_WINDOW)[_WINDOW // 2] - (design @ np.linalg.pinv(design))[_WINDOW // 2]
@@ -140,7 +140,9 @@ def _measure_noise_rad(angle_rad: Floats) -> Floats:
     seen = np.isfinite(blocks).sum(axis=1)
     medians = np.nan_to_num(blocks[np.arange(len(blocks)), np.maximum(seen - 1, 0) // 2])
     known = left_rad[np.isfinite(left_rad)]
-    whole = float(np.median(known)) if len(known) else 0.0
+    if not len(known):
+        return np.full(count, math.nan)
+    whole = float(np.median(known))
     # Of a normal distribution the median of absolute values is 0.6745 sigma.
     scale = 0.6745 * math.sqrt(float(weights @ weights))
     return np.asarray(np.maximum(medians, whole).repeat(_NOISE_PICTURES)[:count] / scale)
@@ -280,7 +282,13 @@ def undistort(places_px: Floats, lens: Lens) -> Floats:
     return points.reshape(places_px.shape)
 
 
-def calibrate_lens(path: Path, columns: int, rows: int, film: FilmInfo) -> Lens:
+def calibrate_lens(
+    path: Path,
+    columns: int,
+    rows: int,
+    film: FilmInfo,
+    on_picture: Callable[[int], None] = lambda _: None,
+) -> Lens:
     """Compute a camera's lens from a film of a checkerboard.
 
     Args:
@@ -288,6 +296,7 @@ def calibrate_lens(path: Path, columns: int, rows: int, film: FilmInfo) -> Lens:
         columns: inner corners along a row.
         rows: inner corners along a column.
         film: the film that the lens is for.
+        on_picture: called with the number of each picture.
 
     Raises:
         FileFormatError: the board is seen too rarely, or in pictures of another size.
@@ -304,9 +313,10 @@ def calibrate_lens(path: Path, columns: int, rows: int, film: FilmInfo) -> Lens:
         )
     board = np.zeros((columns * rows, 3), np.float32)
     board[:, :2] = np.mgrid[:columns, :rows].T.reshape(-1, 2)
-    step = max(1, boards.picture_count // _BOARDS_MAX)
+    step = max(1, -(-boards.picture_count // _BOARDS_MAX))
     corners = []
     for index, picture in iterate_pictures(path, is_grey=True):
+        on_picture(index)
         if index % step == 0:
             is_found, places = cv2.findChessboardCornersSB(
                 np.ascontiguousarray(picture), (columns, rows)

@@ -79,7 +79,7 @@ def describe_film(
     try:
         found = run_film_task("read", path, capture_rate_hz=capture_rate_hz)
         return FilmInfo(**found["film"]), found["times_json"].encode()
-    except (FileFormatError, UsageError) as error:
+    except (FileFormatError, StateError, UsageError) as error:
         error.what = error.what.replace(str(path), name)
         error.where = name
         raise
@@ -173,6 +173,9 @@ def main() -> None:
     except MemoryError:
         text = f"it needs more than {_MEMORY_BYTES_MAX >> 30} GiB"
         _print({"error": {"kind": "FileFormatError", "what": text, "where": request["path"]}})
+    except Exception as error:  # a bug: the parent has no other way to know
+        text = f"the task {request['task']} failed, which is a bug: {error!r}"
+        _print({"error": {"kind": "StateError", "what": text, "where": request["path"]}})
 
 
 def _print(message: dict[str, Any]) -> None:
@@ -271,7 +274,7 @@ def _track(
         film.picture_count,
         make_tag_finder(*tags) if tags is not None else make_dot_finder(dots or ""),
         is_grey=tags is not None or dots == "bright",
-        lens=None if lens is None else calibrate_lens(Path(lens), *board, film),
+        lens=None if lens is None else calibrate_lens(Path(lens), *board, film, _report),
         on_picture=_report,
     )
     return {"film_s": times_s.tolist(), "places_px": places_px.tolist()}

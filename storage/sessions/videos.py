@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import math
 import os
 import re
 import secrets
@@ -77,7 +78,7 @@ class FilmInfo(StrictModel):
     duration_s: float
     """Time from the first picture to the last."""
     rate_hz: float
-    """Pictures per second: the inverse of their median interval."""
+    """Pictures per second, without gaps."""
     play_rate_hz: float
     """Pictures per second as it plays: lower in slow motion."""
     is_variable: bool
@@ -144,6 +145,17 @@ class Video(StrictModel):
     film: FilmInfo
     alignment: Alignment | None = None
     """None: its time is not known."""
+
+    def place_pictures(self, film_s: Floats) -> tuple[Times, Floats] | tuple[None, None]:
+        """Convert instants of its pictures to the session's time, with standard deviations, in ns.
+
+        Rows of a picture are exposed one after the other, so that markers are not where the lamp
+        is. None: it is not aligned.
+        """
+        if self.alignment is None:
+            return None, None
+        t_ns, sigma_ns = self.alignment.place(film_s)
+        return t_ns, np.hypot(sigma_ns, 1e9 / (self.film.rate_hz * math.sqrt(12.0)))
 
 
 def find_video_folders(session_folder: Path) -> dict[str, Path]:

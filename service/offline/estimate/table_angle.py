@@ -106,12 +106,8 @@ def read_angle_track(path: Path) -> AngleTrack:
     table = read_angle_table(path)
     t_ns, sigma_ns = table.t_ns, table.sigma_ns
     if table.film_s is not None and (path.parent / VIDEO_NAME).exists():
-        video = read_video(path.parent)  # its present alignment: the table may be older
-        t_ns = sigma_ns = None
-        if video.alignment is not None:
-            t_ns, sigma_ns = video.alignment.place(table.film_s)
-            # Rows of a picture are exposed one after the other: markers are not where the lamp is.
-            sigma_ns = np.hypot(sigma_ns, 1e9 / (video.film.rate_hz * math.sqrt(12.0)))
+        # By its present alignment: the table may be older.
+        t_ns, sigma_ns = read_video(path.parent).place_pictures(table.film_s)
     if t_ns is None:
         raise UsageError(
             f"{path} has times of a film that is not aligned with the session",

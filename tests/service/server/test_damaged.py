@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 
 from devices.flags import EstimateFlag
+from service.protocol.link import PROTOCOL
+from service.server import nodes
 from service.sessions.tares import TareHistory
 from storage.documents import read_checksummed_json, write_checksummed_json
 from tests.service.fake_node import FakeNode
@@ -170,6 +172,10 @@ def test_a_node_with_a_damaged_hello_is_unknown_until_it_connects(
     assert running.node()["tare"] is not None
     read_checksummed_json(path)
     assert "until it connects" not in list_problems(running)
+
+
+def test_the_present_protocol_is_among_those_that_can_be_read() -> None:
+    assert nodes._READABLE_PROTOCOLS[-1] == PROTOCOL
 
 
 def test_a_hello_of_the_version_before_is_no_problem(running: Running, tared: FakeNode) -> None:

@@ -199,6 +199,8 @@ def test_a_film_of_nothing_or_of_another_session_is_refused_with_a_reason(tmp_pa
     early = AlignmentOptions(pictures=(0,), instants_s=(-10.0,))
     with pytest.raises(FileFormatError, match=r"ends 2\.0 s before the session"):
         align_video(session, video_id, "hand", early)
+    with pytest.raises(UsageError, match="outside the session"):
+        align_video(session, video_id, "light", AlignmentOptions(near_s=1000.0))
     alone = make_session(tmp_path / "alone", lamp=False, server=False)
     video_id = add_film(alone, SMALL, DARK[:20]).id
     with pytest.raises(UsageError, match="no lamp"):

@@ -6,13 +6,14 @@ import math
 import struct
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
 
 from devices.arrays import Floats
 from devices.errors import FileFormatError, UsageError
-from service.video.container import Picture, iterate_pictures, read_film
+from service.video.container import Picture, _compute_rate_hz, iterate_pictures, read_film
 from service.video.tracking import (
     Lens,
     calibrate_lens,
@@ -110,6 +111,34 @@ def test_a_rotated_film_is_upright(tmp_path: Path) -> None:
     assert picture.shape == (96, 64)
 
 
+@pytest.mark.parametrize(("play_hz", "factor"), [(24.0, 1.0), (30.0, 0.125)])
+def test_a_tagged_rate_counts_only_if_the_film_plays_much_slower(
+    tmp_path: Path, play_hz: float, factor: float
+) -> None:
+    tag = {24.0: "30.0", 30.0: "240.0"}[play_hz]
+    greys = [np.full((64, 96), 20 + 18 * i, np.uint8) for i in range(12)]
+    times_s = [i / play_hz for i in range(12)]
+    film = write_film(tmp_path / "film.mp4", Camera(width=96, height=64), greys, times_s)
+    tagged = tmp_path / "tagged.mp4"
+    with (
+        av.open(str(film), "r") as source,
+        av.open(str(tagged), "w", options={"movflags": "use_metadata_tags"}) as target,
+    ):
+        target.metadata["com.android.capture.fps"] = tag
+        stream = target.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(source.streams.video[0]):
+            if packet.size:
+                packet.stream = stream
+                target.mux(packet)
+    info, found_s = read_film(tagged)
+    assert info.play_rate_hz == pytest.approx(play_hz, rel=0.01)
+    np.testing.assert_allclose(found_s, factor * np.array(times_s), atol=1e-3)
+
+
+def test_a_film_of_three_pictures_and_a_gap_has_a_rate() -> None:
+    assert 0.0 < _compute_rate_hz(np.array([0.0, 1.0, 101.0])) <= 1.0
+
+
 def draw_dots(*dots: tuple[int, int, int], colour: tuple[int, int, int]) -> Picture:
     picture = np.full((120, 160, 3), 60, np.uint8)
     for x, y, radius in dots:
@@ -200,6 +229,14 @@ def test_a_foot_at_rest_does_not_vouch_for_a_moving_one() -> None:
     for part in (slice(0, 900), slice(900, 1000)):
         ratio = np.sqrt(np.mean((angle_rad[part] / sigma_rad[part]) ** 2))
         assert 0.5 < ratio < 1.3
+
+
+def test_a_noise_that_cannot_be_measured_is_unknown() -> None:
+    places = make_places(np.full(60, 0.1), np.random.default_rng(3))
+    places[::6] = math.nan
+    angle_rad, sigma_rad = compute_angle(places, zero_rad=0.0)
+    assert np.isfinite(angle_rad).sum() == 50
+    assert np.isnan(sigma_rad).all()
 
 
 def test_a_film_without_markers_and_one_that_breaks_off_are_refused(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ from service.server.server import Server
 from service.user_folders import PublicText
 from service.video import methods
 from service.video.alignment import fit_alignment
-from service.video.methods import AlignmentOptions, store_alignment
+from service.video.methods import AlignmentOptions, compute_common_ns, store_alignment
 from service.video.worker import check_extra_installed, describe_film
 from storage.sessions.folder import Session
 from storage.sessions.videos import (
@@ -51,6 +51,8 @@ from storage.sessions.videos import (
 
 router = APIRouter(prefix="/sessions/{session_id}/videos", tags=["videos"])
 
+_DESCRIBING = CapacityLimiter(1)
+"""One thread: an upload waits for no search."""
 _DECODING = CapacityLimiter(1)
 """One thread: each waits for a process that decodes a film."""
 _WRITING = CapacityLimiter(1)
@@ -150,7 +152,7 @@ async def add_video(
     try:
         async with contextmanager_in_threadpool(incoming):
             await _receive(request, incoming)
-            video = await to_thread.run_sync(keep, limiter=_DECODING)
+            video = await to_thread.run_sync(keep, limiter=_DESCRIBING)
     except ClientDisconnect as error:
         raise UsageError("the upload broke off, and nothing is kept") from error
     response.headers["Location"] = f"/api/v1/sessions/{session_id}/videos/{video.id}"
@@ -251,6 +253,7 @@ async def align_video(
         np.array([pair.sigma_ns for pair in body.pairs]),
         begin_t_ns=begin_t_ns,
         drift_sigma=video.film.drift_sigma,
+        common_ns=compute_common_ns(body.method, np.array([p.sigma_ns for p in body.pairs])),
     )
     aligned = run_with_usage_errors(fit)
     store = partial(store_alignment, folder, aligned, replaces=replace)

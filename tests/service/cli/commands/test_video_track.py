@@ -98,13 +98,13 @@ def test_points_of_another_program_take_the_times_of_the_film(
     video_id = run("video", "add", folder, film, "--json").printed()["id"]
     Path("dlc.csv").write_text(
         "scorer,n,n,n,n,n,n\nbodyparts,a,a,a,b,b,b\ncoords,x,y,likelihood,x,y,likelihood\n"
-        "1,10,300,1,20,100,1\n3,10,300,1,20,100,1\n5,10,300,1,20,100,1\n"
+        + "".join(f"{picture},10,300,1,20,100,1\n" for picture in range(1, 15, 2))
     )
     track = "video", "track", folder, video_id, "--points-file"
     run(*track, "dlc.csv", "--points", "a,b", "-o", "t.csv").succeeds()
     found = read_angle_table(Path("t.csv"))
     assert found.film_s is not None
-    np.testing.assert_allclose(found.film_s, [0.02, 0.06, 0.1], atol=1e-6)
+    np.testing.assert_allclose(found.film_s, np.arange(1, 15, 2) * 0.02, atol=1e-6)
     np.testing.assert_allclose(found.angle_rad, math.atan2(10.0, 200.0))
     Path("dlc.csv").write_text(Path("dlc.csv").read_text() + "16,10,300,1,20,100,1\n")
     run(*track, "dlc.csv", "--points", "a,b").fails(1, "dlc.csv", "last picture is 16", "0 to 15")

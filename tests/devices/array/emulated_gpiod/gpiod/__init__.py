@@ -23,6 +23,8 @@ _spec = importlib.machinery.PathFinder.find_spec(
 __path__ = list(_spec.submodule_search_locations)
 exec(compile(Path(_spec.origin).read_text(), _spec.origin, "exec"))  # noqa: S102  # the installed library
 
+from gpiod.exception import RequestReleasedError  # noqa: E402  # __path__ is set above
+
 RECORD = struct.Struct("<qIB")
 
 
@@ -31,6 +33,7 @@ class _Request:
         self._settings = settings
         self._path = chip / f"line{line}"
         self._is_input = settings.direction is globals()["line"].Direction.INPUT
+        self._is_released = False
         self._seqno = 0  # of 32 bits
         if self._is_input:
             # For writing, too: else it would be readable at its end without a writer.
@@ -39,9 +42,11 @@ class _Request:
             self.set_value(line, settings.output_value)
 
     def wait_edge_events(self, timeout=None):
+        self._check_held()
         return bool(select.select([self._fd], [], [], timeout)[0]) and self._check()
 
     def read_edge_events(self, max_events=None):
+        self._check_held()
         self._check()
         content = os.read(self._fd, (max_events or 1024) * RECORD.size)
         events = []
@@ -55,14 +60,20 @@ class _Request:
         return events
 
     def set_value(self, line, value):
+        self._check_held()
         t_ns, level = time.monotonic_ns(), int(value.value)
         with self._path.with_suffix(".log").open("a") as log:
             log.write(f"{t_ns} {level}\n")
         self._path.write_text(str(level))
 
     def release(self):
+        self._is_released = True
         if self._is_input:
             os.close(self._fd)
+
+    def _check_held(self):
+        if self._is_released:
+            raise RequestReleasedError
 
     def _check(self):
         os.stat(self._path)  # a line that was taken away raises ENOENT
