@@ -94,7 +94,10 @@ def test_a_text_that_names_other_files_or_addresses_is_no_film(film: Path, text:
         ("os.kill(os.getpid(), 11)", "ended with signal 11"),
         ("os._exit(3)", "ended with code 3"),
         ("bytearray(8 << 30)", "needs more than 4 GiB"),
-        ("open('/dev/null', 'wb') and open(path, 'ab').write(b'x' * 9999)", "a bug: .*File too large"),
+        (
+            "open('/dev/null', 'wb') and open(path, 'ab').write(b'x' * 9999)",
+            "a bug: .*File too large",
+        ),
     ],
 )
 def test_a_decoder_that_crashes_is_an_error_that_names_the_film(
