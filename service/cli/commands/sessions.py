@@ -148,10 +148,15 @@ def sessions_command(
         print_json({"items": found})
         return
     table = Table(box=None, pad_edge=False)
-    for heading in ("session", "name", "node", "s", "frames", "markers", "state"):
-        right = heading in ("s", "frames", "markers")
-        # A row is one line: a wrapped name could look like another row.
-        table.add_column(heading, justify="right" if right else "left", no_wrap=True)
+    # Ids are copied from here, so they are whole in a narrow terminal, too.
+    id_chars = max((len(session["id"]) for session in found), default=0)
+    table.add_column("session", no_wrap=True, min_width=id_chars)
+    # A row is one line: a wrapped name could look like another row.
+    for heading in ("name", "node"):
+        table.add_column(heading, no_wrap=True)
+    for heading in ("s", "frames", "markers"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("state")
     for session in found:
         lossy = ", lossy" if session["complete"] == "lossy" else ""
         assumed = ", scale assumed" if session["absolute_scale"] == "assumed" else ""
