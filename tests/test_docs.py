@@ -40,7 +40,7 @@ from devices.scene.scene_file import Scene, list_builtin_scenes, load_scene
 from service.api.access import Logins
 from service.api.app import make_app
 from service.api.settings import Settings
-from service.cli.main import SUMMARIES, load_command
+from service.cli.main import GROUPS, SUMMARIES, load_command
 from service.estimation.calibration import TileCalibration
 from service.protocol.codec import LinkCloseCode
 from service.protocol.live import FeedMessage, PageMessage
@@ -131,7 +131,11 @@ def test_every_column_is_documented_with_its_unit() -> None:
 
 
 def commands() -> dict[str, Any]:
-    return {name: load_command(name) for name in SUMMARIES}
+    found = {name: load_command(name) for name in SUMMARIES}
+    for group in GROUPS:
+        for name, command in found.pop(group).commands.items():
+            found[f"{group} {name}"] = command
+    return found
 
 
 def test_every_command_is_documented_and_says_what_its_options_do() -> None:

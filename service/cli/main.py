@@ -71,29 +71,45 @@ SUMMARIES = {
 }
 """Summary of each command, the first sentence of its function, in the order of `--help`."""
 
+GROUPS = {"video": ("add", "list", "remove", "align", "track")}
+"""Commands of the commands that are groups."""
+
+COMMANDS = [f"{name} {each}".rstrip() for name in SUMMARIES for each in GROUPS.get(name, ("",))]
+"""Names of all commands; two words in a group."""
+
 _MODULES = {
     **dict.fromkeys(("pull", "export"), "sessions"),
     **dict.fromkeys(("demo", "invite", "accept-node"), "serve"),
     **dict.fromkeys(("benchmark", "reproduce"), "studies"),
     "recover": "verify",
+    **{f"{group} {name}": group for group, names in GROUPS.items() for name in names},
 }
 """Modules of commands that do not have their own name."""
 
 
 def get_command_function(name: str) -> Callable[..., None]:
     """Import and return the function of a command."""
-    function = name.replace("-", "_")
+    function = name.replace("-", "_").replace(" ", "_")
     module = import_module(f"{_PACKAGE}.{_MODULES.get(name, function)}")
     command: Callable[..., None] = getattr(module, f"{function}_command")
     return command
 
 
 def load_command(name: str) -> Any:
-    """Return a command with its options, as typer runs it."""
+    """Return a command with its options, or a group of them, as typer runs it."""
     from service.cli.options import require_finite_numbers
 
-    app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-    app.command(name)(require_finite_numbers(get_command_function(name)))
+    app = typer.Typer(
+        help=SUMMARIES[name],
+        no_args_is_help=name in GROUPS,
+        add_completion=False,
+        rich_markup_mode=None,
+        pretty_exceptions_enable=False,
+    )
+    for each in GROUPS.get(name, ()):
+        app.command(each)(require_finite_numbers(get_command_function(f"{name} {each}")))
+    if name not in GROUPS:
+        app.command(name)(require_finite_numbers(get_command_function(name)))
     return typer.main.get_command(app)
 
 

@@ -1,107 +1,318 @@
-"""`foottile video`: films beside sessions."""
+"""`foottile video`: films beside sessions: add, list, remove, align, track."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
 from devices.errors import UsageError
-from service.cli.align_options import AlignArguments, align_and_report
 from service.cli.commands.sessions import find_sealed_file
 from service.cli.options import (
+    SECONDS_MAX,
     DataOption,
     JsonOption,
     add_options,
     echo,
     print_json,
     remark,
+    resolve_output_path,
     show_progress,
+    show_progress_bar,
 )
-from service.cli.track_options import TrackArguments, track_angle
 from storage.sessions.folder import FRAMES_NAME
 
 if TYPE_CHECKING:
+    from service.video.angle import TrackedAngle
     from storage.sessions.videos import Video
 
-ACTIONS = {"add": "FILE", "list": "", "remove": "VIDEO", "align": "VIDEO", "track": "VIDEO"}
-"""Actions, with what each needs behind the session."""
+SessionArgument = Annotated[
+    str, typer.Argument(help="Folder of a sealed session, or its id in --data.")
+]
+VideoArgument = Annotated[str, typer.Argument(help="Id of the video.")]
+
+_CHUNK_BYTES = 4 << 20
+_DRIFT_KNOWN = 0.9
+"""Greatest uncertainty of a drift, of that before any measurement, that says something."""
+_TAG_MAX = 49
 
 
-@add_options
-def video_command(
-    action: Annotated[str, typer.Argument(help=f"{', '.join(ACTIONS)}.")],
-    session: Annotated[
-        str, typer.Argument(help="Folder of a sealed session, or its id in --data.")
-    ],
-    target: Annotated[
-        str | None, typer.Argument(metavar="[FILE|VIDEO]", help="Film to add; or id of a video.")
-    ] = None,
+def video_add_command(
+    session: SessionArgument,
+    film: Annotated[Path, typer.Argument(help="Film: MP4, MOV, M4V, WebM, MKV or AVI.")],
     capture_rate: Annotated[
         float | None,
         typer.Option(
-            help="add: pictures per second when it was taken, if it plays slower and the file does "
-            "not say so."
+            help="Pictures per second when it was taken, if it plays slower and the file does not "
+            "say so."
         ),
     ] = None,
-    *,
-    aligning: AlignArguments,
-    tracking: TrackArguments,
     data: DataOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Keep films beside a session: add, list, remove, align, track.
+    """Copy a film to a session.
 
-    add: copies the film, which is read first: a file that no decoder can read is refused. remove:
-    deletes it with its alignment and tables. align: finds the film's time in the session, with its
-    uncertainty. track: writes the foot's angle in each picture as a table, for `foottile estimate
-    --angle`. A server may run at the same time.
+    It is read first: a file that no decoder can read is refused. A server may run at the same time.
     """
-    from storage.sessions.videos import read_videos, remove_video
+    from service.video.worker import check_extra_installed, describe_film
+    from storage.durable_files import translate_storage_errors
+    from storage.sessions.videos import IncomingVideo
 
-    needed = ACTIONS.get(action)
-    if action == "track" and tracking.begin_s is not None:
-        needed = ""  # points in space, without a video
-    if needed is None:
-        raise UsageError(f"video {action!r}", expected=f"one of {', '.join(ACTIONS)}")
-    if bool(needed) != bool(target):
-        raise UsageError(
-            f"video {action} {session} {target or ''}".rstrip(),
-            expected=f"`foottile video {action} SESSION {needed}`".replace(" `", "`"),
-        )
-    if capture_rate is not None and action != "add":
-        raise UsageError("--capture-rate is for `foottile video add`")
-    if aligning != AlignArguments() and action != "align":
-        raise UsageError("--by and its options are for `foottile video align`")
-    by_markers = aligning.by == "contact" and tracking != TrackArguments()
-    if tracking != TrackArguments() and action != "track" and not by_markers:
-        raise UsageError(
-            "options of markers are for `foottile video track` and `align --by contact`"
-        )
     folder = _find_session_folder(session, data)
-    if action == "align":
-        track = tracking.make_options().make_task_options() if by_markers else None
-        align_and_report(folder, str(target), aligning, track, as_json=as_json)
-        return
-    if action == "track":
-        track_angle(folder, target, tracking, as_json=as_json)
-        return
-    if action == "remove":
-        remove_video(folder, str(target))
-        return
-    if action == "add":
-        videos = [_add_video(folder, Path(str(target)), capture_rate)]
-    else:
-        videos, problems = read_videos(folder)
-        for problem in problems:
-            remark(f"left out: {problem}")
+    check_extra_installed()
+    if not film.is_file():
+        what = "no such file" if not film.exists() else "it is no file"
+        raise UsageError(what, where=str(film), expected="a film")
+    with (
+        show_progress(f"copying {film.name}") as report_step,
+        translate_storage_errors(film),
+        film.open("rb") as file,
+        IncomingVideo(folder, film.name, film.stat().st_size) as incoming,
+    ):
+        while chunk := file.read(_CHUNK_BYTES):
+            incoming.write(chunk)
+        report_step(f"reading {film.name}")
+        video = incoming.keep(lambda path: describe_film(path, str(film), capture_rate))
     if as_json:
-        items = [video.model_dump(mode="json") for video in videos]
-        print_json(items[0] if action == "add" else {"items": items})
+        print_json(video.model_dump(mode="json"))
+    else:
+        echo(_format_video(video))
+
+
+def video_list_command(
+    session: SessionArgument, data: DataOption = None, as_json: JsonOption = False
+) -> None:
+    """List the films of a session, oldest first."""
+    from storage.sessions.videos import read_videos
+
+    videos, problems = read_videos(_find_session_folder(session, data))
+    for problem in problems:
+        remark(f"left out: {problem}")
+    if as_json:
+        print_json({"items": [video.model_dump(mode="json") for video in videos]})
         return
     for video in videos:
         echo(_format_video(video))
+
+
+def video_remove_command(
+    session: SessionArgument, video: VideoArgument, data: DataOption = None
+) -> None:
+    """Delete a film with its alignment and tables."""
+    from storage.sessions.videos import remove_video
+
+    remove_video(_find_session_folder(session, data), video)
+
+
+@dataclass(frozen=True)
+class MarkerOptions:
+    """Options for two markers in the picture."""
+
+    tags: Annotated[
+        str | None,
+        typer.Option(metavar="LOWER,UPPER", help="Numbers of two ArUco tags (4x4_50) on the leg."),
+    ] = None
+    dots: Annotated[
+        str | None, typer.Option(help="Two dots along the leg: bright, or their colour.")
+    ] = None
+    lens: Annotated[
+        Path | None,
+        typer.Option(help="Film of a checkerboard by the same camera, for its distortion."),
+    ] = None
+    board: Annotated[
+        str, typer.Option(metavar="COLUMNSxROWS", help="Inner corners of the checkerboard.")
+    ] = "9x6"
+
+    def to_values(self) -> dict[str, Any]:
+        """Return them as arguments of `TrackOptions`.
+
+        Raises:
+            UsageError: a text is no pair of sensible numbers.
+        """
+        tags = None if self.tags is None else _parse_two(self.tags, ",", "--tags", "3,7")
+        if tags is not None and (max(tags) > _TAG_MAX or tags[0] == tags[1]):
+            raise UsageError(f"--tags {self.tags}", expected=f"two numbers from 0 to {_TAG_MAX}")
+        board = _parse_two(self.board, "x", "--board", "9x6")
+        if not min(board) >= 3 or not max(board) <= 100:
+            raise UsageError(f"--board {self.board}", expected="3 to 100 inner corners")
+        return {"tags": tags, "dots": self.dots, "lens": self.lens, "board": board}
+
+
+@add_options
+def video_align_command(
+    session: SessionArgument,
+    video: VideoArgument,
+    by: Annotated[
+        str,
+        typer.Option(help="light (the node's lamp), clock (page /clock), contact or hand."),
+    ],
+    near: Annotated[
+        float | None,
+        typer.Option(
+            min=-SECONDS_MAX,
+            max=SECONDS_MAX,
+            help="About when the film begins, seconds after the session's first frame, within 5 s.",
+        ),
+    ] = None,
+    picture: Annotated[
+        list[int] | None,
+        typer.Option(
+            metavar="N",
+            help="By contact: first picture of a contact, from 0: the page's number less 1 (repeat "
+            "for several); or name markers with --tags or --dots.",
+        ),
+    ] = None,
+    pair: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="N=SECONDS",
+            help="By hand: picture, from 0 (the page's number less 1), and its instant, seconds "
+            "after the first frame (repeat for several).",
+        ),
+    ] = None,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Replace an alignment that says otherwise.")
+    ] = False,
+    data: DataOption = None,
+    as_json: JsonOption = False,
+    *,
+    markers: MarkerOptions,
+) -> None:
+    """Find a film's time in its session, with its uncertainty, and keep it beside the film."""
+    from service.video.angle import TrackOptions
+    from service.video.methods import AlignmentOptions, align_video
+    from storage.sessions.videos import AlignmentMethod, find_video_folder, read_video
+
+    methods: dict[str, AlignmentMethod] = {each: each for each in get_args(AlignmentMethod)}
+    if by not in methods:
+        raise UsageError(f"--by {by}", expected=", ".join(methods))
+    for option, is_used, method in (
+        ("--picture", bool(picture), "contact"),
+        ("--pair", bool(pair), "hand"),
+        ("--tags and --dots", markers != MarkerOptions(), "contact"),
+    ):
+        if is_used and by != method:
+            raise UsageError(f"{option} is for --by {method}")
+    has_markers = markers.tags is not None or markers.dots is not None
+    if by == "contact" and bool(picture) == has_markers:
+        raise UsageError(
+            "touchdowns are not named, or twice",
+            expected="--picture of each, or markers of the foot by --tags or --dots",
+        )
+    pairs = [_parse_pair(text) for text in pair or []]
+    options = AlignmentOptions(
+        near_s=near,
+        pictures=tuple(picture or [number for number, _ in pairs]),
+        instants_s=tuple(instant_s for _, instant_s in pairs),
+        track=TrackOptions(**markers.to_values()).make_task_options() if has_markers else None,
+        replaces=replace,
+    )
+    folder = _find_session_folder(session, data)
+    name = read_video(find_video_folder(folder, video)).name
+    with show_progress(f"aligning {name}") as report_step:
+        aligned = align_video(
+            *(folder, video, methods[by], options),
+            lambda number: report_step(f"aligning {name}: {number} pictures"),
+        )
+    if as_json:
+        print_json(aligned.model_dump(mode="json"))
+    else:
+        _report_alignment(folder, aligned)
+
+
+@add_options
+def video_track_command(
+    session: SessionArgument,
+    video: Annotated[
+        str | None, typer.Argument(help="Id of the video; none for points in space.")
+    ] = None,
+    points: Annotated[
+        str | None,
+        typer.Option(metavar="LOWER,UPPER", help="Names of two points of --points-file."),
+    ] = None,
+    points_file: Annotated[
+        Path | None,
+        typer.Option(help="Points of another program: CSV of Kinovea or DeepLabCut, TRC, C3D."),
+    ] = None,
+    begin_s: Annotated[
+        float | None,
+        typer.Option(
+            help="Without a video: begin of --points-file, seconds after the first frame."
+        ),
+    ] = None,
+    forward: Annotated[
+        str | None,
+        typer.Option(help="The foot rolls to the right (default) or left; in space: x, -y."),
+    ] = None,
+    zero: Annotated[
+        float, typer.Option(help="Angle of the markers, degrees, at which the foot's is 0.")
+    ] = 0.0,
+    scale: Annotated[
+        float | None, typer.Option(help="Distance of the markers, mm; places are in m as well.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="Table to write, .parquet or .csv; default: beside the film."
+        ),
+    ] = None,
+    data: DataOption = None,
+    as_json: JsonOption = False,
+    *,
+    markers: MarkerOptions,
+) -> None:
+    """Write the foot's angle in each picture as a table, for `foottile estimate --angle`."""
+    from service.video.angle import TrackOptions, read_points_from, track_video
+    from storage.formats.angle_table import ANGLE_NAME, check_suffix
+    from storage.sessions.videos import find_video_folder, read_video
+
+    if [markers.tags, markers.dots, points_file].count(None) != 2:
+        raise UsageError(
+            "what to track is not clear", expected="one of --tags, --dots and --points-file"
+        )
+    if (points is None) != (points_file is None):
+        raise UsageError("--points are names in --points-file", expected="both or none")
+    names = (points or ",").split(",")
+    if len(names) != 2:
+        raise UsageError(f"--points {points}", expected="LOWER,UPPER")
+    if scale is not None and not 0.0 < scale < 1e5:
+        raise UsageError(f"--scale {scale:g}", expected="millimetres, above 0")
+    if not abs(zero) <= 360.0:
+        raise UsageError(f"--zero {zero:g}", expected="degrees")
+    options = TrackOptions(
+        **markers.to_values(),
+        points_file=points_file,
+        points=(names[0].strip(), names[1].strip()),
+        forward=forward,
+        zero_rad=math.radians(zero),
+        scale_m=None if scale is None else scale * 1e-3,
+    )
+    folder = _find_session_folder(session, data)
+    inputs = [path for path in (points_file, markers.lens) if path is not None]
+    if video is None:
+        if points_file is None or out is None or begin_s is None:
+            raise UsageError(
+                "no video is named",
+                expected="VIDEO; or --points-file, --begin-s and --out, of points in space",
+            )
+        check_suffix(out)
+        path = resolve_output_path(out, *inputs)
+        tracked = read_points_from(folder, options, begin_s)
+    elif begin_s is not None:
+        raise UsageError("--begin-s is for points in space", expected="no VIDEO, or no --begin-s")
+    else:
+        video_folder = find_video_folder(folder, video)
+        path = out or video_folder / ANGLE_NAME
+        check_suffix(path)
+        path = resolve_output_path(path, *inputs)
+        facts = read_video(video_folder)
+        with show_progress_bar(f"tracking {facts.name}", facts.film.picture_count) as show_done:
+            tracked = track_video(video_folder, facts, options, show_done)
+    tracked.table.write(path, tracked.places)
+    _report_track(path, tracked, as_json=as_json)
 
 
 def _find_session_folder(session: str, data: Path | None) -> Path:
@@ -120,30 +331,6 @@ def _find_session_folder(session: str, data: Path | None) -> Path:
     return path.parent
 
 
-def _add_video(folder: Path, film: Path, capture_rate_hz: float | None) -> Video:
-    from service.video.worker import check_extra_installed, describe_film
-    from storage.durable_files import translate_storage_errors
-    from storage.sessions.videos import IncomingVideo
-
-    check_extra_installed()
-    if not film.is_file():
-        what = "no such file" if not film.exists() else "it is no file"
-        raise UsageError(what, where=str(film), expected="a film")
-    with (
-        show_progress(f"copying {film.name}") as report_step,
-        translate_storage_errors(film),
-        film.open("rb") as file,
-        IncomingVideo(folder, film.name, film.stat().st_size) as incoming,
-    ):
-        while chunk := file.read(_CHUNK):
-            incoming.write(chunk)
-        report_step(f"reading {film.name}")
-        return incoming.keep(lambda path: describe_film(path, str(film), capture_rate_hz))
-
-
-_CHUNK = 4 << 20
-
-
 def _format_video(video: Video) -> str:
     film = video.film
     rate = f"{film.rate_hz:g} pictures/s" + (" (variable)" if film.is_variable else "")
@@ -152,3 +339,77 @@ def _format_video(video: Video) -> str:
         f"{video.id} {video.name}: {film.width_px} x {film.height_px}, {film.duration_s:.2f} s, "
         f"{film.picture_count} pictures, {rate}, {film.codec}, {video.size_bytes} bytes, {aligned}"
     )
+
+
+def _report_alignment(session_folder: Path, video: Video) -> None:
+    import numpy as np
+
+    from service.video.session_time import read_session_time
+    from storage.sessions.folder import FRAMES_NAME
+
+    alignment = video.alignment
+    assert alignment is not None  # noqa: S101
+    begin_t_ns = read_session_time(session_folder / FRAMES_NAME).begin_t_ns
+    ends_s = np.array([0.0, video.film.duration_s])
+    begin_s = 1e-9 * (alignment.t_ns - begin_t_ns + alignment.to_session_ns(ends_s)[0])
+    bound_ms = 1.96e-6 * alignment.compute_sigma_ns(ends_s).max()
+    count = alignment.pair_count
+    echo(
+        f"{video.name}: by {alignment.method}, begins {abs(begin_s):.4f} s "
+        f"{'after' if begin_s >= 0 else 'before'} the session, +- {bound_ms:.1f} ms (95 %) in all "
+        f"of it, from {count} instant{'s' if count != 1 else ''}"
+    )
+    echo(
+        f"drift: {1e6 * alignment.drift:.1f} +- {1.96e6 * alignment.sigma_drift:.1f} ppm (95 %)"
+        if alignment.sigma_drift < _DRIFT_KNOWN * video.film.drift_sigma
+        else f"drift: not measured, {1.96e6 * video.film.drift_sigma:.0f} ppm are allowed for"
+    )
+    if alignment.rejected_count:
+        remark(f"{alignment.rejected_count} instants contradict the others, and were left out")
+
+
+def _report_track(path: Path, tracked: TrackedAngle, *, as_json: bool) -> None:
+    import numpy as np
+
+    table = tracked.table
+    known = ~np.isnan(table.angle_rad)
+    low, high = (float(f(table.angle_rad[known])) for f in (np.min, np.max))
+    sigma_rad = float(np.median(table.sigma_rad[known]))
+    is_aligned = table.t_ns is not None
+    if as_json:
+        print_json(
+            {
+                "out": path,
+                "pictures": len(known),
+                "with_angle": int(known.sum()),
+                "angle_rad": [low, high],
+                "sigma_rad": sigma_rad,
+                "aligned": is_aligned,
+            }
+        )
+        return
+    echo(
+        f"{path}: {int(known.sum())} of {len(known)} pictures have an angle, "
+        f"{math.degrees(low):.1f} to {math.degrees(high):.1f} degrees, "
+        f"+- {math.degrees(sigma_rad):.2g} (1 sigma)"
+    )
+    if not is_aligned:
+        remark("the film is not aligned: `foottile video align` comes before `estimate --angle`")
+
+
+def _parse_pair(text: str) -> tuple[int, float]:
+    picture, _, seconds = text.partition("=")
+    try:
+        number, instant_s = int(picture), float(seconds)
+    except ValueError:
+        number, instant_s = -1, math.nan
+    if not abs(instant_s) <= SECONDS_MAX:
+        raise UsageError(f"--pair {text!r}", expected="a picture and its instant, as 120=3.52")
+    return number, instant_s
+
+
+def _parse_two(text: str, separator: str, option: str, example: str) -> tuple[int, int]:
+    parts = text.split(separator)
+    if len(parts) != 2 or not all(part.isdecimal() and len(part) < 4 for part in parts):
+        raise UsageError(f"{option} {text!r}", expected=f"two numbers, such as {example}")
+    return int(parts[0]), int(parts[1])

@@ -17,7 +17,7 @@ import pytest
 
 from devices.errors import StorageError
 from service.cli import commands
-from service.cli.main import SUMMARIES, get_command_function
+from service.cli.main import COMMANDS, GROUPS, SUMMARIES, get_command_function
 from service.cli.options import FootOptions, add_options
 from service.cli.reference_options import TableOptions
 from storage.permissions import set_umask_and_create_private_folder
@@ -36,7 +36,7 @@ SHORT = (
     "--out",
     "x.parquet",
 )
-COMMANDS: dict[str, tuple[object, ...]] = {
+ARGUMENTS: dict[str, tuple[object, ...]] = {
     "accept-node": ("bench", "--server", "http://127.0.0.1:1"),
     "benchmark": ("--out", "bench", "--scene", "gone.toml"),
     "bridge": ("foxglove", "--server", "http://127.0.0.1:1"),
@@ -62,7 +62,11 @@ COMMANDS: dict[str, tuple[object, ...]] = {
     "stream": ("bench", "--server", "http://127.0.0.1:1"),
     "invite": ("--server", "http://127.0.0.1:1", "--data", "."),
     "verify": ("s.parquet",),
-    "video": ("add", "s.parquet", "film.mp4"),
+    "video add": ("s.parquet", "film.mp4"),
+    "video align": ("s.parquet", "0" * 12, "--by", "hand"),
+    "video list": ("s.parquet",),
+    "video remove": ("s.parquet", "0" * 12),
+    "video track": ("s.parquet", "0" * 12, "--dots", "red"),
 }
 """For each command, arguments with which it ends within a moment."""
 
@@ -82,7 +86,7 @@ def options(*wanted: type) -> list[tuple[str, str]]:
     """Command and option, of these types."""
     of_foot = set(inspect.signature(add_options(FootOptions)).parameters)
     found = []
-    for command in SUMMARIES:
+    for command in COMMANDS:
         parameters = inspect.signature(get_command_function(command), eval_str=True).parameters
         for name, parameter in parameters.items():
             # An emulated foot is refused by one function, whoever asks for it.
@@ -94,7 +98,7 @@ def options(*wanted: type) -> list[tuple[str, str]]:
 
 
 def test_every_command_has_its_place_here() -> None:
-    assert set(SUMMARIES) == set(COMMANDS)
+    assert set(ARGUMENTS) == set(COMMANDS)
 
 
 @pytest.fixture(scope="module")
@@ -128,13 +132,13 @@ def check(outcome: Outcome, *codes: int) -> None:
 def test_an_absurd_number_is_refused_in_a_sentence(run_short: Run, command: str, name: str) -> None:
     option = f"--{name.replace('_', '-')}"
     for value in NUMBERS:
-        outcome = run_short(command, *COMMANDS[command], f"{option}={value}")
+        outcome = run_short(*command.split(), *ARGUMENTS[command], f"{option}={value}")
         check(outcome, *((2,) if value in NOT_FINITE else (0, 1, 2, 3)))
 
 
 @pytest.mark.parametrize("pair", ["nan,nan", "inf,0", "0,-inf", "1e308,1e308", "-1e308,1e308", "1"])
 def test_an_absurd_pair_of_numbers_is_refused_in_a_sentence(run_short: Run, pair: str) -> None:
-    check(run_short("estimate", *COMMANDS["estimate"], f"--tare-s={pair}"), 1, 2)
+    check(run_short("estimate", *ARGUMENTS["estimate"], f"--tare-s={pair}"), 1, 2)
     (Path.cwd() / "load.csv").write_text("time_s,fz_n,cop_x_m,cop_y_m\n0,9,0,0\n1,9,0,0\n")
     check(run_short(*SHORT, "--load", "load.csv", f"--cop-offset-m={pair}"), 0, 1, 2)
 
@@ -172,7 +176,8 @@ FILES = {"missing", "nowhere", "empty", "junk", "hole", "no Parquet"}
 """What may be written over."""
 
 
-POINTS = ("track", "s.parquet", "--begin-s", 0, "--points", "a,b", "--points-file")
+VIDEO = [name for name in COMMANDS if name.startswith("video ")]
+POINTS = ("s.parquet", "--begin-s", 0, "--points", "a,b", "--points-file")
 READ: dict[tuple[str, str], tuple[object, ...]] = {
     ("benchmark", "scene"): ("--out", "bench", "--scene", "{}"),
     ("calibrate", "recordings"): ("{}", "--out", "cal.json"),
@@ -185,8 +190,8 @@ READ: dict[tuple[str, str], tuple[object, ...]] = {
     ("estimate", "sessions"): ("{}", "--out", "x.parquet"),
     ("estimate", "manifest"): ("--manifest", "{}", "--out", "o"),
     ("estimate", "calibration"): ("s.parquet", "--out", "x.parquet", "--calibration", "{}"),
-    ("estimate", "scene"): (*COMMANDS["estimate"], "--scene", "{}"),
-    ("estimate", "angle"): (*COMMANDS["estimate"], "--angle", "{}"),
+    ("estimate", "scene"): (*ARGUMENTS["estimate"], "--scene", "{}"),
+    ("estimate", "angle"): (*ARGUMENTS["estimate"], "--angle", "{}"),
     ("export", "sessions"): ("{}", "--format", "csv", "--out", "x.csv"),
     ("export", "manifest"): ("--manifest", "{}", "--format", "csv", "--out", "o"),
     ("node", "scene"): ("--scene", "{}"),
@@ -196,10 +201,11 @@ READ: dict[tuple[str, str], tuple[object, ...]] = {
     ("simulate", "scene"): ("--scene", "{}", "--seconds", 1),
     ("simulate", "load"): ("--scene", "standing", "--load", "{}"),
     ("verify", "targets"): ("{}",),
-    ("video", "session"): ("list", "{}"),
-    ("video", "target"): ("add", "s.parquet", "{}"),
-    ("video", "lens"): ("track", "s.parquet", "0" * 12, "--dots", "red", "--lens", "{}"),
-    ("video", "points_file"): (*POINTS, "{}", "--out", "t.csv"),
+    **{(name, "session"): ("{}", *ARGUMENTS[name][1:]) for name in VIDEO},
+    ("video add", "film"): ("s.parquet", "{}"),
+    ("video align", "lens"): (*ARGUMENTS["video align"], "--lens", "{}"),
+    ("video track", "lens"): (*ARGUMENTS["video track"], "--lens", "{}"),
+    ("video track", "points_file"): (*POINTS, "{}", "--out", "t.csv"),
     ("verify", "manifest"): ("--manifest", "{}"),
     ("calibrate", "ca"): (
         *("--live", "--tile", "T01", "--out", "cal.json"),
@@ -208,7 +214,7 @@ READ: dict[tuple[str, str], tuple[object, ...]] = {
     ("node", "ca"): ("--scene", "standing", "--server", "https://127.0.0.1:1", "--ca", "{}"),
     ("sessions", "ca"): ("--server", "https://127.0.0.1:1", "--ca", "{}"),
     **{  # the last --server counts
-        (command, "ca"): (*COMMANDS[command], "--server", "https://127.0.0.1:1", "--ca", "{}")
+        (command, "ca"): (*ARGUMENTS[command], "--server", "https://127.0.0.1:1", "--ca", "{}")
         for command in ("accept-node", "bridge", "pull", "stream", "invite")
     },
 }
@@ -221,7 +227,7 @@ WRITTEN: dict[tuple[str, str], tuple[object, ...]] = {
     ),
     ("export", "out"): ("s.parquet", "--format", "csv", "--out", "{}"),
     ("query", "out"): ("SELECT 1", "--data", ".", "--out", "{}"),
-    ("video", "out"): (*POINTS, "k.csv", "--out", "{}"),
+    ("video track", "out"): (*POINTS, "k.csv", "--out", "{}"),
     ("simulate", "force_plate"): (*SHORT[1:], "--force-plate", "{}"),
     ("simulate", "out"): (*SHORT[1:-1], "{}"),
     ("simulate", "pressure_plate"): (*SHORT[1:], "--pressure-plate", "{}"),
@@ -245,7 +251,10 @@ IN_FOLDERS: dict[tuple[str, str], tuple[object, ...]] = {
     ("accept-node", "data"): ("bench", "--server", "http://127.0.0.1:1", "--data", "{}"),
     ("invite", "data"): ("--server", "http://127.0.0.1:1", "--data", "{}"),
     ("verify", "data"): ("20200101T000000Z-000000", "--data", "{}"),
-    ("video", "data"): ("list", "20200101T000000Z-000000", "--data", "{}"),
+    **{
+        (name, "data"): ("20200101T000000Z-000000", *ARGUMENTS[name][1:], "--data", "{}")
+        for name in VIDEO
+    },
 }
 
 
@@ -265,7 +274,7 @@ def test_a_wrong_kind_of_file_is_refused_in_a_sentence(
 ) -> None:
     for name, make in PLACES.items():
         make(tmp_path / name)
-        check(run_short(command, *given(READ[command, option], name)), 1, 2)
+        check(run_short(*command.split(), *given(READ[command, option], name)), 1, 2)
     assert not (tmp_path / "x.parquet").exists()
 
 
@@ -275,7 +284,7 @@ def test_an_output_in_the_place_of_a_special_file_is_refused_at_once(
 ) -> None:
     for name in PLACES.keys() - FILES:
         PLACES[name](tmp_path / name)
-        check(run_short(command, *given(WRITTEN[command, option], name)), 2)
+        check(run_short(*command.split(), *given(WRITTEN[command, option], name)), 2)
 
 
 @pytest.mark.parametrize(("command", "option"), IN_FOLDERS)
@@ -284,7 +293,7 @@ def test_a_file_in_the_place_of_a_folder_is_refused_in_a_sentence(
 ) -> None:
     for name in PLACES.keys() - FOLDERS:
         PLACES[name](tmp_path / name)
-        check(run_short(command, *given(IN_FOLDERS[command, option], name)), 1, 2)
+        check(run_short(*command.split(), *given(IN_FOLDERS[command, option], name)), 1, 2)
 
 
 def test_an_option_is_passed_on_by_its_name_on_the_command_line() -> None:
@@ -297,17 +306,17 @@ def test_an_option_is_passed_on_by_its_name_on_the_command_line() -> None:
 ODD = "odd\udcff"
 
 
-@pytest.mark.parametrize("command", SUMMARIES)
+@pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_refuses_an_argument_and_a_working_folder(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
-    arguments = COMMANDS[command]
-    refused = run(command, *arguments, ODD)
+    arguments = ARGUMENTS[command]
+    refused = run(*command.split(), *arguments, ODD)
     refused.fails(2, "not UTF-8", "odd\\udcff")
     assert refused.err.count("\n") == 1
     (tmp_path / ODD).mkdir()
     monkeypatch.chdir(tmp_path / ODD)
-    run(command, *arguments).fails(2, "the working folder is not UTF-8")
+    run(*command.split(), *arguments).fails(2, "the working folder is not UTF-8")
     assert list((tmp_path / ODD).iterdir()) == []
 
 
@@ -337,7 +346,7 @@ def test_a_session_in_such_a_folder_is_named_among_many(run: Run, tmp_path: Path
 # --- the table of commands ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", SUMMARIES)
+@pytest.mark.parametrize("name", [name for name in SUMMARIES if name not in GROUPS])
 def test_a_summary_is_the_first_sentence_of_its_command(name: str) -> None:
     said = inspect.getdoc(get_command_function(name))
     assert said is not None
@@ -354,7 +363,7 @@ def test_every_command_that_is_written_is_in_the_table() -> None:
         for line in path.read_text().splitlines()
         if line.startswith("def ") and "_command(" in line
     }
-    assert written == set(SUMMARIES)
+    assert written == {name.replace(" ", "-") for name in COMMANDS}
 
 
 def test_the_help_of_all_names_each_with_its_summary_and_that_of_one_is_its_own(run: Run) -> None:

@@ -76,7 +76,9 @@ COMMANDS: dict[str, tuple[tuple[object, ...], ...]] = {
         ("add", ID, f"{HOSTILE}.mp4"),
         ("list", HOSTILE),
         (HOSTILE, ID),
-        ("align", ID, HOSTILE),
+        ("align", ID, HOSTILE, "--by", "light"),
+        ("align", ID, "0" * 12, "--by", HOSTILE),
+        ("track", ID, HOSTILE, "--dots", HOSTILE),
     ),
     "verify": ((ID,), (), (HOSTILE,), ("--manifest", HOSTILE)),
     # What these print of names is the user's own, or a scene's, which has to be one of a few words.
