@@ -260,7 +260,7 @@ def calibrate_tile(scene: Scene, *, seed: int, parts_seed: int) -> Calibration:
     Raises:
         CalibrationError: the tile has no valid curve.
     """
-    name = f"mill-{scene.tile[0].serial}"
+    name = f"indenter-{scene.tile[0].serial}"
     with _record_indentation(scene, seed, parts_seed) as recordings:
         return fit_calibration(
             recordings, name=name, reference_name=RIG_REFERENCE, reference_delay=RIG_REFERENCE_DELAY

@@ -318,7 +318,7 @@ def run_reproduction(options: ReproduceOptions, folder: Path, report: ReportStep
         FootTileError: the server does not start, or the disk is not writable.
     """
     run = _Run(options, folder, report)
-    with run.measure_time("mill"):
+    with run.measure_time("indenter"):
         domes, calibration = _indent_tiles(run)
     experiments: tuple[ExperimentResult, ...] = ()
     angles = None

@@ -33,7 +33,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     quick = scene.model_dump() | {"ground": scene.ground.model_dump() | {"stroke_s": 2.0}}
     run_simulation(SimulationOptions(validate_scene(quick, where="quick")), path, None)
     pressed = read_indentations([path])
-    calibration = fit_calibration(pressed, name="bench", reference_name="mill")
+    calibration = fit_calibration(pressed, name="bench", reference_name="indenter")
     return calibration, {"T01": [one.indentation for one in pressed["T01"]]}
 
 

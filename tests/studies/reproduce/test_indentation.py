@@ -1,4 +1,4 @@
-"""What the mill's strokes say of a dome."""
+"""What the indenter's strokes say of a dome."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_the_pooled_spread_has_its_truth_in_95_of_100_intervals() -> None:
     assert 930 <= hits <= 970
 
 
-def test_every_dome_is_pressed_past_its_expected_end_and_within_the_mill_s_range() -> None:
+def test_every_dome_is_pressed_past_its_expected_end_and_within_the_indenter_s_range() -> None:
     loads_n = [make_dome_scene(dome).ground.load_n for dome in DOMES]  # type: ignore[union-attr]  # it has one
     assert pytest.approx(max(loads_n), rel=1e-3) == OVERLOAD_FACTOR * 41.65
     assert max(loads_n) < 50.0

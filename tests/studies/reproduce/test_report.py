@@ -25,19 +25,19 @@ def nothing(**failures: str) -> Reproduction:
         experiments=(),
         not_borne_n={},
         failures=failures,
-        seconds={"mill": 1.0},
+        seconds={"indenter": 1.0},
     )
 
 
 def test_a_run_of_which_everything_failed_says_so_and_draws_nothing() -> None:
-    result = nothing(mill="no curve", poppy="the node has ended")
+    result = nothing(indenter="no curve", poppy="the node has ended")
     text = format_reproduction_report(result)
     assert "## Not measured" in text
     assert "- poppy: the node has ended" in text
     assert ONE_FOOT in text
     assert "Table I" not in text
     assert draw_figures(result) == {}
-    assert result.as_dict()["failures"] == {"mill": "no curve", "poppy": "the node has ended"}
+    assert result.as_dict()["failures"] == {"indenter": "no curve", "poppy": "the node has ended"}
 
 
 def test_the_films_angle_is_reported_beside_the_servos() -> None:
