@@ -41,12 +41,11 @@ from storage.sessions.videos import (
 
 _NEAR_S = 5.0
 """Largest error of `near_s`."""
-COMMON_OF_TOUCHDOWNS = 0.5
-"""Part of a touchdown's uncertainty that all of a film share: the ground is the same."""
+COMMON_PART = 0.5
+"""Part of the uncertainty of touchdowns and of instants that a person chose, which all instants of
+a film share: ground and person are the same."""
 _LAMP_MARGIN_NS = 3_000_000_000
 """Time around a part in which its lamp's window may have its middle: half a window."""
-
-
 _LAMP_AMBIGUOUS_NS = 1e9
 """Difference of two pairs of a film that is no drift: they are of different times."""
 
@@ -286,9 +285,9 @@ def _pair_by_clock_page(film: _Film, time: SessionTime, _: AlignmentOptions) -> 
     )
 
 
-def compute_common_ns(method: AlignmentMethod, sigma_ns: Floats) -> float:
-    """Compute the standard deviation of what the instants of a film share, from their own."""
-    return COMMON_OF_TOUCHDOWNS * float(np.median(sigma_ns)) if method == "contact" else 0.0
+def compute_common_ns(sigma_ns: Floats) -> float:
+    """Compute the standard deviation that touchdowns or chosen instants share, from their own."""
+    return COMMON_PART * float(np.median(sigma_ns))
 
 
 def _pair_by_contact(film: _Film, time: SessionTime, options: AlignmentOptions) -> _Pairs:
@@ -316,20 +315,22 @@ def _pair_by_contact(film: _Film, time: SessionTime, options: AlignmentOptions) 
         film_s=at_s[rows],
         t_ns=1e9 * contacts.at_s[numbers],
         sigma_ns=1e9 * np.hypot(sigma_s[rows], contacts.sigma_s[numbers]),
-        common_ns=compute_common_ns("contact", 1e9 * sigma_s[rows]),
+        common_ns=compute_common_ns(1e9 * sigma_s[rows]),
     )
 
 
 def _pair_by_hand(film: _Film, time: SessionTime, options: AlignmentOptions) -> _Pairs:
     if len(options.instants_s) != len(options.pictures):
         raise UsageError("by hand each picture needs its instant", where=film.video.name)
+    sigma_ns = np.full(
+        len(options.pictures),
+        math.hypot(1e9 * film.pick_sigma_s, time.period_ns / math.sqrt(12.0)),
+    )
     return _Pairs(
         film_s=film.find_pictures(options.pictures),
         t_ns=1e9 * np.array(options.instants_s),
-        sigma_ns=np.full(
-            len(options.pictures),
-            math.hypot(1e9 * film.pick_sigma_s, time.period_ns / math.sqrt(12.0)),
-        ),
+        sigma_ns=sigma_ns,
+        common_ns=compute_common_ns(sigma_ns),
     )
 
 

@@ -17,7 +17,7 @@ from service.video.alignment import (
     match_contacts,
 )
 from service.video.contact import find_touchdowns
-from service.video.methods import COMMON_OF_TOUCHDOWNS
+from service.video.methods import COMMON_PART
 from storage.sessions.videos import DRIFT_SIGMA, Alignment
 from tests.service.video.test_contact import SECONDS, draw_marker_height
 
@@ -102,7 +102,7 @@ def test_films_of_hops_are_aligned_within_a_picture_as_surely_as_they_say() -> N
         at_s, film_sigma_s = np.array(find_touchdowns(film_s, height_px)).T
         try:
             touchdowns = Instants(at_s, film_sigma_s, SECONDS)
-            found = align(touchdowns, contacts, COMMON_OF_TOUCHDOWNS)
+            found = align(touchdowns, contacts, COMMON_PART)
         except FileFormatError:  # three hops of sixteen: another match is as likely
             continue
         middle_s = np.array([found.film_s])

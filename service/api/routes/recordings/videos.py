@@ -245,15 +245,16 @@ async def align_video(
     session = _require_sealed_with_frames(session_id, server)
     folder, video = await run_in_threadpool(_read, session_id, video_id, server)
     begin_t_ns = session.started_t_ns
+    sigma_ns = np.array([pair.sigma_ns for pair in body.pairs])
     fit = partial(
         fit_alignment,
         body.method,
         np.array([pair.film_s for pair in body.pairs]),
         np.array([float(pair.t_ns - begin_t_ns) for pair in body.pairs]),
-        np.array([pair.sigma_ns for pair in body.pairs]),
+        sigma_ns,
         begin_t_ns=begin_t_ns,
         drift_sigma=video.film.drift_sigma,
-        common_ns=compute_common_ns(body.method, np.array([p.sigma_ns for p in body.pairs])),
+        common_ns=compute_common_ns(sigma_ns),
     )
     aligned = run_with_usage_errors(fit)
     store = partial(store_alignment, folder, aligned, replaces=replace)
