@@ -16,11 +16,12 @@ from pathlib import Path
 from typing import Literal
 
 from devices.clock import server_utc_ns
-from devices.errors import DamagedFramesError, FootTileError, StateError, StorageError
+from devices.errors import DamagedFramesError, FootTileError, StateError
 from service.estimation.compilation import is_compiling
-from service.protocol.link import ClockSample, RetentionMessage, StreamNumbers
+from service.protocol.link import RetentionMessage, StreamNumbers
 from service.server.node import ServerNode
 from service.server.nodes import NodeRegistry
+from service.server.session_clocks import SessionClocks
 from service.server.session_store import SessionStore, check_revision, user_fields_revision
 from service.server.streams import ServerStream
 from service.sessions.edges import (
@@ -60,8 +61,6 @@ from storage.sessions.metadata import write_markers
 log = logging.getLogger("foottile.recorder")
 
 MAX_DELAY_S = 2.0
-CLOCK_ERROR_MAX_NS = 60_000_000_000
-"""Tolerance: eight probes take up to 40 s on a very poor link."""
 _RETRY_S = 10.0
 _COMPILE_POLL_S = 0.1
 _UNREADABLE_JOURNAL = "a journal cannot be read now, and is retried: see the server's problems"
@@ -94,8 +93,7 @@ class Recorder:
         self._failures: dict[str, str] = {}
         self._edge_ids: dict[str, set[str]] = {}
         """Ids of the edges that a session being recorded has as markers."""
-        for session in store.list_unsealed():
-            store.cache(self._with_clock_offsets(session))
+        self.clocks = SessionClocks(store, nodes)
 
     def list_recording(self, node: str) -> list[Session]:
         """Return the sessions that are being recorded on a node."""
@@ -216,7 +214,7 @@ class Recorder:
             StorageError: it cannot be moved.
         """
         store = self._store
-        store.cache(self._with_clock_offsets(store.trash.restore(session_id, store.folder)))
+        store.cache(self.clocks.add_missing_rows(store.trash.restore(session_id, store.folder)))
         self.advance_unsealed_sessions()
         store.on_change(store.get_session(session_id))
         return store.get_session(session_id)
@@ -410,55 +408,6 @@ class Recorder:
             markers = (*session.markers, *new)
             self._store.cache(session.model_copy(update={"markers": markers}))
 
-    def cache_missing_clock_offsets(self, node: ServerNode) -> None:
-        """Add missing clock measurements to a node's unsealed sessions, in memory.
-
-        Measurements are missing after a first contact, and for streams into which a session was
-        extended.
-        """
-        for session in self._store.list_unsealed(node.name):
-            if session.state != "sealing":
-                self._store.cache(self._with_clock_offsets(session))
-
-    def record_plausible_clock_offset(
-        self, node: ServerNode, row: ClockSample, now_t_ns: int
-    ) -> None:
-        """Record a plausible measurement of a node's clock, in its stream and its sessions.
-
-        A measurement is dropped if its server time is far from the present time, or its node time
-        far from the clock that the hello stated. Others go into the stream's log at once; sessions
-        are saved with their next change.
-        """
-        stated_t_ns = row.t_mono_ns + node.last_info.utc_offset_ns + row.server_minus_node_ns
-        if abs(stated_t_ns - now_t_ns) > CLOCK_ERROR_MAX_NS + row.uncertainty_ns:
-            log.warning(
-                "node %s: a measurement of its clock is not kept: it has this server's clock "
-                "%.0f s off. Was that set just now?",
-                node.name,
-                (stated_t_ns - now_t_ns) * 1e-9,
-            )
-            return
-        limit = node.present_stream.limit
-        if limit is not None and not limit.is_near_stated_clock(
-            row.t_mono_ns, row.uncertainty_ns, now_t_ns
-        ):
-            log.warning(
-                "node %s: a measurement of its clock is not kept: its time is not the one that the "
-                "node stated at connecting",
-                node.name,
-            )
-            return
-        try:
-            node.present_stream.record_clock_offset(row)
-        except StorageError as error:  # the measurement is used all the same
-            log.warning("node %s: %s", node.name, error)
-        offset = node.present_stream.clock_offsets[-1]
-        for session in self._store.list_unsealed(node.name):
-            is_its_own = any(part.stream_id == node.stream_id for part in session.parts)
-            if is_its_own and session.state != "sealing":
-                clock = (*session.clock, offset)
-                self._store.cache(session.model_copy(update={"clock": clock}))
-
     def _clear_failure(self, session_id: str) -> None:
         """Drop the record of a failed sealing: retry at once and do not report the failure."""
         self._retry_after_s.pop(session_id, None)
@@ -547,22 +496,3 @@ class Recorder:
         finally:
             self._edge_ids.pop(session_id, None)
             del self._sealing[session_id]
-
-    def _with_clock_offsets(self, session: Session) -> Session:
-        node = self._nodes.find(session.node)
-        if session.state == "sealed" or node is None:
-            return session
-        try:
-            for stream_id in dict.fromkeys(part.stream_id for part in session.parts):
-                stream = node.streams.get(stream_id)
-                times_ns = [row.t_mono_ns for row in session.clock if row.stream_id == stream_id]
-                # A log may be long: read it only if the session lacks its newest row.
-                if (
-                    stream is not None
-                    and stream.clock_offset is not None
-                    and (stream.clock_offset.t_mono_ns > max(times_ns, default=-1))
-                ):
-                    session = session.with_newer_clock_rows(stream.read_clock_offsets())
-        except StorageError as error:  # frames matter more than clock measurements
-            log.warning("session %s: %s", session.id, error)
-        return session

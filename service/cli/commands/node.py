@@ -185,8 +185,8 @@ def _ask_for_server(folder: Path, ca: Path | None) -> str:
     """Return the id of a server that a person chooses on a terminal; empty: there is no choice."""
     from foottile.local_server import find_local_server
     from service.discovery import search_once
-    from service.node.running_node import ServerSecrets
     from service.node.server_finder import describe_candidates, list_candidates
+    from service.node.server_secrets import ServerSecrets
 
     if not sys.stdin.isatty() or find_local_server(LOCAL_URL) is not None:
         return ""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from service.node.running_node import ServerSecrets
+from service.node.server_secrets import ServerSecrets
 from storage.permissions import SECRETS_NAME, read_secrets_or_empty
 from tests.storage.faulty_disk import NO_SPACE, refusing
 
@@ -70,6 +70,6 @@ def test_a_damaged_file_is_set_aside_and_another_secret_is_made(
 def test_the_secrets_of_the_newest_servers_only_are_kept(
     tmp_path: Path, secrets: ServerSecrets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.node.running_node._SERVERS_MAX", 3)
+    monkeypatch.setattr("service.node.server_secrets._SERVERS_MAX", 3)
     shared = {server: secrets.get_or_create_secret(server) for server in "abcde"}
     assert read_secrets_or_empty(tmp_path / SECRETS_NAME) == {s: shared[s] for s in "cde"}

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import ChangedError, StateError, StorageError
-from service.node.running_node import ServerSecrets
+from service.node.server_secrets import ServerSecrets
 from service.protocol.codec import CloseConnection, LinkCloseCode
 from service.protocol.link import Proof, compute_fingerprint, generate_secret, make_proof
 from service.server.nodes import IdentityClaim, NodeIdentities

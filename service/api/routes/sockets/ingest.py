@@ -165,7 +165,7 @@ def _registered_node(server: Server, hello: Hello, claim: IdentityClaim) -> Iter
     try:
         node = server.nodes.check_hello_and_get_or_create(hello)
         node.apply_checked_hello(hello, server_utc_ns())
-        server.recorder.cache_missing_clock_offsets(node)
+        server.recorder.clocks.cache_missing_rows(node)
         server.recorder.extend_node_sessions(node)
     except Exception as error:
         if is_new:
@@ -236,7 +236,7 @@ async def _receive_messages(socket: WebSocket, server: Server, link: NodeLink) -
             case StreamSelect(stream_id=stream_id):
                 link.stream = _find_announced_stream(node, stream_id)
             case ClockSample():
-                server.recorder.record_plausible_clock_offset(node, parsed, server_utc_ns())
+                server.recorder.clocks.record_plausible_row(node, parsed, server_utc_ns())
             case NodeStatus():
                 node.present_stream.missed_slots = parsed.missed_slots
                 node.warnings, node.fault_counts = parsed.warnings, parsed.counts
