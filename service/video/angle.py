@@ -31,6 +31,7 @@ class TrackOptions:
     Attributes:
         tags: numbers of the lower and the upper ArUco tag.
         dots: `bright`, or the colour of two dots.
+        area_px: part of the pictures with the markers, see `track_markers`; None: all.
         lens: film of a checkerboard, taken by the same camera.
         board: inner corners along its rows and its columns.
         points_file: file of another program, in place of tracking.
@@ -42,6 +43,7 @@ class TrackOptions:
 
     tags: tuple[int, int] | None = None
     dots: str | None = None
+    area_px: tuple[int, ...] | None = None
     lens: Path | None = None
     board: tuple[int, int] = (9, 6)
     points_file: Path | None = None
@@ -61,6 +63,7 @@ class TrackOptions:
         return {
             "tags": self.tags,
             "dots": self.dots,
+            "area_px": self.area_px,
             "lens": None if self.lens is None else str(self.lens),
             "board": self.board,
         }

@@ -62,10 +62,11 @@ FindMarkers = Callable[[Picture], Floats | None]
 
 def track_markers(
     path: Path,
-    picture_count: int,
+    film: FilmInfo,
     find_markers: FindMarkers,
     *,
     is_grey: bool,
+    area_px: tuple[int, int, int, int] | None = None,
     lens: Lens | None = None,
     on_picture: Callable[[int], None] = lambda _: None,
 ) -> Floats:
@@ -73,9 +74,11 @@ def track_markers(
 
     Args:
         path: the film.
-        picture_count: number of its pictures.
+        film: its facts.
         find_markers: finds them in a picture.
         is_grey: whether it takes grey pictures.
+        area_px: left, top, width and height of the part of the pictures in which markers are
+            looked for; None: all.
         lens: of the camera, by a checkerboard.
         on_picture: called with the number of each picture.
 
@@ -84,19 +87,28 @@ def track_markers(
         where a marker is hidden.
 
     Raises:
-        FileFormatError: the film is damaged, or no picture shows both markers.
+        FileFormatError: the film is damaged, or no picture shows both markers, and only these.
+        UsageError: the area reaches beyond the pictures.
     """
-    places_px = np.full((picture_count, 2, 2), math.nan)
+    places_px = np.full((film.picture_count, 2, 2), math.nan)
+    left, top, width, height = area_px or (0, 0, film.width_px, film.height_px)
+    if left + width > film.width_px or top + height > film.height_px:
+        raise UsageError(
+            f"the area reaches to {left + width}, {top + height}",
+            where=str(path),
+            expected=f"a part of {film.width_px} x {film.height_px} pixels",
+        )
     for index, picture in iterate_pictures(path, is_grey=is_grey):
-        found = find_markers(picture)
-        if found is not None and index < picture_count:
-            places_px[index] = found
+        found = find_markers(picture[top : top + height, left : left + width])
+        if found is not None and index < film.picture_count:
+            places_px[index] = found + np.array([left, top])
         on_picture(index)
     if np.isnan(places_px).all():
         raise FileFormatError(
-            "no picture shows both markers",
+            "no picture shows both markers, and no others",
             where=str(path),
-            remedy="Look at the film: tags need a white border, and 5 pixels a square",
+            remedy="Look at the film: tags need a white border, and 5 pixels a square; leave out "
+            "other things of the dots' colour by --area",
         )
     return places_px if lens is None else undistort(places_px, lens)
 
@@ -202,7 +214,7 @@ def _intersect_diagonals(corners: Floats) -> Floats:
 
 
 def make_dot_finder(colour: str) -> FindMarkers:
-    """Make a finder of two dots, the lower one first.
+    """Make a finder of two dots, the lower one first; of three it is not known which are meant.
 
     Args:
         colour: `bright`, or a name of `_COLOURS_HUE`.
@@ -236,18 +248,15 @@ def make_dot_finder(colour: str) -> FindMarkers:
         weights = np.ascontiguousarray(whole[top : top + height, left : left + width])
         if not weights.size:
             return None
-        count, labels, stats, _ = cv2.connectedComponentsWithStats(weights)
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(weights)
         areas = stats[1:, cv2.CC_STAT_AREA].astype(np.float64)
         sizes = stats[1:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)
         least, most = _DOT_AREA_PX
         is_dot = (areas >= least) & (areas <= most * whole.size)
         is_dot &= areas >= _DOT_ROUNDNESS * math.pi / 4 * sizes**2
         dots = np.flatnonzero(is_dot) + 1
-        if count < 3 or len(dots) < 2:
+        if len(dots) != 2:
             return None
-        dots = dots[np.argsort(-areas[dots - 1])][:2]
-        if len(np.flatnonzero(is_dot)) > 2 and areas[dots[1] - 1] < 2 * np.sort(areas[is_dot])[-3]:
-            return None  # a third one is as large: which two are meant is not known
         places = np.stack([_weighted_middle(weights, labels, stats, int(dot)) for dot in dots])
         return np.asarray(places[np.argsort(-places[:, 1])] + np.array([left, top]))
 

@@ -256,6 +256,7 @@ def _track(
     path: Path,
     tags: tuple[int, int] | None = None,
     dots: str | None = None,
+    area_px: tuple[int, int, int, int] | None = None,
     lens: str | None = None,
     board: tuple[int, int] = (0, 0),
     capture_rate_hz: float | None = None,
@@ -271,9 +272,10 @@ def _track(
     film, times_s = read_film(path, capture_rate_hz)
     places_px = track_markers(
         path,
-        film.picture_count,
+        film,
         make_tag_finder(*tags) if tags is not None else make_dot_finder(dots or ""),
         is_grey=tags is not None or dots == "bright",
+        area_px=area_px,
         lens=None if lens is None else calibrate_lens(Path(lens), *board, film, _report),
         on_picture=_report,
     )

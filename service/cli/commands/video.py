@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
@@ -118,6 +119,14 @@ class MarkerOptions:
     dots: Annotated[
         str | None, typer.Option(help="Two dots along the leg: bright, or their colour.")
     ] = None
+    area: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,WIDTH,HEIGHT",
+            help="Part of the pictures in which the markers are, pixels from the left upper "
+            "corner; default: all.",
+        ),
+    ] = None
     lens: Annotated[
         Path | None,
         typer.Option(help="Film of a checkerboard by the same camera, for its distortion."),
@@ -132,13 +141,32 @@ class MarkerOptions:
         Raises:
             UsageError: a text is no pair of sensible numbers.
         """
-        tags = None if self.tags is None else _parse_two(self.tags, ",", "--tags", "3,7")
+        tags = self._parse("tags", "3,7")
         if tags is not None and (max(tags) > _TAG_MAX or tags[0] == tags[1]):
             raise UsageError(f"--tags {self.tags}", expected=f"two numbers from 0 to {_TAG_MAX}")
-        board = _parse_two(self.board, "x", "--board", "9x6")
-        if not min(board) >= 3 or not max(board) <= 100:
+        area_px = self._parse("area", "400,0,600,1080")
+        if area_px is not None and not min(area_px[2:]) > 0:
+            raise UsageError(f"--area {self.area}", expected="a width and a height above 0")
+        board = self._parse("board", "9x6")
+        if board is None or not min(board) >= 3 or not max(board) <= 100:
             raise UsageError(f"--board {self.board}", expected="3 to 100 inner corners")
-        return {"tags": tags, "dots": self.dots, "lens": self.lens, "board": board}
+        return {
+            "tags": tags,
+            "dots": self.dots,
+            "area_px": area_px,
+            "lens": self.lens,
+            "board": board,
+        }
+
+    def _parse(self, option: str, example: str) -> tuple[int, ...] | None:
+        """Return the numbers of an option, as many and separated as in an example."""
+        text = getattr(self, option)
+        if text is None:
+            return None
+        pattern = re.sub(r"\d+", r"\\d{1,5}", re.escape(example))
+        if not re.fullmatch(pattern, text, re.ASCII):
+            raise UsageError(f"--{option} {text!r}", expected=f"numbers, such as {example}")
+        return tuple(map(int, re.findall(r"\d+", text)))
 
 
 @add_options
@@ -406,10 +434,3 @@ def _parse_pair(text: str) -> tuple[int, float]:
     if not abs(instant_s) <= SECONDS_MAX:
         raise UsageError(f"--pair {text!r}", expected="a picture and its instant, as 120=3.52")
     return number, instant_s
-
-
-def _parse_two(text: str, separator: str, option: str, example: str) -> tuple[int, int]:
-    parts = text.split(separator)
-    if len(parts) != 2 or not all(part.isdecimal() and len(part) < 4 for part in parts):
-        raise UsageError(f"{option} {text!r}", expected=f"two numbers, such as {example}")
-    return int(parts[0]), int(parts[1])

@@ -61,7 +61,7 @@ def test_the_angle_of_each_picture_is_right_within_what_it_says(
     assert film.is_variable
     np.testing.assert_allclose(times_s, begin_s, atol=1e-3)
     find = make_tag_finder(LOWER_TAG, UPPER_TAG) if marks == "tags" else make_dot_finder("bright")
-    places_px = track_markers(path, film.picture_count, find, is_grey=True)
+    places_px = track_markers(path, film, find, is_grey=True)
     angle_rad, sigma_rad = compute_angle(places_px * (1.0, -1.0), zero_rad=0.0)
     # The upper marker, which turns, is at 0.3 of the height: so late is its row.
     late_s = (0.5 * camera.exposure + 0.3 * camera.readout) / camera.rate_hz
@@ -146,15 +146,15 @@ def draw_dots(*dots: tuple[int, int, int], colour: tuple[int, int, int]) -> Pict
     return picture
 
 
-def test_two_dots_of_a_colour_are_found_and_of_three_alike_none() -> None:
+def test_two_dots_of_a_colour_are_found_and_of_three_none() -> None:
     red, blue = (30, 30, 220), (220, 60, 30)
     find = make_dot_finder("red")
-    picture = draw_dots((40, 100, 6), (70, 20, 6), (120, 60, 2), colour=red)
+    picture = draw_dots((40, 100, 6), (70, 20, 6), (120, 60, 1), colour=red)
     cv2.circle(picture, (130, 100), 12, blue, -1)
     found = find(picture)
     assert found is not None
     np.testing.assert_allclose(found, [[40, 100], [70, 20]], atol=0.3)
-    assert find(draw_dots((40, 100, 6), (70, 20, 6), (120, 60, 6), colour=red)) is None
+    assert find(draw_dots((40, 100, 6), (70, 20, 6), (120, 60, 2), colour=red)) is None
     assert find(draw_dots((40, 100, 6), colour=red)) is None
     assert find(draw_dots((40, 100, 6), (70, 20, 6), colour=blue)) is None
     streak = draw_dots((40, 100, 6), (70, 20, 6), colour=red)
@@ -162,6 +162,27 @@ def test_two_dots_of_a_colour_are_found_and_of_three_alike_none() -> None:
     found = find(streak)
     assert found is not None
     np.testing.assert_allclose(found, [[40, 100], [70, 20]], atol=0.3)
+
+
+def test_a_lamp_is_no_dot_but_in_the_area_of_the_dots(tmp_path: Path) -> None:
+    camera = Camera()
+    begin_s = (np.arange(PICTURES) / camera.rate_hz).tolist()
+    generator = np.random.default_rng(7)
+    pictures = film_leg(
+        camera, begin_s, swing, generator, marks="dots", lamp_at=lambda at_s, _: at_s > begin_s[8]
+    )
+    path = write_film(tmp_path / "film.mp4", camera, pictures, begin_s)
+    film, _ = read_film(path)
+    find = make_dot_finder("bright")
+    whole = track_markers(path, film, find, is_grey=True)
+    assert np.flatnonzero(~np.isnan(whole[:, 0, 0])).tolist() == [*range(8)]
+    area_px = 40, 0, camera.width - 40, camera.height
+    beside = track_markers(path, film, find, is_grey=True, area_px=area_px)
+    assert np.isfinite(beside).all()
+    np.testing.assert_allclose(beside[:8], whole[:8])
+    beyond_px = 41, *area_px[1:]
+    with pytest.raises(UsageError, match=f"reaches to {camera.width + 1}, {camera.height}"):
+        track_markers(path, film, find, is_grey=True, area_px=beyond_px)
 
 
 def test_a_checkerboard_gives_the_lens_and_its_distortion_is_removed(tmp_path: Path) -> None:
@@ -245,7 +266,7 @@ def test_a_film_without_markers_and_one_that_breaks_off_are_refused(tmp_path: Pa
     blank = [np.full((camera.height, camera.width), 90, np.uint8)] * 12
     path = write_film(tmp_path / "blank.mkv", camera, blank, begin_s)
     with pytest.raises(FileFormatError, match="no picture shows both markers"):
-        track_markers(path, 12, make_tag_finder(1, 2), is_grey=True)
+        track_markers(path, read_film(path)[0], make_tag_finder(1, 2), is_grey=True)
     with pytest.raises(UsageError, match="beige"):
         make_dot_finder("beige")
     cut = tmp_path / "cut.mp4"
