@@ -108,7 +108,7 @@ def estimate_command(
     from service.offline.archive.locations import is_remote
     from service.offline.archive.tasks import EstimateTask
     from service.offline.estimate.session import estimate_session
-    from service.offline.estimate.table_angle import read_angle_track
+    from service.offline.estimate.table_angle import check_film_of_session, read_angle_track
     from service.offline.estimate_summary import (
         compute_estimate_change,
         read_stored_estimates,
@@ -148,8 +148,10 @@ def estimate_command(
         _add_suffix(Path(out)),
         *(Path(name) for name in (calibration, scene, angle) if name is not None),
     )
-    track = None if angle is None else read_angle_track(angle)
     source = session / FRAMES_NAME if session.is_dir() else session
+    track = None if angle is None else read_angle_track(angle)
+    if angle is not None:
+        check_film_of_session(angle, source)
     with show_progress(f"estimating {session}"):
         before = read_stored_estimates(source)
         result = estimate_session(source, path, task, on_remark=remark, angle=track)

@@ -147,6 +147,8 @@ def estimate_session(
             watched = servo.restore_positions(watched)
         written = replace(what, info=info)
         frames = _write_estimates(out, written, notes, stream, watched, on_remark)
+    if servo is not None:
+        on_remark(servo.describe_use())
     if not frames or stream.plan is None:
         problem = "the session has no frames" + (
             "" if part.has_all_rows_and_columns else " in that time"

@@ -19,11 +19,14 @@ import numpy.typing as npt
 from devices.arrays import Columns, Floats, Times
 from devices.errors import FileFormatError, UsageError
 from devices.flags import FrameFlag
-from devices.frames import NO_SERVO_COUNTS, ArrayInfo, ServoInfo
+from devices.frames import NO_SERVO_COUNTS, ArrayInfo, FrameBatch, ServoInfo
 from devices.scene.scene_file import Scene
+from service.estimation.foot import compute_segment_rad_per_count
 from service.offline.estimate.preparation import BatchWithColumns
 from storage.formats.angle_table import UNKNOWN_ANGLE, VIDEO, read_angle_table
 from storage.parquet_hash import compute_sha256
+from storage.sessions.folder import FRAMES_NAME
+from storage.sessions.reader import SealedFileReader
 from storage.sessions.time_axis import TimeAxis
 from storage.sessions.videos import VIDEO_NAME, read_video
 
@@ -96,6 +99,31 @@ class AngleTrack:
         )
 
 
+def check_film_of_session(table: Path, source: Path) -> None:
+    """Check that the film that a table lies beside is one of the session that it is used for.
+
+    Args:
+        table: the table.
+        source: the session's file.
+
+    Raises:
+        UsageError: the film's session is of another stream.
+        FileFormatError: one of the sessions is damaged.
+    """
+    folder = table.parent.parent
+    if not (table.parent / VIDEO_NAME).exists() or not (folder / FRAMES_NAME).exists():
+        return
+    streams = set()
+    for path in (source, folder / FRAMES_NAME):
+        with SealedFileReader(path, only_slices=True) as session:
+            streams.add(session.info.stream_id)
+    if len(streams) > 1:
+        raise UsageError(
+            f"{table} is of a film of another session, {folder.name}",
+            expected=f"a film of {source}",
+        )
+
+
 def read_angle_track(path: Path) -> AngleTrack:
     """Read a table of angles; a film's times are converted by the alignment beside it.
 
@@ -152,7 +180,9 @@ class TableServo:
     ) -> None:
         servo = info.servo or (None if scene is None else scene.servo)
         self._travel = None if servo is None else servo.ankle_travel_m_per_rad
-        self._track, self._axis = track, axis
+        self._track, self._axis, self._own = track, axis, info.servo
+        self._frame_count = self._known_count = self._compared_count = 0
+        self._apart_rad2 = 0.0
         self.info = info.model_copy(
             update={
                 "servo": ServoInfo(
@@ -186,6 +216,7 @@ class TableServo:
         for frames, columns in pieces:
             t_ns = self._axis.shift_to_axis(frames.t_ns, columns.get("part"))
             angle_rad, sigma_rad, source = self._track.interpolate(t_ns)
+            self._count(frames, angle_rad)
             counts = np.rint(angle_rad * (_COUNTS_PER_TURN / (2.0 * math.pi)))
             given = replace(
                 frames,
@@ -195,6 +226,29 @@ class TableServo:
             )
             kept = {name: getattr(frames, name) for name in _REPLACED}
             yield given, {**columns, **kept, "angle_source": source, "angle_sigma_rad": sigma_rad}
+
+    def _count(self, frames: FrameBatch, angle_rad: Floats) -> None:
+        self._frame_count += len(frames)
+        self._known_count += int((~np.isnan(angle_rad)).sum())
+        if self._own is None:
+            return
+        is_read = (frames.servo_counts != NO_SERVO_COUNTS) & (frames.frame_flags & _UNKNOWN == 0)
+        rad_per_count = compute_segment_rad_per_count(self._own)
+        own_rad = (frames.servo_counts - self._own.zero_counts) * rad_per_count
+        apart_rad = (angle_rad - own_rad)[is_read & ~np.isnan(angle_rad)]
+        self._compared_count += len(apart_rad)
+        self._apart_rad2 += float(apart_rad @ apart_rad)
+
+    def describe_use(self) -> str:
+        """Describe how many frames have an angle, and how far it is from the servo's."""
+        share = self._known_count / max(self._frame_count, 1)
+        said = f"the table has an angle in {100 * share:.0f} % of the frames"
+        if self._compared_count:
+            apart_deg = math.degrees(math.sqrt(self._apart_rad2 / self._compared_count))
+            said += f"; it differs from the servo's by {apart_deg:.2g} degrees (RMS)"
+        if self._travel is None:
+            said += "; without the ankle's travel, of a --scene, there is no COP on the ground"
+        return said
 
     def restore_positions(self, pieces: Iterable[BatchWithColumns]) -> Iterator[BatchWithColumns]:
         """Yield estimated frames with their own servo, and the uncertainty on the ground."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,14 +15,20 @@ from devices.flags import FrameFlag
 from devices.frames import NO_SERVO_COUNTS, ServoInfo
 from service.offline.estimate.preparation import EstimateRequest
 from service.offline.estimate.session import estimate_session
-from service.offline.estimate.table_angle import AngleTrack, read_angle_track
+from service.offline.estimate.table_angle import (
+    AngleTrack,
+    check_film_of_session,
+    read_angle_track,
+)
 from storage.formats.angle_table import ANGLE_NAME, AngleTable
 from storage.formats.slice import Slice
 from storage.schema import ANGLE_COLUMNS, ESTIMATE_COLUMNS, MEASURED_COLUMNS
+from storage.sessions.folder import FRAMES_NAME
 from storage.sessions.reader import SealedFileReader
-from storage.sessions.videos import Alignment, Video, write_video
+from storage.sessions.videos import VIDEO_NAME, Alignment, Video, write_video
 from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array, make_servo
+from tests.builders.frames import make_frames
 from tests.service.sessions.pieces import calibration, frames, hopping
 from tests.storage.sessions.test_videos import INFO
 
@@ -106,6 +113,38 @@ def test_the_tables_angle_moves_the_ground_and_nothing_else(raw: Path, tmp_path:
     np.testing.assert_allclose(
         by_table["cop_ground_x_m"][on_ground], expected_m[on_ground], atol=1e-6
     )
+
+
+def test_how_far_the_table_reaches_and_agrees_with_the_servo_is_said(tmp_path: Path) -> None:
+    source = write_session(tmp_path / "raw.parquet", make_servo())
+    t_ns = np.arange(UTC_NS, UTC_NS + N // 4 * PERIOD_NS, INTERVAL_NS)
+    constant = np.full(len(t_ns), 0.1)
+    track = replace(
+        make_track(), t_ns=t_ns, angle_rad=constant, sigma_rad=constant, sigma_ns=constant
+    )
+    said: list[str] = []
+    request = EstimateRequest(None, ("static",), 100.0, None, None, Slice(), unquantized=True)
+    estimate_session(source, tmp_path / "out", request, on_remark=said.append, angle=track)
+    assert said[-1] == (
+        "the table has an angle in 25 % of the frames; it differs from the servo's by 5.7 degrees "
+        "(RMS)"
+    )
+
+
+def test_a_film_of_another_session_is_refused(raw: Path, tmp_path: Path) -> None:
+    for name in ("own", "other"):
+        folder = tmp_path / name / f"video-{'0' * 12}"
+        folder.mkdir(parents=True)
+        (folder / VIDEO_NAME).write_text("")
+    shutil.copy(raw, tmp_path / "own" / FRAMES_NAME)
+    with SealedFileWriter(
+        tmp_path / "other" / FRAMES_NAME, make_array(stream_id="f" * 32), {}
+    ) as writer:
+        writer.append_frames(make_frames(10), {})
+    check_film_of_session(folder.parent.parent / "own" / folder.name / ANGLE_NAME, raw)
+    check_film_of_session(tmp_path / ANGLE_NAME, raw)
+    with pytest.raises(UsageError, match="of a film of another session, other"):
+        check_film_of_session(folder / ANGLE_NAME, raw)
 
 
 def test_where_the_table_has_a_gap_the_angle_is_unknown_and_never_the_servos(
