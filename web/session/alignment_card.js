@@ -37,17 +37,16 @@ export class AlignmentCard {
     this.draw();
   }
 
-  /** Add the picture shown with the cursor, or with the contact nearest to it. @param {"hand" | "contact"} method */
+  /** Add the picture shown with the cursor, or with the contact nearest to the cursor. @param {"hand" | "contact"} method */
   add(method) {
-    const { cursorS, plots, view, middle } = this.page;
+    const { cursorS, plots, view } = this.page;
     const { film } = this.card;
-    const aboutS = cursorS ?? middle;
     const contacts = plots.stances.filter((stance) => stance.begun).map((stance) => stance.from);
     if (!film.times.length) return notice("this browser does not show the film.", { bad: true });
     if (!film.isStill) return notice("the film is moving: pause it.", { bad: true });
-    if (method === "hand" && cursorS === null) return notice("put the cursor on the instant first.", { bad: true });
+    if (cursorS === null) return notice(`put the cursor ${method === "hand" ? "on the instant" : "near the contact"} first.`, { bad: true });
     if (method === "contact" && !contacts.length) return notice("the session has no contact that begins in it.", { bad: true });
-    const timeS = method === "hand" ? cursorS : contacts.reduce((best, one) => (Math.abs(one - aboutS) < Math.abs(best - aboutS) ? one : best));
+    const timeS = method === "hand" ? cursorS : contacts.reduce((best, one) => (Math.abs(one - cursorS) < Math.abs(best - cursorS) ? one : best));
     const resolutionS = method === "hand" ? (view.to - view.from) / plots.plotWidth : 1 / plots.whole.rateHz;
     this.pairs = this.pairs.filter(({ index }) => index !== film.wanted);
     this.pairs.push({ index: film.wanted, timeS, method, ...pairOf(method, film.times, film.wanted, timeS, plots.whole.beginNs, resolutionS) });
