@@ -106,7 +106,6 @@ def file_response(path: Path, **options: Any) -> FileResponse:
 
 _CHUNK = 256 << 10  # three times the default's throughput (performance.md)
 _SINGLE_RANGE = re.compile(r"bytes=(?:(\d{1,18})-(\d{0,18})|-(\d{1,18}))")
-_YEAR_S = 31_536_000
 
 
 def stored_file_response(
@@ -131,7 +130,7 @@ def stored_file_response(
     sent = {
         **headers,
         "ETag": f'"{sha256}"',
-        "Cache-Control": f"private, max-age={_YEAR_S}, immutable",
+        "Cache-Control": "private, no-cache",  # after a logout nothing may come from a cache
         "Repr-Digest": f"sha-256=:{b64encode(bytes.fromhex(sha256)).decode()}:",
     }
     if has_matching_etag(request, sha256):

@@ -39,7 +39,7 @@ def test_a_download_is_the_stored_file(sealed: Sealed) -> None:
     }
     assert {name: answer.headers[name] for name in expected} == expected
     assert f'filename="trial_{sealed.id}.parquet"' in answer.headers["content-disposition"]
-    assert "immutable" in answer.headers["cache-control"]
+    assert answer.headers["cache-control"] == "private, no-cache"
 
 
 def test_a_range_is_a_part_of_the_file(sealed: Sealed) -> None:
