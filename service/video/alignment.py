@@ -54,6 +54,8 @@ def fit_alignment(
     """
     if not len(film_s):
         raise FileFormatError(f"no instant of the film was found by {method}")
+    _, rows = np.unique(np.stack([film_s, t_ns]), axis=1, return_index=True)
+    film_s, t_ns, sigma_ns = film_s[rows], t_ns[rows], sigma_ns[rows]
     # From one pair the others are as uncertain as both, and the drift between them.
     apart_s = film_s[None, :] - film_s[:, None]
     misfit_ns = np.abs(t_ns[None, :] - t_ns[:, None] - 1e9 * apart_s)
@@ -69,7 +71,7 @@ def fit_alignment(
     if 2 * used.sum() <= len(film_s):
         raise FileFormatError(
             f"of {len(film_s)} instants found by {method} no majority agrees",
-            remedy="Align by another method, or by hand",
+            remedy="Look for the wrong ones, or align by another method",
         )
     x_s, y_ns, weight = film_s[used], t_ns[used], sigma_ns[used] ** -2.0
     middle_s = float(weight @ x_s / weight.sum())
@@ -101,6 +103,8 @@ _STEP_S = 0.5
 _CERTAIN_BY = 3.0
 """Least lead of the best match over one by another step: odds of 20."""
 _SAME_S = 0.05
+_INTERVALS_MIN = 1
+"""Intervals that have to agree before touchdowns outside the session count as possible."""
 _FIRST_TOUCHDOWNS = 12
 """Touchdowns with which matches are tried: the first ones, of which some may be wrong."""
 
@@ -114,6 +118,19 @@ class Instants(NamedTuple):
     """Time that the film or session covers, from 0."""
     drift_sigma: float = DRIFT_SIGMA
     """Standard deviation of its clock's drift."""
+    is_complete: bool = True
+    """False: some were chosen, and the film shows more."""
+
+
+class _Match(NamedTuple):
+    """Match by one touchdown that is some contact."""
+
+    score: float
+    """Log likelihood against a match by chance."""
+    possible: float
+    """The same if touchdowns outside the session agreed, too: a robot repeats its steps."""
+    offset_s: float
+    pairs: list[tuple[int, int]]
 
 
 def match_contacts(
@@ -123,7 +140,8 @@ def match_contacts(
 
     Each of the first touchdowns is tried with every contact. The others then agree within their
     uncertainties and the drift, or were missed; one before or after the other recording counts
-    neither way.
+    neither way. But a match is certain only if no other would be as good if those agreed, too: a
+    film that begins before the session shows the same steps earlier.
 
     Args:
         touchdowns: of the film, in s from its first picture.
@@ -136,29 +154,27 @@ def match_contacts(
     Raises:
         FileFormatError: nothing agrees, or steps are so alike that another match is as likely.
     """
-    found: list[tuple[float, float, list[tuple[int, int]]]] = []
+    matches: list[_Match] = []
     for first in range(min(len(touchdowns.at_s), _FIRST_TOUCHDOWNS)):
         for contact in range(len(contacts.at_s)):
             offset_s = float(contacts.at_s[contact] - touchdowns.at_s[first])
             if near_s[0] <= offset_s <= near_s[1]:
-                score, pairs = _match_by(touchdowns, contacts, first, contact)
-                found.append((score, offset_s, pairs))
-    best = max(found, default=(0.0, 0.0, []))
-    others = [score for score, offset_s, _ in found if abs(offset_s - best[1]) > _SAME_S]
-    if best[0] <= 0.0 or best[0] - max(others, default=-math.inf) < _CERTAIN_BY:
+                matches.append(_match_by(touchdowns, contacts, first, contact))
+    best = max(matches, key=lambda match: match.score, default=_Match(0.0, 0.0, 0.0, []))
+    rivals = [m.possible for m in matches if abs(m.offset_s - best.offset_s) > _SAME_S]
+    if best.score <= 0.0 or best.possible - max(rivals, default=-math.inf) < _CERTAIN_BY:
         count = f"{len(touchdowns.at_s)} touchdowns and {len(contacts.at_s)} contacts"
         raise FileFormatError(
-            f"{count} do not agree" if best[0] <= 0.0 else f"{count} agree in more than one way",
+            f"{count} do not agree" if best.score <= 0.0 else f"{count} agree in more than one way",
             expected="steps of which the times in between differ, or a film of all of them",
-            remedy="Say about when the film begins with --near, or align by another method",
+            remedy="Say about when the film begins with --near, as exactly as --within says, or "
+            "align by another method",
         )
-    return best[2]
+    return best.pairs
 
 
-def _match_by(
-    touchdowns: Instants, contacts: Instants, first: int, contact: int
-) -> tuple[float, list[tuple[int, int]]]:
-    """Match the others if one touchdown is that contact: log likelihood, and pairs."""
+def _match_by(touchdowns: Instants, contacts: Instants, first: int, contact: int) -> _Match:
+    """Match the others if one touchdown is that contact."""
     since_s = touchdowns.at_s - touchdowns.at_s[first]
     expected_s = contacts.at_s[contact] + since_s
     right = np.minimum(np.searchsorted(contacts.at_s, expected_s), len(contacts.at_s) - 1)
@@ -179,9 +195,15 @@ def _match_by(
     covered = (expected_s >= 0) & (expected_s <= contacts.duration_s)
     filmed = (in_film_s >= 0) & (in_film_s <= touchdowns.duration_s)
     filmed[nearest[agree]] = False
-    misses = int((covered & ~agree).sum() + filmed.sum())
-    pairs = [(int(row), int(nearest[row])) for row in np.flatnonzero(agree)]
-    return float(gain[agree].sum()) - _MISS_COST * misses, pairs
+    misses = int((covered & ~agree).sum()) + int(touchdowns.is_complete) * int(filmed.sum())
+    score = float(gain[agree].sum()) - _MISS_COST * misses
+    outside = int((~covered & ~agree).sum()) * (agree.sum() > _INTERVALS_MIN)
+    return _Match(
+        score=score,
+        possible=score + float(gain[agree].mean()) * outside,
+        offset_s=float(contacts.at_s[contact] - touchdowns.at_s[first]),
+        pairs=[(int(row), int(nearest[row])) for row in np.flatnonzero(agree)],
+    )
 
 
 def describe_contradiction(old: Alignment, new: Alignment) -> str:

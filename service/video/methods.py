@@ -39,11 +39,11 @@ from storage.sessions.videos import (
     write_video,
 )
 
-_NEAR_S = 5.0
-"""Largest error of `near_s`."""
 COMMON_PART = 0.5
 """Part of the uncertainty of touchdowns and of instants that a person chose, which all instants of
 a film share: ground and person are the same."""
+PICK_SIGMA = 1.0 / math.sqrt(3.0)
+"""Standard deviation of a picture that a person chose, in intervals: one too early or too late."""
 _LAMP_MARGIN_NS = 3_000_000_000
 """Time around a part in which its lamp's window may have its middle: half a window."""
 _LAMP_AMBIGUOUS_NS = 1e9
@@ -56,6 +56,7 @@ class AlignmentOptions:
 
     Attributes:
         near_s: about when the film begins, in s after the session's begin.
+        within_s: largest error of `near_s`.
         pictures: pictures that a person chose: of touchdowns, or by hand.
         instants_s: their instants in s after the session's begin, by hand.
         track: options of the task that tracks the foot's markers, by contact without pictures.
@@ -63,6 +64,7 @@ class AlignmentOptions:
     """
 
     near_s: float | None = None
+    within_s: float = 5.0
     pictures: tuple[int, ...] = ()
     instants_s: tuple[float, ...] = ()
     track: dict[str, Any] | None = None
@@ -93,8 +95,8 @@ class _Film:
             task, self.path, on_picture=self.on_picture, capture_rate_hz=rate_hz, **options
         )
 
-    def find_pictures(self, pictures: Sequence[int]) -> Floats:
-        """Return the times of pictures.
+    def find_pictures(self, pictures: Sequence[int]) -> tuple[Floats, Floats]:
+        """Return the times of pictures, and the intervals from those before them, in s.
 
         Raises:
             UsageError: the film has no such picture.
@@ -106,12 +108,10 @@ class _Film:
                 where=self.video.name,
                 expected=f"numbers from 0 to {count - 1}",
             )
-        return np.asarray(read_picture_times(self.path.parent)[list(pictures)])
-
-    @property
-    def pick_sigma_s(self) -> float:
-        """Standard deviation of a picture that a person chose: one too early or too late."""
-        return 1.0 / (max(self.video.film.rate_hz, 1e-3) * math.sqrt(3.0))
+        times_s = read_picture_times(self.path.parent)
+        intervals_s = np.diff(times_s) if count > 1 else np.ones(1)
+        rows = np.array(pictures)
+        return times_s[rows], intervals_s[np.maximum(rows - 1, 0)]
 
 
 def align_video(
@@ -217,8 +217,8 @@ def _pair_by_light(film: _Film, time: SessionTime, options: AlignmentOptions) ->
         end_ns = span.t_mono_ns[1]
         if options.near_s is not None:
             near_ns = time.begin_t_ns + round(1e9 * options.near_s) - time.get_mono_offset_ns(span)
-            begin_ns = max(begin_ns, near_ns - round(1e9 * _NEAR_S))
-            end_ns = min(end_ns, near_ns + round(1e9 * _NEAR_S))
+            begin_ns = max(begin_ns, near_ns - round(1e9 * options.within_s))
+            end_ns = min(end_ns, near_ns + round(1e9 * options.within_s))
         if begin_ns <= end_ns:
             spans.append(span)
             windows.append((begin_ns, end_ns))
@@ -297,16 +297,18 @@ def _pair_by_contact(film: _Film, time: SessionTime, options: AlignmentOptions) 
         found = find_touchdowns(np.array(track["film_s"]), height_px)
         at_s, sigma_s = np.array(found, dtype=np.float64).reshape(-1, 2).T
     else:
+        shown_s, interval_s = film.find_pictures(sorted(set(options.pictures)))
         # The foot was put down between the picture before and the first one.
-        half_s = 0.5 / max(film.video.film.rate_hz, 1e-3)
-        at_s = np.sort(film.find_pictures(options.pictures)) - half_s
-        sigma_s = np.full(len(at_s), film.pick_sigma_s)
+        at_s, sigma_s = shown_s - interval_s / 2.0, interval_s * PICK_SIGMA
     near_s = (-math.inf, math.inf)
     if options.near_s is not None:
-        near_s = options.near_s - _NEAR_S, options.near_s + _NEAR_S
+        near_s = options.near_s - options.within_s, options.near_s + options.within_s
     contacts = time.load_contacts()
     pairs = match_contacts(
-        Instants(at_s, sigma_s, film.video.film.duration_s, film.video.film.drift_sigma),
+        Instants(
+            *(at_s, sigma_s, film.video.film.duration_s, film.video.film.drift_sigma),
+            is_complete=options.track is not None,
+        ),
         contacts,
         near_s,
     )
@@ -322,12 +324,10 @@ def _pair_by_contact(film: _Film, time: SessionTime, options: AlignmentOptions) 
 def _pair_by_hand(film: _Film, time: SessionTime, options: AlignmentOptions) -> _Pairs:
     if len(options.instants_s) != len(options.pictures):
         raise UsageError("by hand each picture needs its instant", where=film.video.name)
-    sigma_ns = np.full(
-        len(options.pictures),
-        math.hypot(1e9 * film.pick_sigma_s, time.period_ns / math.sqrt(12.0)),
-    )
+    film_s, interval_s = film.find_pictures(options.pictures)
+    sigma_ns = np.hypot(1e9 * PICK_SIGMA * interval_s, time.period_ns / math.sqrt(12.0))
     return _Pairs(
-        film_s=film.find_pictures(options.pictures),
+        film_s=film_s,
         t_ns=1e9 * np.array(options.instants_s),
         sigma_ns=sigma_ns,
         common_ns=compute_common_ns(sigma_ns),

@@ -47,8 +47,9 @@ def video_add_command(
     capture_rate: Annotated[
         float | None,
         typer.Option(
+            min=0.0,
             help="Pictures per second when it was taken, if it plays slower and the file does not "
-            "say so."
+            "say so.",
         ),
     ] = None,
     data: DataOption = None,
@@ -182,9 +183,12 @@ def video_align_command(
         typer.Option(
             min=-SECONDS_MAX,
             max=SECONDS_MAX,
-            help="About when the film begins, seconds after the session's first frame, within 5 s.",
+            help="About when the film begins, seconds after the session's first frame.",
         ),
     ] = None,
+    within: Annotated[
+        float, typer.Option(min=0.0, max=SECONDS_MAX, help="Largest error of --near, seconds.")
+    ] = 5.0,
     picture: Annotated[
         list[int] | None,
         typer.Option(
@@ -212,6 +216,7 @@ def video_align_command(
     """Find a film's time in its session, with its uncertainty, and keep it beside the film."""
     from service.video.angle import TrackOptions
     from service.video.methods import AlignmentOptions, align_video
+    from storage.formats.angle_table import SUFFIXES
     from storage.sessions.videos import AlignmentMethod, find_video_folder, read_video
 
     methods: dict[str, AlignmentMethod] = {each: each for each in get_args(AlignmentMethod)}
@@ -233,6 +238,7 @@ def video_align_command(
     pairs = [_parse_pair(text) for text in pair or []]
     options = AlignmentOptions(
         near_s=near,
+        within_s=within,
         pictures=tuple(picture or [number for number, _ in pairs]),
         instants_s=tuple(instant_s for _, instant_s in pairs),
         track=TrackOptions(**markers.to_values()).make_task_options() if has_markers else None,
@@ -249,6 +255,8 @@ def video_align_command(
         print_json(aligned.model_dump(mode="json"))
     else:
         _report_alignment(folder, aligned)
+    if any(path.suffix in SUFFIXES for path in find_video_folder(folder, video).iterdir()):
+        remark("tables that were tracked before have the times of before: track again")
 
 
 @add_options
@@ -294,7 +302,7 @@ def video_track_command(
 ) -> None:
     """Write the foot's angle in each picture as a table, for `foottile estimate --angle`."""
     from service.video.angle import TrackOptions, read_points_from, track_video
-    from storage.formats.angle_table import ANGLE_NAME, check_suffix
+    from storage.formats.angle_table import ANGLE_NAME, SUFFIXES, check_suffix
     from storage.sessions.videos import find_video_folder, read_video
 
     if [markers.tags, markers.dots, points_file].count(None) != 2:
@@ -320,6 +328,10 @@ def video_track_command(
     )
     folder = _find_session_folder(session, data)
     inputs = [path for path in (points_file, markers.lens) if path is not None]
+    # Only tables beside a film may be written over.
+    inputs += [
+        path for path in folder.rglob("*") if path.parent == folder or path.suffix not in SUFFIXES
+    ]
     if video is None:
         if points_file is None or out is None or begin_s is None:
             raise UsageError(
@@ -362,6 +374,8 @@ def _find_session_folder(session: str, data: Path | None) -> Path:
 def _format_video(video: Video) -> str:
     film = video.film
     rate = f"{film.rate_hz:g} pictures/s" + (" (variable)" if film.is_variable else "")
+    if film.capture_rate_hz is not None:
+        rate += f" as taken, plays at {film.play_rate_hz:g}"
     aligned = "not aligned" if video.alignment is None else f"aligned by {video.alignment.method}"
     return (
         f"{video.id} {video.name}: {film.width_px} x {film.height_px}, {film.duration_s:.2f} s, "

@@ -129,6 +129,33 @@ def test_equal_steps_need_a_film_of_all_of_them_or_a_hint() -> None:
         match_contacts(Instants(np.empty(0), np.empty(0), 9.0), contacts)
 
 
+def test_steps_that_repeat_hide_whether_a_film_began_before_its_session() -> None:
+    hops_s = np.array([2.041, 2.919, 3.801, 6.682, 7.56, 8.442])
+    contacts = Instants(hops_s, np.full(6, 2e-3), 10.8)
+    # It begins 4 s before the session, and shows three hops before and the first three of it.
+    early = Instants(np.array([*(hops_s[:3] - 4.641), *hops_s[:3]]) + 4.0, np.full(6, 2e-3), 9.0)
+    with pytest.raises(FileFormatError, match="agree in more than one way"):
+        match_contacts(early, contacts)
+    with pytest.raises(FileFormatError, match="agree in more than one way"):
+        match_contacts(early, contacts, (-9.0, 1.0))
+    assert match_contacts(early, contacts, (-6.0, -2.0)) == [(3, 0), (4, 1), (5, 2)]
+    # Already if two of them agree.
+    contacts = contacts._replace(at_s=hops_s[[0, 1, 3, 4]], sigma_s=np.full(4, 2e-3))
+    early = early._replace(at_s=early.at_s[[0, 1, 3, 4]], sigma_s=np.full(4, 2e-3))
+    with pytest.raises(FileFormatError, match="agree in more than one way"):
+        match_contacts(early, contacts)
+
+
+def test_chosen_touchdowns_need_not_be_all_of_the_film() -> None:
+    hops_s = np.array([2.041, 2.919, 3.801, 6.682])
+    contacts = Instants(hops_s, np.full(4, 2e-3), 10.8)
+    one = Instants(hops_s[1:2] - 1.0, np.array([5e-3]), 8.0)
+    near_s = (0.6, 1.4)
+    with pytest.raises(FileFormatError, match="do not agree"):
+        match_contacts(one, contacts, near_s)
+    assert match_contacts(one._replace(is_complete=False), contacts, near_s) == [(0, 1)]
+
+
 def test_an_error_that_all_pairs_share_does_not_average_out() -> None:
     film_s, t_ns, sigma_ns = np.arange(4.0), 1e9 * np.arange(4.0), np.full(4, 1e6)
     alone = fit_alignment("light", film_s, t_ns, sigma_ns, begin_t_ns=0)
@@ -146,6 +173,14 @@ def test_alignments_that_differ_beyond_their_uncertainties_are_described() -> No
     assert describe_contradiction(one, one) == ""
     assert "300.0 ms later by hand than by light" in describe_contradiction(one, other)
     assert "300.0 ms earlier by light than by hand" in describe_contradiction(other, one)
+
+
+def test_a_pair_that_is_said_twice_counts_once() -> None:
+    once = fit_alignment(
+        "hand", np.array([0.0, 2.0, 5.0]), np.array([0, 2e9, 9e9]), np.full(3, 1e6), begin_t_ns=0
+    )
+    film_s, t_ns = np.array([0.0, 2.0, 5.0, 5.0, 5.0]), np.array([0, 2e9, 9e9, 9e9, 9e9])
+    assert fit_alignment("hand", film_s, t_ns, np.full(5, 1e6), begin_t_ns=0) == once
 
 
 def test_pairs_that_scatter_more_than_they_state_are_as_uncertain_as_they_scatter() -> None:

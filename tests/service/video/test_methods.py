@@ -152,6 +152,23 @@ def test_picked_touchdowns_are_aligned_with_contacts_within_a_picture(session: P
     assert abs(off_ns) < 4.0 * sigma_ns
 
 
+def test_a_picture_after_dropped_ones_is_as_uncertain_as_they_are(session: Path) -> None:
+    times_s = [*np.arange(20) / SMALL.rate_hz, *(0.8 + np.arange(20) / SMALL.rate_hz)]
+    path = session.parent / "gap.mp4"
+    write_film(path, SMALL, DARK[: len(times_s)], times_s)
+    with IncomingVideo(session, path.name) as incoming:
+        incoming.write(path.read_bytes())
+        added = incoming.keep(lambda film: describe_film(film, path.name))
+    sigmas_ns = []
+    for picture in (19, 20):
+        options = AlignmentOptions(pictures=(picture,), instants_s=(5.0,))
+        alignment = align_video(session, added.id, "hand", options).alignment
+        assert alignment is not None
+        sigmas_ns.append(alignment.sigma_ns)
+    ratio = (0.8 - 19 / SMALL.rate_hz) * SMALL.rate_hz
+    assert sigmas_ns[1] / sigmas_ns[0] == pytest.approx(ratio, rel=0.05)
+
+
 def test_what_contradicts_another_method_is_refused_unless_it_replaces_it(
     session: Path,
 ) -> None:

@@ -139,6 +139,7 @@ REFUSED: tuple[tuple[tuple[str, ...], str], ...] = (
     (("--dots", "red", "--area", "1,2,0,3"), "above 0"),
     (("--dots", "red", "--area", "1,2,9999,3"), "the area reaches to 10000, 5"),
     (("--dots", "red", "-o", "t.xlsx"), ".parquet or .csv"),
+    (("--dots", "red", "-o", f"session/{FRAMES_NAME}"), "is an input and would be lost"),
     (("--dots", "red", "-o", "nowhere/t.csv"), "no folder"),
     (("--points", "a,b"), "--tags"),
     (("--points-file", "x.csv"), "both or none"),
