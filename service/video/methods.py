@@ -271,7 +271,7 @@ def _pair_by_clock_page(film: _Film, time: SessionTime, _: AlignmentOptions) -> 
             "no picture shows the clock page",
             where=film.video.name,
             expected="the page /clock of this server, whole and sharp, for two seconds",
-            remedy="Look for it in the film, or align by another method",
+            remedy="Look for it in the film; one that plays slower needs --capture-rate when added",
         )
     rows = [time.convert_server_time(pair["t_ns"]) for pair in pairs]
     return _Pairs(
