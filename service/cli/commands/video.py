@@ -245,12 +245,9 @@ def video_align_command(
         replaces=replace,
     )
     folder = _find_session_folder(session, data)
-    name = read_video(find_video_folder(folder, video)).name
-    with show_progress(f"aligning {name}") as report_step:
-        aligned = align_video(
-            *(folder, video, methods[by], options),
-            lambda number: report_step(f"aligning {name}: {number} pictures"),
-        )
+    facts = read_video(find_video_folder(folder, video))
+    with show_progress_bar(f"aligning {facts.name}", facts.film.picture_count) as show_done:
+        aligned = align_video(folder, video, methods[by], options, show_done)
     if as_json:
         print_json(aligned.model_dump(mode="json"))
     else:
