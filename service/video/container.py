@@ -15,6 +15,7 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +43,8 @@ _GAP_BEYOND = 0.5
 _VARIABLE_BEYOND = 0.2
 """A film's rate is variable if an interval differs by more than this part of their median."""
 _PIXELS_MAX = 8192 * 8192
+_ASPECT_RATIO_MAX = 4
+"""A pixel that is wider or higher than so many times its other side is an error of the file."""
 _PICTURES_MAX = 5_000_000
 _THREADS = 4
 _OPEN_OPTIONS = {
@@ -74,7 +77,7 @@ def read_film(path: Path, capture_rate_hz: float | None = None) -> tuple[FilmInf
         tagged = _find_capture_rate_hz(container, stream)
         rotation_deg = _decode_rotation_deg(path)
         sideways = rotation_deg % 180 != 0
-        width, height = stream.codec_context.width, stream.codec_context.height
+        width, height = _compute_shown_size_px(stream)
         codec = stream.codec_context.name
     play_rate_hz = _compute_rate_hz(times_s)
     if tagged is not None and tagged < _SLOWED_MIN * play_rate_hz:
@@ -121,7 +124,9 @@ def _compute_rate_hz(times_s: Floats) -> float:
 def iterate_pictures(
     path: Path, *, is_grey: bool, begin: int = 0, end: int | None = None
 ) -> Iterator[tuple[int, Picture]]:
-    """Yield pictures of a film, turned upright, with their index in order of time.
+    """Yield pictures of a film as shown, with their index in order of time.
+
+    They are turned upright, and have square pixels.
 
     Args:
         path: the film.
@@ -142,6 +147,7 @@ def iterate_pictures(
         first, last = int(stamps[begin]), int(stamps[end - 1])
         container.seek(first, stream=stream, backward=True)
         pixel_format = "gray" if is_grey else "bgr24"
+        width, height = _compute_shown_size_px(stream)
         shown = begin - 1
         try:
             for frame in container.decode(stream):
@@ -150,7 +156,8 @@ def iterate_pictures(
                 if frame.pts > last:
                     return
                 shown = int(np.searchsorted(stamps, frame.pts))
-                picture = np.asarray(frame.to_ndarray(format=pixel_format), dtype=np.uint8)
+                shown_frame = frame.reformat(width=width, height=height, format=pixel_format)
+                picture = np.asarray(shown_frame.to_ndarray(), dtype=np.uint8)
                 yield shown, np.rot90(picture, round(frame.rotation / 90) % 4)
         except av.error.FFmpegError as error:
             raise FileFormatError(
@@ -176,7 +183,7 @@ def _open_container(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
             stream = container.streams.video[0]
             if stream.codec_context is None:  # a drawing, or a codec that is not there
                 raise FileFormatError("its pictures cannot be decoded", where=str(path))
-            if stream.codec_context.width * stream.codec_context.height > _PIXELS_MAX:
+            if math.prod(_compute_shown_size_px(stream)) > _PIXELS_MAX:
                 raise FileFormatError("its pictures are too large", where=str(path))
             stream.thread_type = "AUTO"
             stream.codec_context.thread_count = min(_THREADS, os.cpu_count() or 1)
@@ -189,6 +196,14 @@ def _open_container(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
             expected="MP4, MOV, WebM, MKV or AVI",
             remedy="Play it, or copy it from the camera again",
         ) from error
+
+
+def _compute_shown_size_px(stream: VideoStream) -> tuple[int, int]:
+    """Return width and height of pictures with square pixels, before the rotation."""
+    ratio = stream.sample_aspect_ratio
+    if not ratio or not 1 / _ASPECT_RATIO_MAX <= ratio <= _ASPECT_RATIO_MAX:
+        ratio = Fraction(1)
+    return round(stream.codec_context.width * ratio), stream.codec_context.height
 
 
 def _read_stamps(

@@ -71,7 +71,7 @@ class FilmInfo(StrictModel):
     codec: Text
     width_px: Count
     height_px: Count
-    """Both as shown: after the rotation."""
+    """Both as shown: with square pixels, after the rotation."""
     rotation_deg: int
     """Rotation that a player applies, counterclockwise."""
     picture_count: Count

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -109,6 +110,37 @@ def test_a_rotated_film_is_upright(tmp_path: Path) -> None:
     corners = [int(picture[y, x]) for y, x in ((2, 2), (2, -3), (-3, 2), (-3, -3))]
     assert np.argmax(corners) == 1
     assert picture.shape == (96, 64)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "width_px"), [(Fraction(3, 2), 144), (Fraction(1, 2), 48), (Fraction(5), 96)]
+)
+def test_pictures_have_square_pixels_as_a_player_shows_them(
+    tmp_path: Path, ratio: Fraction, width_px: int
+) -> None:
+    path = tmp_path / "film.mp4"
+    stored = np.full((64, 96), 90, np.uint8)
+    stored[:, 48:] = 200
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=50)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = ratio
+        for _ in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(stored, format="gray")))
+        container.mux(stream.encode(None))
+    one = 1 << 16
+    for turn, shape in (
+        ((one, 0, 0, 0, one), (64, width_px)),
+        ((0, one, 0, -one, 0), (width_px, 64)),
+    ):
+        patch_box(path, b"tkhd", 44, *turn, 0, 0, 0, 1 << 30)
+        film, _ = read_film(path)
+        assert (film.height_px, film.width_px) == shape
+        for is_grey in (True, False):
+            _, picture = next(iterate_pictures(path, is_grey=is_grey))
+            assert picture.shape[:2] == shape
+    edge = np.argmax(np.abs(np.diff(picture[:, 32, 0].astype(int))))
+    assert edge == pytest.approx(width_px / 2, abs=2)
 
 
 @pytest.mark.parametrize(("play_hz", "factor"), [(24.0, 1.0), (30.0, 0.125)])
