@@ -43,6 +43,8 @@ _GAP_BEYOND = 0.5
 _VARIABLE_BEYOND = 0.2
 """A film's rate is variable if an interval differs by more than this part of their median."""
 _PIXELS_MAX = 8192 * 8192
+_UNORDERED = ("h264", "hevc")
+"""Codecs of which the library does not find the order of time where a file has none, as AVI."""
 _ASPECT_RATIO_MAX = 4
 """A pixel that is wider or higher than so many times its other side is an error of the file."""
 _PICTURES_MAX = 5_000_000
@@ -185,6 +187,15 @@ def _open_container(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
                 raise FileFormatError("its pictures cannot be decoded", where=str(path))
             if math.prod(_compute_shown_size_px(stream)) > _PIXELS_MAX:
                 raise FileFormatError("its pictures are too large", where=str(path))
+            codec = stream.codec_context
+            if container.format.name == "avi" and codec.name in _UNORDERED and codec.has_b_frames:
+                raise FileFormatError(
+                    f"the order of its pictures is unknown: AVI with B-frames of {codec.name}",
+                    where=str(path),
+                    expected="MP4, MOV or MKV, which say when each picture is shown",
+                    remedy="Copy it anew from the camera, as MP4, or convert it: "
+                    "ffmpeg -i FILM.avi FILM.mp4",
+                )
             stream.thread_type = "AUTO"
             stream.codec_context.thread_count = min(_THREADS, os.cpu_count() or 1)
             yield container, stream
@@ -220,7 +231,7 @@ def _read_stamps(
             raise FileFormatError(
                 "the film is too long", where=str(path), expected=f"{_PICTURES_MAX} pictures"
             )
-        # AVI has no order but that of decoding.
+        # A file may have no times but those of decoding.
         stamp = packet.dts if packet.pts is None else packet.pts
         if stamp is not None and not packet.is_discard:
             stamps.append(stamp)

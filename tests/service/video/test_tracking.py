@@ -81,6 +81,28 @@ def film_of_greys(path: Path, count: int = 12) -> Path:
     return write_film(path, camera, pictures, [i / 50.0 for i in range(count)])
 
 
+@pytest.mark.parametrize("codec", ["mpeg4", "libx264"])
+def test_an_avi_is_read_unless_it_lacks_the_order_of_b_frames(tmp_path: Path, codec: str) -> None:
+    for b_frames in (0, 2):
+        path = tmp_path / f"{b_frames}.avi"
+        with av.open(str(path), "w") as container:
+            options = {"bf": str(b_frames), "sc_threshold": "1000000000"}
+            stream = container.add_stream(codec, rate=50, options=options)
+            assert isinstance(stream, av.VideoStream)
+            stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+            for i in range(12):
+                grey = np.full((64, 96), 20 + 18 * i, np.uint8)
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(grey, format="gray")))
+            container.mux(stream.encode(None))
+        if b_frames and codec == "libx264":
+            with pytest.raises(FileFormatError, match=r"order .* expected MP4.* ffmpeg -i"):
+                read_film(path)
+            continue
+        assert read_film(path)[0].picture_count == 12
+        greys = {index: int(p.mean()) for index, p in iterate_pictures(path, is_grey=True)}
+        assert greys == {i: pytest.approx(20 + 18 * i, abs=4) for i in range(12)}
+
+
 def patch_box(path: Path, name: bytes, offset: int, *numbers: int) -> None:
     """Replace signed numbers behind the name of a box."""
     content = bytearray(path.read_bytes())
