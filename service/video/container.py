@@ -170,7 +170,7 @@ def iterate_pictures(
 
 
 @contextmanager
-def _open_container(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
+def _open_container(path: Path, **options: str) -> Iterator[tuple[InputContainer, VideoStream]]:
     with require_extra("video", "a film"):
         import av
     if not path.is_file():
@@ -178,7 +178,9 @@ def _open_container(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     try:
         with (
             path.open("rb") as file,
-            av.open(file, "r", options=_OPEN_OPTIONS, metadata_errors="replace") as container,
+            av.open(
+                file, "r", options=_OPEN_OPTIONS | options, metadata_errors="replace"
+            ) as container,
         ):
             if not container.streams.video:
                 raise FileFormatError("the file has no pictures", where=str(path))
@@ -237,12 +239,6 @@ def _read_stamps(
             stamps.append(stamp)
     if not stamps:
         raise FileFormatError("the film has no picture with a time", where=str(path))
-    if packet_count < stream.frames and "mp4" in container.format.name:
-        raise FileFormatError(
-            f"the film breaks off after {packet_count} of {stream.frames} pictures",
-            where=str(path),
-            remedy="Copy the file from the camera again",
-        )
     return np.unique(np.array(stamps, dtype=np.int64))
 
 
@@ -253,6 +249,16 @@ def _check_length(
 
     Matroska and AVI have no index of all pictures.
     """
+    if "mp4" in container.format.name and len(times_s) < stream.frames:
+        # A trimmed film has pictures that are not shown, but are in the file.
+        with _open_container(path, advanced_editlist="0") as (whole, pictures):
+            packet_count = sum(packet.size > 0 for packet in whole.demux(pictures))
+        if packet_count < stream.frames:
+            raise FileFormatError(
+                f"the film breaks off after {packet_count} of {stream.frames} pictures",
+                where=str(path),
+                remedy="Copy the file from the camera again",
+            )
     stated_s = 0.0
     if found := _DURATION.fullmatch(stream.metadata.get("DURATION", "")):  # Matroska, WebM
         stated_s = int(found[1]) * 3600 + int(found[2]) * 60 + float(found[3])

@@ -122,6 +122,35 @@ def test_an_edit_list_leaves_out_the_pictures_that_no_player_shows(tmp_path: Pat
         np.testing.assert_array_equal(picture, whole[index + 3])
 
 
+@pytest.mark.parametrize(
+    ("begin", "end", "first"), [(0, 20, 0), (25, 60, 25), (24.5, 60, 25), (13, 31, 13)]
+)
+def test_a_trimmed_film_is_whole_and_a_cut_one_is_not(
+    tmp_path: Path, begin: float, end: int, first: int
+) -> None:
+    """Trimmed as phones do: its edit list leaves out begin and end, which the file still has."""
+    path, count = tmp_path / "film.mp4", 60
+    with av.open(str(path), "w", options={"movflags": "faststart"}) as container:
+        stream = container.add_stream("libx264", rate=50, options={"bf": "2", "g": "10"})
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+        for i in range(count):
+            grey = np.full((64, 96), 20 + 3 * i, np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(grey, format="gray")))
+        container.mux(stream.encode(None))
+    delay = 512  # of the first picture, by B-frames, of 256 ticks a picture
+    patch_box(path, b"elst", 12, round((end - begin) * 20), delay + round(begin * 256))
+    film, times_s = read_film(path)
+    assert film.picture_count == end - first
+    np.testing.assert_allclose(times_s, np.arange(end - first) / 50.0, atol=1e-6)
+    greys = [(index, p.mean()) for index, p in iterate_pictures(path, is_grey=True)]
+    assert [index for index, _ in greys] == [*range(end - first)]
+    np.testing.assert_allclose([grey for _, grey in greys], 20 + 3 * np.arange(first, end), atol=2)
+    with path.open("r+b") as file:
+        file.truncate(path.stat().st_size - 40)
+    with pytest.raises(FileFormatError, match=rf"breaks off after \d+ of {count} pictures"):
+        read_film(path)
+
+
 def test_a_rotated_film_is_upright(tmp_path: Path) -> None:
     path = film_of_greys(tmp_path / "film.mp4")
     one = 1 << 16
