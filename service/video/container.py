@@ -184,7 +184,9 @@ def _open_container(path: Path, **options: str) -> Iterator[tuple[InputContainer
         ):
             if not container.streams.video:
                 raise FileFormatError("the file has no pictures", where=str(path))
-            stream = container.streams.video[0]
+            # The first one may be a cover.
+            stream = container.streams.best("video") or container.streams.video[0]
+            assert isinstance(stream, av.VideoStream)  # noqa: S101
             if stream.codec_context is None:  # a drawing, or a codec that is not there
                 raise FileFormatError("its pictures cannot be decoded", where=str(path))
             if math.prod(_compute_shown_size_px(stream)) > _PIXELS_MAX:

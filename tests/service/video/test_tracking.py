@@ -81,6 +81,25 @@ def film_of_greys(path: Path, count: int = 12) -> Path:
     return write_film(path, camera, pictures, [i / 50.0 for i in range(count)])
 
 
+def test_a_cover_before_the_film_is_not_taken_for_it(tmp_path: Path) -> None:
+    path = tmp_path / "film.mkv"
+    with av.open(str(path), "w") as container:
+        cover = container.add_stream("mjpeg", rate=1)
+        cover.width, cover.height, cover.pix_fmt = 192, 128, "yuvj420p"
+        stream = container.add_stream("libx264", rate=50)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+        image = np.full((128, 192), 200, np.uint8)
+        container.mux(cover.encode(av.VideoFrame.from_ndarray(image, format="gray")))
+        container.mux(cover.encode(None))
+        for i in range(12):
+            grey = np.full((64, 96), 20 + 18 * i, np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(grey, format="gray")))
+        container.mux(stream.encode(None))
+    film, times_s = read_film(path)
+    assert (film.codec, film.width_px, len(times_s)) == ("h264", 96, 12)
+    assert [index for index, _ in iterate_pictures(path, is_grey=True)] == [*range(12)]
+
+
 @pytest.mark.parametrize("codec", ["mpeg4", "libx264"])
 def test_an_avi_is_read_unless_it_lacks_the_order_of_b_frames(tmp_path: Path, codec: str) -> None:
     for b_frames in (0, 2):
