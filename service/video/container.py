@@ -4,8 +4,8 @@ Times are those of the container: presentation stamps, after edit lists, in risi
 the order in the file (B-frames). A stamp is the begin of display; the exposure may be earlier by a
 constant, which the offset absorbs for light and contact, but not for the clock page.
 
-A high-speed film that plays slowly states its capture rate in a tag of some cameras, else the user
-does: times are then scaled by play rate / capture rate.
+A high-speed film that plays slowly, or a time-lapse film, states its capture rate in a tag of some
+cameras, else the user does: times are then scaled by play rate / capture rate.
 """
 
 from __future__ import annotations
@@ -34,10 +34,13 @@ Picture = npt.NDArray[np.uint8]
 """Grey picture (height, width), or colours (height, width, 3) in the order blue, green, red."""
 
 _CAPTURE_RATE_TAGS = ("com.android.capture.fps",)
-"""Tags with the rate of a film that plays slower than it was taken."""
-_SLOWED_MIN = 1.5
-"""Least ratio of a tagged rate to the played one: normal films of phones have the tag, too."""
-_CAPTURE_RATES_HZ = (1.0, 1e6)
+"""Tags with the rate of a film that plays slower or, of time-lapse, faster than it was taken."""
+_NORMAL_RATIO = 1.5
+"""Ratio of a tagged rate to the played one up to which a film plays as it was taken.
+
+Normal films of phones have the tag, too.
+"""
+_CAPTURE_RATES_HZ = (1e-3, 1e6)
 _GAP_BEYOND = 0.5
 """Intervals that differ by more than this part of their median do not count for the rate."""
 _VARIABLE_BEYOND = 0.2
@@ -82,9 +85,9 @@ def read_film(path: Path, capture_rate_hz: float | None = None) -> tuple[FilmInf
         width, height = _compute_shown_size_px(stream)
         codec = stream.codec_context.name
     play_rate_hz = _compute_rate_hz(times_s)
-    if tagged is not None and tagged < _SLOWED_MIN * play_rate_hz:
+    if tagged is not None and 1 / _NORMAL_RATIO < tagged / (play_rate_hz or tagged) < _NORMAL_RATIO:
         tagged = None
-    captured_hz = capture_rate_hz or tagged
+    captured_hz = tagged if capture_rate_hz is None else capture_rate_hz
     if captured_hz is not None:
         low, high = _CAPTURE_RATES_HZ
         if not (low <= captured_hz <= high) or not play_rate_hz:

@@ -213,11 +213,13 @@ def test_pictures_have_square_pixels_as_a_player_shows_them(
     assert edge == pytest.approx(width_px / 2, abs=2)
 
 
-@pytest.mark.parametrize(("play_hz", "factor"), [(24.0, 1.0), (30.0, 0.125)])
-def test_a_tagged_rate_counts_only_if_the_film_plays_much_slower(
-    tmp_path: Path, play_hz: float, factor: float
+@pytest.mark.parametrize(
+    ("play_hz", "tag", "factor"),
+    [(24.0, "30.0", 1.0), (30.0, "240.0", 0.125), (30.0, "24.0", 1.0), (30.0, "0.5", 60.0)],
+)
+def test_a_tagged_rate_counts_only_if_the_film_plays_much_slower_or_faster(
+    tmp_path: Path, play_hz: float, tag: str, factor: float
 ) -> None:
-    tag = {24.0: "30.0", 30.0: "240.0"}[play_hz]
     greys = [np.full((64, 96), 20 + 18 * i, np.uint8) for i in range(12)]
     times_s = [i / play_hz for i in range(12)]
     film = write_film(tmp_path / "film.mp4", Camera(width=96, height=64), greys, times_s)
@@ -234,7 +236,10 @@ def test_a_tagged_rate_counts_only_if_the_film_plays_much_slower(
                 target.mux(packet)
     info, found_s = read_film(tagged)
     assert info.play_rate_hz == pytest.approx(play_hz, rel=0.01)
-    np.testing.assert_allclose(found_s, factor * np.array(times_s), atol=1e-3)
+    np.testing.assert_allclose(found_s, factor * np.array(times_s), atol=1e-3 * factor)
+    stated, stated_s = read_film(tagged, capture_rate_hz=play_hz)
+    assert stated.capture_rate_hz == play_hz
+    np.testing.assert_allclose(stated_s, times_s, atol=1e-3)
 
 
 def test_a_film_of_three_pictures_and_a_gap_has_a_rate() -> None:
@@ -405,5 +410,6 @@ def test_pictures_have_the_order_of_time_with_b_frames_a_variable_rate_and_a_cap
     assert slow.rate_hz == pytest.approx(1000.0)
     assert slow.play_rate_hz == pytest.approx(film.rate_hz)
     np.testing.assert_allclose(slow_s, np.array(times_s) / 20.0, atol=1e-5)
-    with pytest.raises(UsageError, match="cannot have been taken"):
-        read_film(path, capture_rate_hz=1e9)
+    for rate_hz in (1e9, 0.0, -1.0, math.nan):
+        with pytest.raises(UsageError, match="cannot have been taken"):
+            read_film(path, capture_rate_hz=rate_hz)
