@@ -22,6 +22,8 @@ from storage.sessions.videos import Video, get_film_path, read_picture_times
 _POINT_SIGMA = 1e-4
 """Error of another program's points that neighbours share, relative to their distance."""
 _INTERVAL_TOLERANCE = 0.1
+_PICTURE_WITHIN, _PICTURE_WITHIN_S = 1.0 / 3.0, 0.002
+"""Largest distance of a row's time from a picture's: part of the film's interval, or if more s."""
 
 
 @dataclass(frozen=True)
@@ -148,20 +150,38 @@ def read_points(
             )
         instants_s = times_s[instants_s.astype(np.int64)]
     elif times_s is not None:
-        interval_s = float(np.median(np.diff(instants_s))) if len(instants_s) > 1 else 0.0
-        film_interval_s = float(np.median(np.diff(times_s)))
-        if (
-            instants_s[-1] > times_s[-1] + film_interval_s
-            or abs(interval_s / film_interval_s - 1.0) > _INTERVAL_TOLERANCE
-        ):
-            raise FileFormatError(
-                f"its rows are {interval_s:g} s apart, and end at {instants_s[-1]:g} s",
-                where=str(path),
-                expected=f"seconds of the film: {film_interval_s:g} s apart, up to {times_s[-1]:g}",
-                remedy="Export its time in seconds, from the film's first picture on",
-            )
+        _check_instants(instants_s, times_s, path)
     length = float(np.nanmedian(np.linalg.norm(found.places[:, 1] - found.places[:, 0], axis=1)))
     return _make_table(instants_s, found.places, _POINT_SIGMA * length, options, video)
+
+
+def _check_instants(instants_s: Floats, times_s: Floats, path: Path) -> None:
+    """Check that the instants of a file are seconds of the film, each that of a picture.
+
+    Raises:
+        FileFormatError: they are not.
+    """
+    edges_s = (times_s[1:] + times_s[:-1]) / 2
+    off_s = np.abs(instants_s - times_s[np.searchsorted(edges_s, instants_s)])
+    film_interval_s, interval_s = (
+        float(np.median(np.diff(each_s))) if len(each_s) > 1 else 0.0
+        for each_s in (times_s, instants_s)
+    )
+    is_off = off_s > max(film_interval_s * _PICTURE_WITHIN, _PICTURE_WITHIN_S)
+    if abs(interval_s - film_interval_s) > _INTERVAL_TOLERANCE * film_interval_s:
+        what = f"its rows are {interval_s:g} s apart"
+    elif is_off.any():
+        row = int(np.argmax(is_off))
+        what = f"its row {row + 1} is at {instants_s[row]:g} s, at which the film has no picture"
+    else:
+        return
+    raise FileFormatError(
+        what,
+        where=str(path),
+        expected=f"seconds of the film: {film_interval_s:g} s apart, up to {times_s[-1]:g}",
+        remedy="Export its time in seconds, from the film's first picture on; if the film lacks "
+        "pictures, and the other program does not know it, use --tags or --dots",
+    )
 
 
 def read_points_from(session_folder: Path, options: TrackOptions, begin_s: float) -> TrackedAngle:
