@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -93,7 +94,8 @@ def track_video(
         on_picture: called with the number of pictures done.
 
     Raises:
-        FileFormatError: the film or the file of points is damaged, or does not show the markers.
+        FileFormatError: the film or the file of points is damaged, does not show the markers, or
+            the first one is above the other.
         UsageError: no such direction or colour.
     """
     path = get_film_path(folder, video)
@@ -204,11 +206,18 @@ def _make_table(
     film_s: Floats, places: Floats, place_sigma: float, options: TrackOptions, video: Video | None
 ) -> TrackedAngle:
     angle_rad, sigma_rad = compute_angle(places, zero_rad=options.zero_rad, place_sigma=place_sigma)
-    if np.isnan(sigma_rad[~np.isnan(angle_rad)]).any():
+    where = "" if video is None else video.name
+    if np.isnan(sigma_rad).all():
         raise FileFormatError(
             "no seven pictures in a row show both markers, by which their noise is measured",
-            where="" if video is None else video.name,
+            where=where,
             remedy="Film the leg without hiding the markers",
+        )
+    if np.nanmedian(np.abs(angle_rad)) > math.pi / 2.0:
+        raise FileFormatError(
+            "the first marker named is above the other: its angle is beyond a quarter of a turn",
+            where=where,
+            remedy="Name the lower marker first, or the angle at which the foot's is 0 by --zero",
         )
     t_ns, sigma_ns = (None, None) if video is None else video.place_pictures(film_s)
     table = AngleTable(angle_rad, sigma_rad, film_s, t_ns, sigma_ns, np.full(len(film_s), VIDEO))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,3 +47,16 @@ def test_rows_of_no_picture_are_refused_by_the_first(tmp_path: Path) -> None:
         options = write_kinovea(tmp_path / "k.csv", times_s)
         with pytest.raises(FileFormatError, match=rf"k.csv: its {said}.*; expected seconds"):
             read_points(options, film_s)
+
+
+def test_a_marker_named_first_that_is_above_the_other_is_refused(tmp_path: Path) -> None:
+    film_s = np.arange(ROWS) / 50.0
+    options = write_kinovea(tmp_path / "k.csv", film_s)
+    straight = read_points(options, film_s).table
+    upside_down = replace(options, zero_rad=math.pi)
+    with pytest.raises(FileFormatError, match=r"beyond a quarter of a turn.* by --zero"):
+        read_points(upside_down, film_s)
+    turned = replace(options, zero_rad=-1.5)
+    np.testing.assert_allclose(
+        read_points(turned, film_s).table.angle_rad, straight.angle_rad + 1.5
+    )

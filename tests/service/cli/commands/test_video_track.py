@@ -151,6 +151,11 @@ def test_options_that_do_not_fit_are_refused(run: Run, folder: Path, film: Path)
     video_id = run("video", "add", folder, film, "--json").printed()["id"]
     for options, problem in REFUSED:
         run("video", "track", folder, video_id, *options).fails(2, problem)
+    swapped = "--tags", f"{UPPER_TAG},{LOWER_TAG}"
+    track = "video", "track", folder, video_id, *swapped, "-o", "t.csv"
+    run(*track).fails(1, "leg.mp4", "first marker named is above", "lower marker first")
+    assert not Path("t.csv").exists()
+    run(*track, "--zero", 180).succeeds()
     run("video", "track", folder, "0" * 12, "--dots", "red").fails(1, "no video", video_id)
     by_contact = "video", "align", folder, video_id, "--by", "contact"
     run(*by_contact, *TAGS).fails(1, "no estimates")
