@@ -288,7 +288,8 @@ class IncomingVideo:
         """
         _check_space(self._final.parent, self._size_bytes)
         with translate_storage_errors(self._final.parent):
-            self._folder.mkdir()
+            # Whoever may not read the session may not see its film, whatever the umask.
+            self._folder.mkdir(mode=self._final.parent.stat().st_mode & 0o777)
             try:
                 self._file = open(self._path, "wb")
             except OSError:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+import stat
 import threading
 from pathlib import Path
 
@@ -131,6 +132,17 @@ def test_what_is_not_kept_leaves_nothing(folder: Path, monkeypatch: pytest.Monke
         fill()
     assert names(folder) == {"session.json"}
     assert remove_dead_process_temporaries(folder) == []
+
+
+@pytest.mark.parametrize("mode", [0o700, 0o750, 0o755])
+def test_a_video_is_as_open_as_its_session(folder: Path, mode: int) -> None:
+    folder.chmod(mode)
+    before = os.umask(0o022)
+    try:
+        video = add(folder)
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(find_video_folder(folder, video.id).stat().st_mode) == mode
 
 
 def test_a_film_leaves_room_for_frames(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
