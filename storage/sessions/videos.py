@@ -1,8 +1,8 @@
 """Videos of a session: a folder for each in the session's, whose other files they do not touch.
 
 The file is kept as it came, under a fixed name. `video.json` states facts of the film, its hash,
-and how its time is aligned with the session's. An incomplete folder has a temporary name, and is
-deleted at the next start of a server.
+and how its time is aligned with the session's. An incomplete folder has a temporary name. If its
+process has ended, it is deleted when the next video is added, or a server starts.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from devices.errors import (
 from devices.types import Count, Identifier, StrictModel, Text, TNs
 from storage.documents import read_document, write_document
 from storage.durable_files import (
+    is_dead_process_temporary,
     make_temporary_path,
     sync_folder,
     translate_storage_errors,
@@ -280,12 +281,15 @@ class IncomingVideo:
         self._hash = hashlib.sha256()
 
     def __enter__(self) -> Self:
-        """Create the file.
+        """Create the file; delete what ended processes left of others.
 
         Raises:
             UnknownError: the session was deleted meanwhile.
             StorageError: it cannot be created, or does not fit.
         """
+        for path in self._final.parent.glob(".video-*.tmp"):
+            if is_dead_process_temporary(path.name):
+                shutil.rmtree(path, ignore_errors=True)
         _check_space(self._final.parent, self._size_bytes)
         with translate_storage_errors(self._final.parent):
             # Whoever may not read the session may not see its film, whatever the umask.

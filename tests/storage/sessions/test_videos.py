@@ -6,6 +6,8 @@ import hashlib
 import os
 import shutil
 import stat
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -143,6 +145,23 @@ def test_a_video_is_as_open_as_its_session(folder: Path, mode: int) -> None:
     finally:
         os.umask(before)
     assert stat.S_IMODE(find_video_folder(folder, video.id).stat().st_mode) == mode
+
+
+@pytest.mark.process
+def test_what_a_killed_process_left_is_deleted_when_a_video_is_added(folder: Path) -> None:
+    code = (
+        "import os, sys; from pathlib import Path\n"
+        "from storage.sessions.videos import IncomingVideo\n"
+        "IncomingVideo(Path(sys.argv[1]), 'a.mp4').__enter__().write(bytes(99)); os._exit(9)"
+    )
+    subprocess.run([sys.executable, "-c", code, str(folder)], check=False)
+    assert len(names(folder)) == 2
+    with IncomingVideo(folder, "b.mp4"):
+        living = names(folder)
+        assert len(living) == 2
+        video = add(folder)
+        assert names(folder) == living | {f"video-{video.id}"}
+    assert names(folder) == {"session.json", f"video-{video.id}"}
 
 
 def test_a_film_leaves_room_for_frames(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
