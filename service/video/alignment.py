@@ -128,7 +128,7 @@ class _Match(NamedTuple):
     score: float
     """Log likelihood against a match by chance."""
     possible: float
-    """The same if touchdowns outside the session agreed, too: a robot repeats its steps."""
+    """Score if touchdowns outside the session agreed, too: a robot repeats its steps."""
     offset_s: float
     pairs: list[tuple[int, int]]
 

@@ -242,13 +242,13 @@ class TableServo:
     def describe_use(self) -> str:
         """Describe how many frames have an angle, and how far it is from the servo's."""
         share = self._known_count / max(self._frame_count, 1)
-        said = f"the table has an angle in {100 * share:.0f} % of the frames"
+        text = f"the table has an angle in {100 * share:.0f} % of the frames"
         if self._compared_count:
             apart_deg = math.degrees(math.sqrt(self._apart_rad2 / self._compared_count))
-            said += f"; it differs from the servo's by {apart_deg:.2g} degrees (RMS)"
+            text += f"; it differs from the servo's by {apart_deg:.2g} degrees (RMS)"
         if self._travel is None:
-            said += "; without the ankle's travel, of a --scene, there is no COP on the ground"
-        return said
+            text += "; without the ankle's travel, of a --scene, there is no COP on the ground"
+        return text
 
     def restore_positions(self, pieces: Iterable[BatchWithColumns]) -> Iterator[BatchWithColumns]:
         """Yield estimated frames with their own servo, and the uncertainty on the ground."""
