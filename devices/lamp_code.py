@@ -1,8 +1,8 @@
 """Code of a lamp on the robot: a function of the node's clock alone, so that a film tells its time.
 
 A maximum length sequence of 2^20 - 1 bits (x^20 + x^17 + 1) of 93 ms each, which repeats after 27
-hours. 93 ms is a multiple of no usual picture's interval, so edges of the code fall on all phases
-of it.
+hours. 93 ms is a multiple of no usual picture interval, so the code's edges fall on all phases of a
+picture.
 """
 
 from __future__ import annotations

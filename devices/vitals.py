@@ -1,6 +1,6 @@
 """Vitals of a machine: disk, heat, supply, load, Wi-Fi, clock; and warnings with remedies.
 
-Read from Linux and, on a Raspberry Pi, from its firmware. What a machine does not state is None.
+Read from Linux and, on a Raspberry Pi, from its firmware. A value that the machine lacks is None.
 The bits of `get_throttled` are those of the Raspberry Pi's documentation (`vcgencmd`).
 """
 
@@ -21,7 +21,7 @@ from devices.types import Count, StrictModel
 
 VITALS_INTERVAL_S = 5.0
 _CALM_UPDATES = 6
-"""Updates without a cause that end a warning, half a minute: none of them flickers."""
+"""Updates without a cause that end a warning, half a minute, so that no warning flickers."""
 _COMMAND_TIMEOUT_S = 2.0
 
 

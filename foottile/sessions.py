@@ -34,7 +34,7 @@ _ARROW_START, _ARROW_END = b"ARROW1\0\0", b"ARROW1"
 
 @dataclass(frozen=True)
 class SessionData:
-    """Frames of a session, or a slice of them; the server sends only the selected part.
+    """Frames of a session, or a slice; the server sends only the selected part.
 
     `data["grf_n"]` fetches a column as numpy. `data[["t_ns", "grf_n"]]` and `data[2.0:3.0]`
     (seconds from the session's first frame) select a part and fetch nothing.
@@ -327,7 +327,7 @@ class Session:
         end_s: float | None = None,
         clock: Clock = "node",
     ) -> SessionData:
-        """Return the frames, or a slice of them, without fetching anything yet.
+        """Return the frames, or a slice, without fetching anything yet.
 
         Args:
             columns: names, of all tiles (`force_n`) or one (`force_n_0`); empty: all.

@@ -1,1 +1,1 @@
-"""Programs: node, server, API, offline work, commands; and the pure estimation all of them use."""
+"""Programs: node, server, API, offline work, commands; and the pure estimation that they use."""

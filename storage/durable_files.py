@@ -1,7 +1,7 @@
 """Crash-safe files: atomic writes, folder locks, and setting damaged files aside.
 
 A file is written whole or not at all, and synced. Reading follows no links and waits for no pipes.
-The lock of a folder keeps out a second process, which would undo what the first one does. A damaged
+The lock of a folder keeps out a second process, which would undo the first one's work. A damaged
 file is renamed, never deleted: its owner may still need it.
 
 A scratch file is for data that would take too much memory and can be made again. Its disk space is

@@ -40,7 +40,7 @@ def read_edges(message: bytes | memoryview, schema: pa.Schema) -> tuple[Edge, ..
     """Read the edges of a message whose layout was checked; none is the usual case.
 
     Raises:
-        ValueError: they are not what a node writes.
+        ValueError: no node writes such edges.
     """
     if EDGES_KEY not in bytes(message[: 8 + int.from_bytes(message[4:8], "little")]):
         return ()

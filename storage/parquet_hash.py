@@ -75,7 +75,7 @@ def _fill_hash_placeholders(file: BinaryIO, *, where: str) -> None:
 
 
 class HashPair(NamedTuple):
-    """Hash that a file states of itself, and the one that it has."""
+    """Hash of a file: as its footer states, and as computed."""
 
     stated: str
     actual: str

@@ -4,7 +4,7 @@ Both ends have the schema (it follows from the `ArrayInfo` of the stream), so a 
 batch and nothing else; the same bytes, appended to the schema's own message, are an Arrow IPC
 stream that any tool can read.
 
-A batch of 25 ms costs as much to decode as thousands of frames, and a journal has 140,000 of them
+A batch of 25 ms costs as much to decode as thousands of frames, and a journal has 140,000 batches
 an hour. So the bytes of each message are checked against its CRC-32, which is cheap, and everything
 else is checked for all messages together. If any check fails, decoding of many messages gives None:
 the caller then decodes batch by batch to find the faulty one.

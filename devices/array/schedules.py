@@ -1,4 +1,4 @@
-"""Schedules of one frame's transfers on the bus, and the time each of them takes.
+"""Schedules of one frame's transfers on the bus, and the time that each takes.
 
 Each schedule is a function that scans one frame of an array into a `Scan`. `TileArray` handles and
 flags faults; a schedule is only the order. At 400 kHz with four tiles of 1.6 ms: `sequential` 132

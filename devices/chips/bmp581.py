@@ -108,7 +108,7 @@ def encode_settings(settings: ChipSettings) -> Registers:
 
     Raises:
         UsageError: the chip has no such setting, or a filter is asked for with single conversions,
-            whose effect on the first of them is not documented.
+            whose effect on the first conversion is not documented.
     """
     if settings.oversampling not in OVERSAMPLINGS:
         raise UsageError(
@@ -158,9 +158,9 @@ def compute_conversion_ns(settings: Registers) -> tuple[int, int]:
 def compute_sample_delay_ns(settings: Registers, conversion_ns: int) -> int:
     """Return the time from a conversion's begin to the middle of its pressure sample.
 
-    The pressure is taken to be the second part of a conversion, and what a filter c gives is c
-    conversions older in the mean. The measured time of a commanded conversion is the longest, so
-    that its start is late by half of what starts differ by.
+    The pressure is assumed to be the second part of a conversion. A filter c makes it older by c
+    conversions in the mean. The measured time of a commanded conversion is the longest, so its
+    start is late by half of the starts' spread.
     """
     late_ns = 0 if is_free_running(settings) else START_SPREAD_NS // 2
     filtered_ns = FILTER_COEFFICIENTS[settings[1] >> 3 & 7] * conversion_ns

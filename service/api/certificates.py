@@ -1,4 +1,4 @@
-"""Certificates of a server: a CA of its own, made once, and the certificates that it signs.
+"""Certificates of a server: its own CA, made once, and the certificates that the CA signs.
 
 A phone or a node trusts the CA once; the server's own certificate follows the machine's names and
 addresses. The CA is constrained to names and addresses of local networks, so that a thief of its

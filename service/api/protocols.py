@@ -157,7 +157,7 @@ class LimitedHttp(HttpToolsProtocol):
         self._unparsed_bytes = 0
 
     def on_body(self, body: bytes) -> None:
-        """Pass on a piece of the body; the timeout is for each 256 KiB of it, in a film's."""
+        """Pass on a piece of the body; a film's upload has the timeout for each 256 KiB."""
         self._unparsed_bytes = 0
         super().on_body(body)
         self._body_bytes += len(body)

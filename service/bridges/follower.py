@@ -97,7 +97,7 @@ class Event:
 
 
 class Outlet:
-    """Base of outlets: what a bridge publishes. No method waits for a reader."""
+    """Base of outlets, which publish a bridge's data. No method waits for a reader."""
 
     columns: tuple[str, ...] | None = None
     """Columns of the frames; empty: all; None: no frames are needed."""

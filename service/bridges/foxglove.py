@@ -1,6 +1,6 @@
 """Foxglove's live view: a websocket server of the protocol `foxglove.sdk.v1`.
 
-Topics, schemas and encoder are those of MCAP files. The library sends from threads of its own, and
+Topics, schemas and encoder are those of MCAP files. The library sends from its own threads, and
 drops the oldest messages for a slow viewer.
 """
 

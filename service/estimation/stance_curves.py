@@ -246,7 +246,7 @@ class PeakSearch:
             self._t_ns, self._forces = self._t_ns[_CHUNK:], self._forces[:, _CHUNK:]
 
     def estimate_peak(self) -> StancePeak | None:
-        """Estimate the peak so far; None without a force."""
+        """Estimate the highest peak until now; None without a force."""
         if not self._frames:
             return None
         self._search(slice(None))

@@ -46,7 +46,7 @@ class ExportResult:
 
 
 def export_session(source: Path, out: Path, options: ExportOptions) -> ExportResult:
-    """Write a sealed session, or a slice of it, in another format.
+    """Write a sealed session, or a slice, in another format.
 
     Args:
         source: the session's frames file.

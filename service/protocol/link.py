@@ -181,7 +181,7 @@ class Proof(StrictModel):
 
 
 class EarlierStream(StrictModel):
-    """Ended stream of which the node still stores frames, or has lost some."""
+    """Ended stream with frames that the node still stores or has lost."""
 
     array_info: KnownArray
     stored: SeqIntervals

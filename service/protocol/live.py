@@ -291,7 +291,7 @@ class TrialsView(View):
 
 
 class PageQuery(StrictModel):
-    """Query of a page. Descriptions say what a refused value should have been."""
+    """Query of a page. Descriptions state the values that a refused one could have had."""
 
     format: Literal["json"] = Field(default="json", description="json or arrow")
     policy: Literal["latest"] = Field(

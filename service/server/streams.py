@@ -279,7 +279,7 @@ class ServerStream:
         return requested & needed
 
     def apply_present_hello(self, hello: Hello, now_t_ns: int) -> None:
-        """Apply hello of which this is the present stream: bounds, obtainable frames, losses."""
+        """Apply a hello that names this stream as present: bounds, obtainable frames, losses."""
         self.limit = StreamLimit.from_hello(hello, now_t_ns)
         self.node_ranges = Intervals((*hello.stored, (hello.next_seq, NO_END)))
         self._update_notes(hello.lost, next_seq=None)

@@ -25,7 +25,7 @@ STEADY_S = 1.0
 LOADED_KPA = 0.3
 """Least pressure of a load above that of the rest; a light weight gives 0.5 kPa."""
 MOVED_PART = 0.15
-"""A step whose pressure changes by more than this part of it is repeated; creep stays below."""
+"""Relative change of pressure above which a step is repeated; creep stays below."""
 TRACE_S = 20.0
 """Length of `Weighing.recent_kpa`."""
 _MOVED_KPA = 0.15  # or by more than this, where the part is less

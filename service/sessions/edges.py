@@ -84,7 +84,7 @@ def collect_edge_markers(inputs: SessionInputs) -> EdgeMarkers:
 def make_edge_markers(
     edges: Sequence[Edge], section: SyncSection, info: ArrayInfo, clock: ClockTable, part: int
 ) -> list[Marker]:
-    """Return edges of one stream as markers, in the server's time as far as that is known.
+    """Return edges of one stream as markers, in the server's time where that is known.
 
     Args:
         edges: edges of the stream.

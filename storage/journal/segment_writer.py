@@ -66,7 +66,7 @@ class SegmentWriter:
             raise
 
     def append(self, message: EncodedBatch) -> None:
-        """Append a batch and its record; all of it, or none.
+        """Append a batch and its record, completely or not at all.
 
         Raises:
             OSError: the disk is full or refuses it.
@@ -213,7 +213,7 @@ class OpenSegments:
         return bool(self._closing)
 
     def append(self, message: EncodedBatch) -> SegmentWriter:
-        """Append a batch to the segment where it fits; all of it, or none.
+        """Append a batch to the segment where it fits, completely or not at all.
 
         Raises:
             StorageError: the disk is full or not writable.

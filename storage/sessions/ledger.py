@@ -108,7 +108,7 @@ class StreamState:
 
     Attributes:
         stored: numbers that are stored here, or in the sealed file.
-        lost: numbers that will not come, by reason; none of them is stored.
+        lost: numbers that will not come, by reason; no stored one is among them.
         damaged: numbers that were stored here and cannot be read any more.
         obtainable: numbers that the node may still have; unknown ones count as obtainable.
         next_seq: number after its last frame; None while it runs, or if unknown.

@@ -80,7 +80,7 @@ def wrap_session_as_metadata(session: Session) -> StoredMetadata:
 def _parse_pulled_metadata(
     folder: Path, content: dict[str, Any], problems: list[str]
 ) -> StoredMetadata:
-    """Parse a pulled session: the API's view of it, and markers and ledger beside it."""
+    """Parse a pulled session: the API's view of the session, with markers and ledger beside it."""
     text = _read_sidecar_json(folder / LEDGER_NAME, problems)
     _read_sidecar_json(folder / PULLED_MARKERS_NAME, problems)
     parts = tuple(Part.model_validate(part) for part in content["parts"])
@@ -233,7 +233,7 @@ class SessionFilter:
     """Filter of sessions; an empty field accepts every session.
 
     Attributes:
-        nodes: names of nodes, one of which recorded the session.
+        nodes: names of nodes; one has to have recorded the session.
         tags: tags that the session has, case-insensitive.
         take: id of its take.
         q: text in id, name, subject, notes, node, scene or a tag, case-insensitive.

@@ -134,7 +134,7 @@ def encode_overview(levels: Sequence[Bins], *, tile_count: int, frames_sha256: s
     """Return the bytes of an `overview.arrow`.
 
     Args:
-        levels: bins of each level, the finest first, none of them empty.
+        levels: bins of each level, the finest first, no level empty.
         tile_count: number of the array's tiles.
         frames_sha256: file hash of the frames.
     """

@@ -298,7 +298,7 @@ class BinBuilder:
         """Drop all but the first frames: those of full bins, at most `max_frames`.
 
         Returns:
-            The number of frames left. The last of them has to be added again before the next one.
+            The number of frames left. The last frame has to be added again before the next one.
         """
         bins = concatenate_bins(self._bins) if self._bins else None
         ends = np.cumsum(bins["frames"] if bins is not None else [], dtype=np.int64)

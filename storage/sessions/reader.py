@@ -1,4 +1,4 @@
-"""Reader of a sealed session: all of it, or the row groups and columns of a slice.
+"""Reader of a sealed session: complete, or the row groups and columns of a slice.
 
 Data is verified before it is read: the whole file by its hash, or for slices the footer by its own,
 and every page by its checksum. The statistics of a verified footer give the row groups that may

@@ -161,7 +161,7 @@ def _verify_documents(
 
     Args:
         data_folder: the data folder.
-        verified_folders: folders of streams and sessions; of them only set-aside files are listed.
+        verified_folders: folders of streams and sessions, whose set-aside files only are listed.
         report: findings are added here.
     """
 

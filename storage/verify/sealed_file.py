@@ -321,7 +321,7 @@ class ExportReport:
     Attributes:
         path: the file.
         format: format of the file.
-        source: session, hashes of its file, and selection; empty if the export has none of it.
+        source: session, hashes of its file, and selection; empty if the export states none.
         problems: messages of damage; empty: it can be read to its end.
     """
 

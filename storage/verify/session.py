@@ -292,7 +292,7 @@ def _check_derived_file(
     Args:
         report: findings are added here.
         path: the file.
-        read_frames_sha256: reads all of it; returns the hash of the frames it was made from.
+        read_frames_sha256: reads the whole file; returns the hash of the frames it was made from.
     """
     try:
         frames_sha256 = read_frames_sha256(path)

@@ -123,7 +123,7 @@ class EmulatedPart:
 
 
 class EmulatedBmp581:
-    """Emulated part: registers, modes, and conversions by a clock of its own.
+    """Emulated part: registers, modes, and conversions by the part's own clock.
 
     Args:
         part: its properties.

@@ -117,7 +117,7 @@ def stored_file_response(
     filename: str,
     headers: Mapping[str, str] = MappingProxyType({}),
 ) -> Response:
-    """Answer with a file that never changes, or a range of it.
+    """Answer with a file that never changes, or with a byte range.
 
     Args:
         request: the request.

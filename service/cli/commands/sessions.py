@@ -288,7 +288,7 @@ def export_command(
     ] = False,
     options: FormatOptions,
 ) -> None:
-    """Write a sealed session, or a slice of it, in another format.
+    """Write a sealed session, or a slice, in another format.
 
     Each of many sessions is written into a folder of its id in --out; a repeated command resumes.
     Exit code 3: some sessions failed.

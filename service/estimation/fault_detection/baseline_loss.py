@@ -10,9 +10,9 @@ hardly reads too little at all.
 
 A tile that permanently reads too much cannot be told from a loaded one.
 
-Thermal drift, the shift of the baseline by warmth: without the model `temperature` all of it is
-error, and all tiles err to the same side. The gas follows its chip within seconds, so the larger
-shift counts: the chip's, or its low-pass.
+Thermal drift is the shift of the baseline by warmth. Without the model `temperature` the drift is
+all error, and all tiles err to the same side. The gas follows its chip within seconds, so the
+larger shift counts: the chip's, or its low-pass.
 """
 
 from __future__ import annotations

@@ -78,7 +78,7 @@ def limit_arrow_threads() -> None:
 
 
 def run_job(job: Job) -> Outcome | Unfinished:
-    """Run a job, or one chunk of it if the session is long; skip it if its result exists.
+    """Run a job, or one chunk if the session is long; skip a job whose result exists.
 
     Raises:
         UsageError: worker and client run different versions.

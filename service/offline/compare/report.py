@@ -231,7 +231,7 @@ def plot_comparison(
 
     Args:
         title: title of the figure.
-        pairs: our frames with the reference, n of them.
+        pairs: our n frames with the reference.
         force_n: (n, tiles), forces of the tiles.
         serials: serials of the tiles.
         errors: source of the limits of agreement.

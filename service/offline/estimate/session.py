@@ -51,7 +51,7 @@ from storage.sessions.time_axis import TIME_AXIS_NOTE
 from storage.sessions.writer import SealedFileWriter
 
 _WHOLE_SESSION_NOTES = frozenset({"session", "ledger"})
-"""Notes of a session that do not hold for a part of it."""
+"""Notes of a session that do not hold for a part."""
 _ESTIMATOR_NOTE = "estimator"
 """Note of the estimator, if it is not that of the models."""
 _ANGLE_NOTE = "angle"

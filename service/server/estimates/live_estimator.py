@@ -44,7 +44,7 @@ class TileRanges:
         end_kpa: end of each tile's calibrated range.
         full_scale_n: force at that end.
         slope_n_per_kpa: slope near zero.
-        is_scale_assumed: True if the newtons of any of them rest on an assumption.
+        is_scale_assumed: True if the newtons of any tile rest on an assumption.
     """
 
     entries: tuple[TileCalibration | None, ...]

@@ -224,7 +224,7 @@ class SpacedTimes(NamedTuple):
 
 
 def fit_constant_rate_if_times_repeat(time_s: Floats) -> SpacedTimes:
-    """Replace all times by times at a constant rate if rounding made some of them equal.
+    """Replace all times by times at a constant rate if rounding made some equal.
 
     Times are returned unchanged unless the rate is clear: no time falls, and all deviate from a
     constant rate by rounding only.

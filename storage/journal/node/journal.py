@@ -90,7 +90,7 @@ def _recover_ended_stream(folder: Path, problems: list[str]) -> NodeStream | Non
 
 
 def _open_stream(folder: Path, problems: list[str]) -> NodeStream | None:
-    """Open a stream on disk; None if nothing of it can be read.
+    """Open a stream on disk; None if nothing can be read.
 
     Raises:
         FileFormatError: another version wrote its notes.

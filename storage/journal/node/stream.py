@@ -359,7 +359,7 @@ class NodeStream:
                 self.update_and_save_notes(sync_max_s=took_s)
 
     def try_record_end_once_synced(self, requests: RetentionRequests, problems: list[str]) -> None:
-        """Record the stream's end once all of it is on disk; the next call retries after an error.
+        """Record the stream's end once it is whole on disk; the next call retries after an error.
 
         Args:
             requests: retention requests.

@@ -179,7 +179,7 @@ async def get_video(session_id: str, video_id: str, server: ServerState) -> Vide
     "/{video_id}", summary="Delete a video", **NO_CONTENT, responses=problem_responses(_UNKNOWN)
 )
 async def delete_video(session_id: str, video_id: str, server: ServerState) -> None:
-    """Delete a video for good, with its alignment and all that was made of it."""
+    """Delete a video for good, with its alignment and the files made from it."""
     await run_in_threadpool(remove_video, _find_folder(session_id, server), video_id)
 
 
