@@ -8,7 +8,7 @@
 
 It lists, searches and opens sessions as Arrow, pandas and numpy; the server cuts the slices. It
 tares and records nodes, and adds markers. `connect_async` is the same for asyncio. All its errors
-are `FootTileError`s.
+are `ClientError`s.
 """
 
 from __future__ import annotations
@@ -18,38 +18,38 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import os
 
-    from foottile.asyncio_client import AsyncServer as AsyncServer
+    from foottile.asyncio_client import AsyncClient as AsyncClient
+    from foottile.client import Client as Client
     from foottile.errors import AccessDeniedError as AccessDeniedError
+    from foottile.errors import ClientError as ClientError
     from foottile.errors import ConflictError as ConflictError
     from foottile.errors import DamagedError as DamagedError
-    from foottile.errors import FootTileError as FootTileError
     from foottile.errors import FramesLostWarning as FramesLostWarning
+    from foottile.errors import InvalidRequestError as InvalidRequestError
     from foottile.errors import NotFoundError as NotFoundError
     from foottile.errors import ServerUnavailableError as ServerUnavailableError
-    from foottile.errors import UsageError as UsageError
     from foottile.live import FrameLoss as FrameLoss
     from foottile.live import LiveStream as LiveStream
-    from foottile.server import Server as Server
-    from foottile.sessions import Marker as Marker
-    from foottile.sessions import Session as Session
+    from foottile.sessions import RemoteSession as RemoteSession
     from foottile.sessions import SessionData as SessionData
+    from foottile.sessions import SessionMarker as SessionMarker
 
 _MODULES = {
     "AccessDeniedError": "errors",
-    "AsyncServer": "asyncio_client",
+    "AsyncClient": "asyncio_client",
+    "Client": "client",
+    "ClientError": "errors",
     "ConflictError": "errors",
     "DamagedError": "errors",
-    "FootTileError": "errors",
     "FrameLoss": "live",
     "FramesLostWarning": "errors",
+    "InvalidRequestError": "errors",
     "LiveStream": "live",
-    "Marker": "sessions",
     "NotFoundError": "errors",
-    "Server": "server",
+    "RemoteSession": "sessions",
     "ServerUnavailableError": "errors",
-    "Session": "sessions",
     "SessionData": "sessions",
-    "UsageError": "errors",
+    "SessionMarker": "sessions",
 }
 """Module of each public name; imported at first use, because importing Arrow is slow."""
 
@@ -62,7 +62,7 @@ def connect(
     *,
     timeout_s: float = 10.0,
     ca: str | os.PathLike[str] | None = None,
-) -> Server:
+) -> Client:
     """Return a client of a server, without a request yet; a context manager, or `close` it.
 
     Args:
@@ -73,11 +73,11 @@ def connect(
         ca: file or folder of further CA certificates in PEM, for example a laboratory's.
 
     Raises:
-        UsageError: invalid address, token or certificate.
+        InvalidRequestError: invalid address, token or certificate.
     """
-    from foottile.server import Server
+    from foottile.client import Client
 
-    return Server(url, token, timeout_s=timeout_s, ca=ca)
+    return Client(url, token, timeout_s=timeout_s, ca=ca)
 
 
 def connect_async(
@@ -86,11 +86,11 @@ def connect_async(
     *,
     timeout_s: float = 10.0,
     ca: str | os.PathLike[str] | None = None,
-) -> AsyncServer:
+) -> AsyncClient:
     """Return a client for asyncio; arguments and errors as for `connect`."""
-    from foottile.asyncio_client import AsyncServer
+    from foottile.asyncio_client import AsyncClient
 
-    return AsyncServer(url, token, timeout_s=timeout_s, ca=ca)
+    return AsyncClient(url, token, timeout_s=timeout_s, ca=ca)
 
 
 def __getattr__(name: str) -> Any:

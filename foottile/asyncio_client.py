@@ -14,11 +14,11 @@ import pyarrow as pa
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
+from foottile.client import Client
 from foottile.connection import AsyncCloseable, AsyncWebsocket
-from foottile.errors import FootTileError
+from foottile.errors import ClientError
 from foottile.live import FrameLoss, LiveRequest, LiveStreamState, Policy
-from foottile.server import Server
-from foottile.sessions import Clock, Marker, Session, SessionData
+from foottile.sessions import Clock, RemoteSession, SessionData, SessionMarker
 
 T = TypeVar("T")
 
@@ -58,9 +58,9 @@ class AsyncSessionData:
 
 
 class AsyncSession:
-    """Asynchronous `Session`, with the same arguments, results and errors."""
+    """Asynchronous `RemoteSession`, with the same arguments, results and errors."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: RemoteSession) -> None:
         self.snapshot = session
         """Session at the last response: `snapshot.id`, `snapshot.state`, `snapshot.metadata`."""
 
@@ -81,87 +81,87 @@ class AsyncSession:
         end_s: float | None = None,
         clock: Clock = "node",
     ) -> AsyncSessionData:
-        """Return the frames, as `Session.open`."""
+        """Return the frames, as `RemoteSession.open`."""
         data = self.snapshot.open(columns, start_s=start_s, end_s=end_s, clock=clock)
         return AsyncSessionData(data)
 
     async def refresh(self) -> Self:
-        """Call `Session.refresh` in a thread."""
+        """Call `RemoteSession.refresh` in a thread."""
         await asyncio.to_thread(self.snapshot.refresh)
         return self
 
-    async def markers(self) -> list[Marker]:
-        """Call `Session.markers` in a thread."""
+    async def markers(self) -> list[SessionMarker]:
+        """Call `RemoteSession.markers` in a thread."""
         return await asyncio.to_thread(self.snapshot.markers)
 
-    async def add_marker(self, label: str, *, t_ns: int | None = None) -> Marker:
-        """Call `Session.add_marker` in a thread."""
+    async def add_marker(self, label: str, *, t_ns: int | None = None) -> SessionMarker:
+        """Call `RemoteSession.add_marker` in a thread."""
         return await asyncio.to_thread(self.snapshot.add_marker, label, t_ns=t_ns)
 
     async def update(self, **changes: Any) -> Self:
-        """Call `Session.update` in a thread."""
+        """Call `RemoteSession.update` in a thread."""
         await asyncio.to_thread(self.snapshot.update, **changes)
         return self
 
     async def stop(self) -> Self:
-        """Call `Session.stop` in a thread."""
+        """Call `RemoteSession.stop` in a thread."""
         await asyncio.to_thread(self.snapshot.stop)
         return self
 
     async def wait_until_sealed(self, timeout_s: float = 60.0) -> Self:
-        """Call `Session.wait_until_sealed` in a thread."""
+        """Call `RemoteSession.wait_until_sealed` in a thread."""
         await asyncio.to_thread(self.snapshot.wait_until_sealed, timeout_s)
         return self
 
     async def download(self, path: Any, **options: Any) -> Any:
-        """Call `Session.download` in a thread."""
+        """Call `RemoteSession.download` in a thread."""
         return await asyncio.to_thread(self.snapshot.download, path, **options)
 
 
-class AsyncServer(AsyncCloseable):
-    """Asynchronous `Server`, created by `foottile.connect_async`."""
+class AsyncClient(AsyncCloseable):
+    """Asynchronous `Client`, created by `foottile.connect_async`."""
 
     def __init__(self, url: str, token: str | None = None, **options: Any) -> None:
-        self._server = Server(url, token, **options)
+        self._client = Client(url, token, **options)
 
     async def close(self) -> None:
         """Close all connections."""
-        self._server.close()
+        self._client.close()
 
     async def nodes(self) -> list[dict[str, Any]]:
-        """Call `Server.nodes` in a thread."""
-        return await asyncio.to_thread(self._server.nodes)
+        """Call `Client.nodes` in a thread."""
+        return await asyncio.to_thread(self._client.nodes)
 
     async def node(self, name: str) -> dict[str, Any]:
-        """Call `Server.node` in a thread."""
-        return await asyncio.to_thread(self._server.node, name)
+        """Call `Client.node` in a thread."""
+        return await asyncio.to_thread(self._client.node, name)
 
     async def sessions(
         self, search: str | None = None, **filters: Any
     ) -> AsyncIterator[AsyncSession]:
-        """Yield sessions, as `Server.sessions`: `async for session in server.sessions("mud")`."""
-        async for session in _iterate_in_thread(self._server.sessions(search, **filters)):
+        """Yield sessions, as `Client.sessions`: `async for session in server.sessions("mud")`."""
+        async for session in _iterate_in_thread(self._client.sessions(search, **filters)):
             yield AsyncSession(session)
 
     async def session(self, session_id: str) -> AsyncSession:
-        """Call `Server.session` in a thread."""
-        return AsyncSession(await asyncio.to_thread(self._server.session, session_id))
+        """Call `Client.session` in a thread."""
+        return AsyncSession(await asyncio.to_thread(self._client.session, session_id))
 
     async def download_take(self, take: str, path: Any, **options: Any) -> Any:
-        """Call `Server.download_take` in a thread."""
-        return await asyncio.to_thread(self._server.download_take, take, path, **options)
+        """Call `Client.download_take` in a thread."""
+        return await asyncio.to_thread(self._client.download_take, take, path, **options)
 
     async def record(self, node: str, name: str, **options: Any) -> AsyncSession:
-        """Call `Server.record` in a thread; `async with` stops the recording."""
-        return AsyncSession(await asyncio.to_thread(self._server.record, node, name, **options))
+        """Call `Client.record` in a thread; `async with` stops the recording."""
+        return AsyncSession(await asyncio.to_thread(self._client.record, node, name, **options))
 
     async def tare(self, node: str, reason: str = "") -> dict[str, Any]:
-        """Call `Server.tare` in a thread."""
-        return await asyncio.to_thread(self._server.tare, node, reason)
+        """Call `Client.tare` in a thread."""
+        return await asyncio.to_thread(self._client.tare, node, reason)
 
     async def tares(self, node: str) -> list[dict[str, Any]]:
-        """Call `Server.tares` in a thread."""
-        return await asyncio.to_thread(self._server.tares, node)
+        """Call `Client.tares` in a thread."""
+        return await asyncio.to_thread(self._client.tares, node)
 
     def live(
         self,
@@ -175,9 +175,9 @@ class AsyncServer(AsyncCloseable):
         reconnect_timeout_s: float | None = None,
     ) -> AsyncLiveStream:
         """Return a live stream: `async for batch in server.live("left")`."""
-        request = LiveRequest.create(self._server.url, node, columns, policy, stream_id, from_seq)
+        request = LiveRequest.create(self._client.url, node, columns, policy, stream_id, from_seq)
         return AsyncLiveStream(
-            request, self._server.http, on_loss=on_loss, reconnect_timeout_s=reconnect_timeout_s
+            request, self._client.http, on_loss=on_loss, reconnect_timeout_s=reconnect_timeout_s
         )
 
 
@@ -203,7 +203,7 @@ class AsyncLiveStream(LiveStreamState, AsyncCloseable):
             self._last_message_s = time.monotonic()
             try:
                 batch = self._protocol.parse_message(message)
-            except FootTileError:
+            except ClientError:
                 await self.close()
                 raise
             if batch is not None:

@@ -18,7 +18,7 @@ from websockets.exceptions import InvalidHandshake, InvalidStatus
 from websockets.http11 import Response
 from websockets.sync.client import ClientConnection
 
-from foottile.errors import UsageError
+from foottile.errors import InvalidRequestError
 
 _BYTES_MAX = 16 << 20
 """Size limit of a file of CAs: 70 times Debian's."""
@@ -36,7 +36,7 @@ def make_context(
         is_exclusive: trust no other CA than these.
 
     Raises:
-        UsageError: no readable certificate.
+        InvalidRequestError: no readable certificate.
     """
     if ca is None:
         return ssl.create_default_context()
@@ -54,11 +54,13 @@ def make_context(
             context.load_verify_locations(cafile=path)
             has_certs = len(context.get_ca_certs()) > count_before or _is_trusted(path)
     except (OSError, ValueError) as error:  # an ssl.SSLError is an OSError
-        raise UsageError(
+        raise InvalidRequestError(
             f"{str(path)!r}: no CA certificates can be read: {error}; expected a file in PEM"
         ) from error
     if not has_certs:
-        raise UsageError(f"{str(path)!r}: there is no CA certificate in it; expected a file in PEM")
+        raise InvalidRequestError(
+            f"{str(path)!r}: there is no CA certificate in it; expected a file in PEM"
+        )
     return context
 
 
@@ -68,12 +70,14 @@ def make_local_context(ca: str) -> ssl.SSLContext:
     Its name is not compared: it listens on a loopback address, and its file is this user's.
 
     Raises:
-        UsageError: there is no readable certificate.
+        InvalidRequestError: there is no readable certificate.
     """
     try:
         context = ssl.create_default_context(cafile=ca)
     except OSError as error:
-        raise UsageError(f"{ca!r}: the certificate of the local server: {error}") from error
+        raise InvalidRequestError(
+            f"{ca!r}: the certificate of the local server: {error}"
+        ) from error
     context.check_hostname = False
     context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
     return context

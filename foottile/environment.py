@@ -6,7 +6,7 @@ import logging
 import os
 import re
 
-from foottile.errors import UsageError
+from foottile.errors import InvalidRequestError
 
 log = logging.getLogger("foottile.environment")
 
@@ -25,13 +25,15 @@ def read_variable(name: str) -> str | None:
     warning.
 
     Raises:
-        UsageError: a control character is in it.
+        InvalidRequestError: a control character is in it.
     """
     value = os.environ.get(name, "").strip()
     if len(value) > 1 and value[0] == value[-1] and value[0] in "'\"":
         value = value[1:-1].strip()
     if any(ord(character) < ord(" ") or character == "\x7f" for character in value):
-        raise UsageError(f"{name}: a control character is in its value; expected one line of text")
+        raise InvalidRequestError(
+            f"{name}: a control character is in its value; expected one line of text"
+        )
     if name.endswith("_PORT") and _KUBERNETES.fullmatch(value):
         log.warning(
             "%s=%s is ignored: Kubernetes sets it for a service of this name; expected a number. "
@@ -46,7 +48,7 @@ def read_token() -> str | None:
     """Return the token in `FOOTTILE_TOKEN`; None if it is not set or empty.
 
     Raises:
-        UsageError: no HTTP header can carry it.
+        InvalidRequestError: no HTTP header can carry it.
     """
     token = read_variable(TOKEN_VARIABLE)
     return None if token is None else check_token(token, TOKEN_VARIABLE)
@@ -56,11 +58,11 @@ def check_token(token: str, where: str) -> str:
     """Return a token without white space at its ends.
 
     Raises:
-        UsageError: no HTTP header can carry it.
+        InvalidRequestError: no HTTP header can carry it.
     """
     token = token.strip()
     if not _TOKEN.fullmatch(token):
-        raise UsageError(
+        raise InvalidRequestError(
             f"{where} is no token; expected ASCII letters, digits and signs; no spaces. "
             "Copy the one that `foottile serve` shows or keeps in a file"
         )

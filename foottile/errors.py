@@ -1,7 +1,7 @@
 """Errors of this package.
 
-    FootTileError
-     +-- UsageError              (ValueError)       invalid request: column, address, time, format
+    ClientError
+     +-- InvalidRequestError     (ValueError)       column, address, time or format
      +-- NotFoundError           (LookupError)      no such node, session or stream
      +-- AccessDeniedError       (PermissionError)  token missing or insufficient
      +-- ConflictError                              state forbids it: recording, node away, changed
@@ -18,7 +18,7 @@ from http import HTTPStatus
 from typing import Any
 
 
-class FootTileError(Exception):
+class ClientError(Exception):
     """Base of all errors.
 
     Attributes:
@@ -34,27 +34,27 @@ class FootTileError(Exception):
         self.status = status
 
 
-class UsageError(FootTileError, ValueError):
+class InvalidRequestError(ClientError, ValueError):
     """Invalid request: address, column, format, time or range."""
 
 
-class NotFoundError(FootTileError, LookupError):
+class NotFoundError(ClientError, LookupError):
     """Unknown node, session or stream."""
 
 
-class AccessDeniedError(FootTileError, PermissionError):
+class AccessDeniedError(ClientError, PermissionError):
     """Missing or insufficient token."""
 
 
-class ConflictError(FootTileError):
+class ConflictError(ClientError):
     """Conflict with the present state: session recording, node away, or metadata changed."""
 
 
-class ServerUnavailableError(FootTileError, ConnectionError):
+class ServerUnavailableError(ClientError, ConnectionError):
     """No usable response: no server, connection lost, timeout, or another program."""
 
 
-class DamagedError(FootTileError):
+class DamagedError(ClientError):
     """Received data that is damaged or incomplete."""
 
 
@@ -62,21 +62,21 @@ class FramesLostWarning(UserWarning):
     """Permanent loss of frames of a live stream; the text has their numbers and the reason."""
 
 
-_BY_STATUS: dict[int, type[FootTileError]] = {
-    HTTPStatus.BAD_REQUEST: UsageError,
+_BY_STATUS: dict[int, type[ClientError]] = {
+    HTTPStatus.BAD_REQUEST: InvalidRequestError,
     HTTPStatus.UNAUTHORIZED: AccessDeniedError,
     HTTPStatus.FORBIDDEN: AccessDeniedError,
     HTTPStatus.NOT_FOUND: NotFoundError,
     HTTPStatus.CONFLICT: ConflictError,
     HTTPStatus.PRECONDITION_FAILED: ConflictError,
-    HTTPStatus.REQUEST_ENTITY_TOO_LARGE: UsageError,
-    HTTPStatus.UNPROCESSABLE_ENTITY: UsageError,
+    HTTPStatus.REQUEST_ENTITY_TOO_LARGE: InvalidRequestError,
+    HTTPStatus.UNPROCESSABLE_ENTITY: InvalidRequestError,
     HTTPStatus.REQUEST_TIMEOUT: ServerUnavailableError,
     HTTPStatus.SERVICE_UNAVAILABLE: ServerUnavailableError,
 }
 
 
-def make_error(status: int, content: object, url: str, *, otherwise: str = "") -> FootTileError:
+def make_error(status: int, content: object, url: str, *, otherwise: str = "") -> ClientError:
     """Return the error for an error response.
 
     Args:
@@ -89,5 +89,5 @@ def make_error(status: int, content: object, url: str, *, otherwise: str = "") -
     detail = problem.get("detail") or otherwise or f"HTTP {status}"
     if not isinstance(detail, str):
         detail = otherwise or f"HTTP {status}"
-    kind = _BY_STATUS.get(status, FootTileError)
+    kind = _BY_STATUS.get(status, ClientError)
     return kind(f"{url}: {detail}", problem=problem, status=status)

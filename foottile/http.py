@@ -17,13 +17,13 @@ from foottile.connection import (
     make_local_context,
 )
 from foottile.environment import check_token, decode_zone, read_token
-from foottile.errors import FootTileError, ServerUnavailableError, UsageError, make_error
+from foottile.errors import ClientError, InvalidRequestError, ServerUnavailableError, make_error
 from foottile.local_server import find_local_server
 
 try:
     import httpx
 except ModuleNotFoundError as error:  # a node does not need it
-    raise UsageError("foottile needs httpx: pip install 'foottile[client]'") from error
+    raise InvalidRequestError("foottile needs httpx: pip install 'foottile[client]'") from error
 
 API = "/api/v1"
 _ATTEMPTS_MAX = 2
@@ -40,7 +40,7 @@ class HttpClient:
         ca: file or folder of further CA certificates, beside the machine's.
 
     Raises:
-        UsageError: invalid address, token or certificate.
+        InvalidRequestError: invalid address, token or certificate.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class HttpClient:
         if local is not None and local.ca and ca is None:
             self.context = make_local_context(local.ca)
         if ca is not None and self.context is None:
-            raise UsageError(f"{self.url}: a CA is for addresses with https://")
+            raise InvalidRequestError(f"{self.url}: a CA is for addresses with https://")
         self.headers = {"Authorization": f"Bearer {token}"} if token else {}
         try:
             self._client = httpx.Client(
@@ -73,9 +73,9 @@ class HttpClient:
                 verify=self.context or ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT),
             )
         except (httpx.InvalidURL, ValueError) as error:
-            raise UsageError(f"{url!r} is no server address: {error}") from error
+            raise InvalidRequestError(f"{url!r} is no server address: {error}") from error
         if self._client.base_url.scheme not in ("http", "https") or not self._client.base_url.host:
-            raise UsageError(f"{url!r} is no server address; expected http://HOST:PORT")
+            raise InvalidRequestError(f"{url!r} is no server address; expected http://HOST:PORT")
 
     def close(self) -> None:
         """Close all connections."""
@@ -92,7 +92,7 @@ class HttpClient:
             field: field that every valid response has.
 
         Raises:
-            FootTileError: no response, or a problem response.
+            ClientError: no response, or a problem response.
         """
         content = self._request("GET", path, _ATTEMPTS_MAX, params=_encode_query(query))
         if field and field not in content:
@@ -121,7 +121,7 @@ class HttpClient:
             is_idempotent: send it again if the first response is lost.
 
         Raises:
-            FootTileError: no response, or a problem response.
+            ClientError: no response, or a problem response.
         """
         content = None if body is None else {k: v for k, v in body.items() if v is not None}
         attempts = _ATTEMPTS_MAX if is_idempotent else 1
@@ -143,7 +143,7 @@ class HttpClient:
             headers: further headers.
 
         Raises:
-            FootTileError: no response, a problem response, or an interrupted one.
+            ClientError: no response, a problem response, or an interrupted one.
         """
         has_response = False
         try:
@@ -164,7 +164,7 @@ class HttpClient:
 
     def _request(self, method: str, path: str, attempts: int, **options: Any) -> dict[str, Any]:
         if self._client.is_closed:
-            raise UsageError(f"{self.url}: this connection was closed; make a new one")
+            raise InvalidRequestError(f"{self.url}: this connection was closed; make a new one")
         while True:
             attempts -= 1
             try:
@@ -193,7 +193,7 @@ class HttpClient:
         if problem is not None:
             raise ServerUnavailableError(f"{self.url}: {problem}", status=status)
 
-    def _make_error(self, response: httpx.Response) -> FootTileError:
+    def _make_error(self, response: httpx.Response) -> ClientError:
         reason = f"{response.reason_phrase} (HTTP {response.status_code})"
         return make_error(response.status_code, _parse_json(response), self.url, otherwise=reason)
 

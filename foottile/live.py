@@ -29,11 +29,11 @@ from foottile.connection import (
     explain_tls,
 )
 from foottile.errors import (
+    ClientError,
     DamagedError,
-    FootTileError,
     FramesLostWarning,
+    InvalidRequestError,
     ServerUnavailableError,
-    UsageError,
     make_error,
 )
 from foottile.http import HttpClient
@@ -160,23 +160,23 @@ class LiveProtocol:
         """Handle the close code of a connection; returning means: reconnect.
 
         Raises:
-            UsageError: no such node, column or stream.
+            InvalidRequestError: no such node, column or stream.
             DamagedError: the server cannot read the next frame.
         """
         if code == _POLICY:
-            raise UsageError(f"{self._request.url}: {reason}")
+            raise InvalidRequestError(f"{self._request.url}: {reason}")
         if code == _UNREADABLE:
             raise DamagedError(f"{self._request.url}: {reason}")
         if code == _NO_STREAM:
             if not self._has_connected or self._stream_id is None:
-                raise UsageError(f"{self._request.url}: {reason}")
+                raise InvalidRequestError(f"{self._request.url}: {reason}")
             loss = FrameLoss(self._stream_id, self._next_seq or 0, None, "no_stream")
             self._stream_id, self._next_seq = None, 0  # all stored frames of the present one
             self._add_loss(loss)
 
     def explain_rejection(
         self, status: int, headers: Mapping[str, str], body: bytes
-    ) -> FootTileError | None:
+    ) -> ClientError | None:
         """Return the error for an HTTP response in place of a websocket; None: retry.
 
         Args:
@@ -302,7 +302,7 @@ class LiveStreamState:
         """Return the delay before reconnecting after a closed connection.
 
         Raises:
-            FootTileError: reconnecting is useless.
+            ClientError: reconnecting is useless.
         """
         if self._is_closed:
             return 0.0
@@ -316,7 +316,7 @@ class LiveStreamState:
         """Return the delay before reconnecting after a failed attempt.
 
         Raises:
-            FootTileError: another attempt is useless.
+            ClientError: another attempt is useless.
         """
         if isinstance(error, UpgradeRejection):
             problem = self._protocol.explain_rejection(error.status, error.headers, error.body)
@@ -330,7 +330,7 @@ class LiveStreamState:
 
 
 class LiveStream(LiveStreamState, Closeable):
-    """Iterator of live batches, created by `Server.live`; connects at the first batch.
+    """Iterator of live batches, created by `Client.live`; connects at the first batch.
 
     Each batch has consecutive frames of one stream, with `seq`, `t_ns`, the requested columns, and
     `recomputed`. `batch.schema.metadata[b"foottile.array_info"]` describes the array.
@@ -352,9 +352,9 @@ class LiveStream(LiveStreamState, Closeable):
         """Wait for the next frames and return them.
 
         Raises:
-            UsageError: no such node, column or stream.
+            InvalidRequestError: no such node, column or stream.
             ServerUnavailableError: no server at first, or not for `reconnect_timeout_s`.
-            FootTileError: the server rejects the request, or is no foottile server.
+            ClientError: the server rejects the request, or is no foottile server.
             StopIteration: the stream was closed.
         """
         while not self._is_closed:
@@ -367,7 +367,7 @@ class LiveStream(LiveStreamState, Closeable):
             self._last_message_s = time.monotonic()
             try:
                 batch = self._protocol.parse_message(message)
-            except FootTileError:
+            except ClientError:
                 self.close()
                 raise
             if batch is not None:

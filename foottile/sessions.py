@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from foottile.errors import ConflictError, DamagedError, FootTileError, UsageError
+from foottile.errors import ClientError, ConflictError, DamagedError, InvalidRequestError
 from foottile.http import HttpClient
 
 if TYPE_CHECKING:
@@ -64,8 +64,8 @@ class SessionData:
         """Return a column as numpy, [n] or [n, tiles]; or a selection of columns or seconds.
 
         Raises:
-            UsageError: a slice with a step, or an invalid column name.
-            FootTileError: as for `iter_batches`.
+            InvalidRequestError: a slice with a step, or an invalid column name.
+            ClientError: as for `iter_batches`.
         """
         if isinstance(key, str):
             columns = list(replace(self, columns=(key,)).to_numpy().values())
@@ -74,15 +74,15 @@ class SessionData:
             return self._slice_seconds(key)
         names = tuple(key)
         if not names or not all(isinstance(name, str) for name in names):
-            raise UsageError(f"{key!r} is no list of columns")
+            raise InvalidRequestError(f"{key!r} is no list of columns")
         return replace(self, columns=names)
 
     def iter_batches(self) -> Iterator[pa.RecordBatch]:
         """Yield the frames in batches of some thousand, as the network delivers them.
 
         Raises:
-            UsageError: no such column, or no such time in the session.
-            FootTileError: no response, no such session, or a damaged or interrupted response.
+            InvalidRequestError: no such column, or no such time in the session.
+            ClientError: no response, no such session, or a damaged or interrupted response.
         """
         query = {
             "format": "arrow",
@@ -96,7 +96,7 @@ class SessionData:
             content = io.BufferedReader(_ResponseFile(response), _CHUNK_BYTES)
             try:
                 yield from _read_batches(content)
-            except FootTileError:  # some are also OSErrors
+            except ClientError:  # some are also OSErrors
                 raise
             except (pa.ArrowInvalid, OSError, EOFError) as error:
                 raise DamagedError(
@@ -107,36 +107,36 @@ class SessionData:
         """Return an Arrow table; units and descriptions are in the metadata of its fields.
 
         Raises:
-            FootTileError: as for `iter_batches`, or the slice has no frame.
+            ClientError: as for `iter_batches`, or the slice has no frame.
         """
         batches = list(self.iter_batches())
         if not batches:
-            raise FootTileError(f"session {self.session_id} has no frame in this slice")
+            raise ClientError(f"session {self.session_id} has no frame in this slice")
         return pa.Table.from_batches(batches)
 
     def to_pandas(self) -> Any:
         """Return a pandas DataFrame; unknown values are NaN.
 
         Raises:
-            FootTileError: as for `to_arrow`, or pandas is not installed.
+            ClientError: as for `to_arrow`, or pandas is not installed.
         """
         try:
             return self.to_arrow().to_pandas()
         except ModuleNotFoundError as error:
-            raise FootTileError("this needs pandas: pip install pandas") from error
+            raise ClientError("this needs pandas: pip install pandas") from error
 
     def to_numpy(self) -> dict[str, npt.NDArray[Any]]:
         """Return arrays by name, [n]; unknown values are NaN, also in columns of integers.
 
         Raises:
-            FootTileError: as for `to_arrow`.
+            ClientError: as for `to_arrow`.
         """
         table = self.to_arrow()
         return {name: table[name].to_numpy() for name in table.column_names}
 
     def _slice_seconds(self, seconds: slice) -> SessionData:
         if seconds.step is not None:
-            raise UsageError("a slice of seconds has no step; expected begin and end only")
+            raise InvalidRequestError("a slice of seconds has no step; expected begin and end only")
         start_s = seconds.start if seconds.start is not None else self.start_s
         end_s = seconds.stop if seconds.stop is not None else self.end_s
         return replace(self, start_s=start_s, end_s=end_s)
@@ -194,7 +194,7 @@ def download(
     Raises:
         DamagedError: the hash differs.
         OSError: the file cannot be written.
-        FootTileError: no response, or a problem response.
+        ClientError: no response, or a problem response.
     """
     target = Path(path)
     partial = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
@@ -219,7 +219,7 @@ _POLL_S = 0.2
 
 
 @dataclass(frozen=True)
-class Marker:
+class SessionMarker:
     """Labelled instant of a session.
 
     Attributes:
@@ -233,12 +233,12 @@ class Marker:
     t_ns: int
 
     @classmethod
-    def create(cls, metadata: Mapping[str, Any]) -> Marker:
+    def create(cls, metadata: Mapping[str, Any]) -> SessionMarker:
         """Return a marker from the server's JSON."""
         return cls(metadata["id"], metadata["label"], metadata["t_ns"])
 
 
-class Session:
+class RemoteSession:
     """Session with its `metadata` at the last response, with every field of the API.
 
     As a context manager it stops a running recording at the end of the block.
@@ -250,7 +250,7 @@ class Session:
 
     def __repr__(self) -> str:
         what = f"{self.name!r} of {self.node}, {self.duration_s:.1f} s, {self.state}"
-        return f"<Session {self.id} {what}>"
+        return f"<RemoteSession {self.id} {what}>"
 
     def __enter__(self) -> Self:
         return self
@@ -259,7 +259,7 @@ class Session:
         try:
             if self.refresh().state == "recording":
                 self.stop()
-        except FootTileError:
+        except ClientError:
             if error is None:  # else the error of the block matters more
                 raise
 
@@ -314,7 +314,7 @@ class Session:
         """Fetch the present metadata.
 
         Raises:
-            FootTileError: no response, or no such session.
+            ClientError: no response, or no such session.
         """
         self.metadata = self._http.get(self._path)
         return self
@@ -338,24 +338,24 @@ class Session:
         names = (columns,) if isinstance(columns, str) else tuple(columns)
         return SessionData(self._http, self.id, names, start_s, end_s, clock)
 
-    def markers(self) -> list[Marker]:
+    def markers(self) -> list[SessionMarker]:
         """Return the markers, in order of time.
 
         Raises:
-            FootTileError: no response, or no such session.
+            ClientError: no response, or no such session.
         """
         found = self._http.get(f"{self._path}/markers", field="items")
-        return [Marker.create(each) for each in found["items"]]
+        return [SessionMarker.create(each) for each in found["items"]]
 
-    def add_marker(self, label: str, *, t_ns: int | None = None) -> Marker:
+    def add_marker(self, label: str, *, t_ns: int | None = None) -> SessionMarker:
         """Add a marker now, or at an instant of the server's UTC; a repeated request adds it once.
 
         Raises:
-            FootTileError: no response, or a problem response.
+            ClientError: no response, or a problem response.
         """
         body = {"label": label, "t_ns": t_ns, "id": uuid.uuid4().hex[:12]}
         path = f"{self._path}/markers"
-        return Marker.create(self._http.send("POST", path, body, is_idempotent=True))
+        return SessionMarker.create(self._http.send("POST", path, body, is_idempotent=True))
 
     def update(
         self,
@@ -369,7 +369,7 @@ class Session:
 
         Raises:
             ConflictError: the metadata changed since the last response; `refresh` it.
-            FootTileError: no response, or a problem response.
+            ClientError: no response, or a problem response.
         """
         body = {"name": name, "subject": subject, "notes": notes}
         changes: dict[str, object] = {**body, "tags": None if tags is None else list(tags)}
@@ -381,7 +381,7 @@ class Session:
         """Stop the recording; return when it is sealed, or after some seconds.
 
         Raises:
-            FootTileError: no response, or no such session.
+            ClientError: no response, or no such session.
         """
         self.metadata = self._http.send("POST", f"{self._path}/stop", is_idempotent=True)
         return self
@@ -395,7 +395,7 @@ class Session:
 
         Raises:
             ConflictError: not sealed at the timeout; the text has the reason. Retry.
-            FootTileError: no response.
+            ClientError: no response.
         """
         end_s = time.monotonic() + timeout_s
         while self.refresh().state != "sealed":
@@ -414,7 +414,7 @@ class Session:
             ConflictError: the session is not sealed, for Parquet.
             DamagedError: the hash differs from the server's.
             OSError: the file cannot be written.
-            FootTileError: no response, or a problem response.
+            ClientError: no response, or a problem response.
         """
 
         def get_expected_sha256() -> str | None:

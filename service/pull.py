@@ -71,7 +71,7 @@ def refuse_data_folder(folder: Path) -> None:
         raise UsageError(what, where=str(folder), remedy=remedy)
 
 
-def pull_session(server: foottile.Server, session_id: str, out_folder: Path) -> dict[str, Any]:
+def pull_session(server: foottile.Client, session_id: str, out_folder: Path) -> dict[str, Any]:
     """Download a sealed session into the folder `out`/`session_id`.
 
     A partial download is resumed.
@@ -84,7 +84,7 @@ def pull_session(server: foottile.Server, session_id: str, out_folder: Path) -> 
         foottile.UnknownError: the server does not have the session.
         foottile.ConflictError: the session is not sealed.
         foottile.DamagedError: the download differs from the server's file.
-        foottile.FootTileError: another refusal by the server.
+        foottile.ClientError: another refusal by the server.
         UsageError: the id is not valid, or the folder belongs to a server or node.
         StorageError: a file cannot be written.
     """
@@ -115,7 +115,7 @@ def pull_session(server: foottile.Server, session_id: str, out_folder: Path) -> 
 
 
 def pull_export(
-    server: foottile.Server,
+    server: foottile.Client,
     session_id: str,
     out_folder: Path,
     selection: Slice,
@@ -133,7 +133,7 @@ def pull_export(
 
     Raises:
         foottile.DamagedError: the download cannot be read.
-        foottile.FootTileError: the server does not answer, or refuses.
+        foottile.ClientError: the server does not answer, or refuses.
         UsageError: the id is not valid, or the folder belongs to a server or node.
         StorageError: the file cannot be written.
     """
@@ -146,7 +146,7 @@ def pull_export(
 
 
 def pull_take_export(
-    server: foottile.Server,
+    server: foottile.Client,
     take_id: str,
     out_folder: Path,
     selection: Slice,
@@ -159,7 +159,7 @@ def pull_take_export(
         The take's metadata, with `complete`, `path` and `bytes`.
 
     Raises:
-        foottile.FootTileError: the server does not answer, or refuses.
+        foottile.ClientError: the server does not answer, or refuses.
         UsageError: the folder belongs to a server or node.
         StorageError: the file cannot be written.
     """
@@ -173,7 +173,7 @@ def pull_take_export(
 
 
 def _download_export(
-    server: foottile.Server,
+    server: foottile.Client,
     url: str,
     stem: str,
     out_folder: Path,
@@ -223,7 +223,7 @@ def _download_export(
     return path
 
 
-def _get_session_metadata(server: foottile.Server, session_id: str) -> Mapping[str, Any]:
+def _get_session_metadata(server: foottile.Client, session_id: str) -> Mapping[str, Any]:
     """Return the session's metadata; refuse an invalid id, which could name another folder."""
     if not re.fullmatch(r"[0-9A-Za-z-]{1,64}", session_id):
         raise UsageError(
@@ -232,7 +232,7 @@ def _get_session_metadata(server: foottile.Server, session_id: str) -> Mapping[s
     return server.session(session_id).metadata
 
 
-def _download_frames(server: foottile.Server, session: Mapping[str, Any], path: Path) -> int:
+def _download_frames(server: foottile.Client, session: Mapping[str, Any], path: Path) -> int:
     """Download the frames, resuming a partial file; return the number of resumed bytes.
 
     An interrupted download leaves its partial file.
@@ -253,7 +253,7 @@ def _download_frames(server: foottile.Server, session: Mapping[str, Any], path: 
             resumed = partial_bytes if answer.status_code == HTTPStatus.PARTIAL_CONTENT else 0
             with translate_storage_errors(partial), partial.open("ab" if resumed else "wb") as file:
                 _write_response(answer, file)
-    except foottile.FootTileError as error:
+    except foottile.ClientError as error:
         # The partial file may be complete already, but not renamed.
         if not partial_bytes or error.status != HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
             raise
@@ -284,7 +284,7 @@ def _append_retry_remedy(remedy: str) -> Iterator[None]:
         raise foottile.ServerUnavailableError(f"{error} {remedy}") from error
 
 
-def _pull_table(server: foottile.Server, url: str, path: Path) -> None:
+def _pull_table(server: foottile.Client, url: str, path: Path) -> None:
     try:
         with server.http.stream(url, {"format": "parquet"}) as answer:
             content = answer.read()

@@ -26,8 +26,7 @@ from websockets.exceptions import WebSocketException
 
 from devices.errors import UsageError
 from devices.frames import ArrayInfo
-from foottile.errors import FootTileError as ClientError
-from foottile.errors import NotFoundError
+from foottile.errors import ClientError, NotFoundError
 from service.protocol.codec import run_until_first_ends
 from service.protocol.live import LIVE_PATH
 from storage.clock.bounds import BoundedOffset, ClockOffsets, OffsetRows
@@ -41,7 +40,7 @@ from storage.schema import (
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from foottile import Server
+    from foottile import Client
 
 _RETRY_S = 1.0
 _PING_INTERVAL_S, _FIRST_PINGS = 2.0, 8
@@ -209,7 +208,7 @@ class ServerFollower:
 
     def __init__(
         self,
-        server: Server,
+        server: Client,
         outlet: Outlet,
         reporter: Reporter,
         nodes: Collection[str] = (),

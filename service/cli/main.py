@@ -22,7 +22,7 @@ import typer
 from typer.core import TyperGroup
 
 from devices.errors import FootTileError, UsageError, escape_control_chars, is_utf8_encodable
-from foottile.errors import FootTileError as ClientError
+from foottile.errors import ClientError
 from service.version import SOFTWARE_VERSION
 
 _M_ARENA_MAX = -8  # malloc.h of glibc

@@ -172,7 +172,7 @@ class Laboratory:
                 sealed = session.stop().wait_until_sealed(_SEAL_TIMEOUT_S).metadata
                 missed = server.node(trial.name)["missed_slots"]
                 pulled = pull_session(server, session.id, self._folder / "sessions")
-        except foottile.FootTileError as error:
+        except foottile.ClientError as error:
             raise LinkError(f"trial {trial.name}: {error}") from error
         finally:
             code = _stop_process(node)
@@ -218,14 +218,14 @@ class Laboratory:
         raise FootTileError("the server does not start", where=str(self._log_path("server")))
 
     def _start_recording(
-        self, server: foottile.Server, name: str, process: subprocess.Popen[bytes]
-    ) -> foottile.Session:
+        self, server: foottile.Client, name: str, process: subprocess.Popen[bytes]
+    ) -> foottile.RemoteSession:
         """Start recording as soon as the node is connected."""
         deadline_s, reason = time.monotonic() + _NODE_START_TIMEOUT_S, ""
         while time.monotonic() < deadline_s and process.poll() is None:
             try:
                 return server.record(name, name, pre_roll_s=PRE_ROLL_S)
-            except foottile.FootTileError as error:  # not connected yet
+            except foottile.ClientError as error:  # not connected yet
                 reason = str(error)
                 time.sleep(_POLL_S)
         raise FootTileError(f"node {name} does not come: {reason}", where=str(self._log_path(name)))

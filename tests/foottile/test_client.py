@@ -24,12 +24,14 @@ HEAVY = ("httpx", "pyarrow", "numpy", "websockets", "service", "storage", "devic
 
 
 @pytest.fixture
-def server(running: Running) -> Iterator[foottile.Server]:
+def server(running: Running) -> Iterator[foottile.Client]:
     with foottile.connect(running.url) as server:
         yield server
 
 
-def recorded(server: foottile.Server, tared: FakeNode, name: str = "trial") -> foottile.Session:
+def recorded(
+    server: foottile.Client, tared: FakeNode, name: str = "trial"
+) -> foottile.RemoteSession:
     with server.record("bench", name, tags=["mud"]) as session:
         tared.deliver(300, [20.0, 60.0], alive=True)
         session.add_marker("a stone")
@@ -52,7 +54,7 @@ def test_all_that_it_names_is_there() -> None:
 
 
 def test_a_session_is_recorded_marked_found_and_read(
-    server: foottile.Server, tared: FakeNode, tmp_path: Path
+    server: foottile.Client, tared: FakeNode, tmp_path: Path
 ) -> None:
     session = recorded(server, tared)
     assert (session.state, session.complete, session.node) == ("sealed", True, "bench")
@@ -84,7 +86,7 @@ def test_a_session_is_recorded_marked_found_and_read(
 
 
 def test_frames_are_read_however_small_the_pieces_are_that_they_come_in(
-    server: foottile.Server, tared: FakeNode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    server: foottile.Client, tared: FakeNode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     session = recorded(server, tared)
     whole = pq.read_table(session.download(tmp_path / "trial.parquet"))
@@ -95,7 +97,7 @@ def test_frames_are_read_however_small_the_pieces_are_that_they_come_in(
 
 
 def test_an_answer_that_breaks_off_is_said_to_be_damaged(
-    server: foottile.Server, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
+    server: foottile.Client, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     session = recorded(server, tared)
     given = httpx.Response.iter_bytes
@@ -109,13 +111,13 @@ def test_an_answer_that_breaks_off_is_said_to_be_damaged(
 
 
 def test_what_has_no_method_is_asked_for_by_its_path(
-    server: foottile.Server, tared: FakeNode
+    server: foottile.Client, tared: FakeNode
 ) -> None:
     assert server.http.get("/calibrations", {"limit": None})["items"] == []
 
 
 def test_what_somebody_else_has_changed_is_not_overwritten(
-    server: foottile.Server, running: Running, tared: FakeNode
+    server: foottile.Client, running: Running, tared: FakeNode
 ) -> None:
     with server.record("bench", "one") as mine:
         theirs = server.session(mine.id)
@@ -126,7 +128,7 @@ def test_what_somebody_else_has_changed_is_not_overwritten(
         assert mine.refresh().update(name="two").metadata["notes"] == "wet"
 
 
-def test_an_error_carries_what_the_server_said(server: foottile.Server, tared: FakeNode) -> None:
+def test_an_error_carries_what_the_server_said(server: foottile.Client, tared: FakeNode) -> None:
     with pytest.raises(foottile.NotFoundError, match="no node 'nobody'") as raised:
         server.node("nobody")
     assert raised.value.status == 404
@@ -135,9 +137,9 @@ def test_an_error_carries_what_the_server_said(server: foottile.Server, tared: F
         server.session("../nodes")
     session = server.record("bench", "x")
     tared.deliver(20)
-    with pytest.raises(foottile.UsageError, match="no column 'colour'"):
+    with pytest.raises(foottile.InvalidRequestError, match="no column 'colour'"):
         session.open(["colour"]).to_arrow()
-    with pytest.raises(foottile.UsageError, match="no step"):
+    with pytest.raises(foottile.InvalidRequestError, match="no step"):
         _ = session.open()[0:1:2]
     with pytest.raises(foottile.ConflictError, match="still recording"):
         session.wait_until_sealed(timeout_s=0.0)
@@ -170,14 +172,14 @@ def test_a_token_is_shown_and_its_lack_is_told(
     "url", ["", "laptop", "ftp://laptop", "http://", "http://[::1", "http://a b"]
 )
 def test_what_is_no_address_is_said(url: str) -> None:
-    with pytest.raises((foottile.UsageError, foottile.ServerUnavailableError)):
+    with pytest.raises((foottile.InvalidRequestError, foottile.ServerUnavailableError)):
         foottile.connect(url).nodes()
 
 
 def test_what_was_closed_is_not_asked_any_more(running: Running) -> None:
     with foottile.connect(running.url) as server:
         pass
-    with pytest.raises(foottile.UsageError, match="closed"):
+    with pytest.raises(foottile.InvalidRequestError, match="closed"):
         server.nodes()
 
 

@@ -50,7 +50,7 @@ def test_a_control_character_within_a_value_is_refused(
     value: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(NAME, value)
-    with pytest.raises(foottile.UsageError, match=f"{NAME}.*control character"):
+    with pytest.raises(foottile.InvalidRequestError, match=f"{NAME}.*control character"):
         read_variable(NAME)
 
 
@@ -70,10 +70,10 @@ def test_a_token_that_no_header_can_carry_is_refused(
     token: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("FOOTTILE_TOKEN", token)
-    with pytest.raises(foottile.UsageError, match="FOOTTILE_TOKEN"):
+    with pytest.raises(foottile.InvalidRequestError, match="FOOTTILE_TOKEN"):
         read_token()
     monkeypatch.delenv("FOOTTILE_TOKEN")
-    with pytest.raises(foottile.UsageError, match="token"):
+    with pytest.raises(foottile.InvalidRequestError, match="token"):
         foottile.connect("http://127.0.0.1:1", token)
 
 

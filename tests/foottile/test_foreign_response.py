@@ -159,7 +159,7 @@ def test_a_proxy_of_the_environment_is_not_asked(
         monkeypatch.setenv(name, proxy)
         with foottile.connect(running.url) as server:
             assert server.nodes() == []
-            with pytest.raises(foottile.UsageError, match="nobody"):
+            with pytest.raises(foottile.InvalidRequestError, match="nobody"):
                 next(server.live("nobody"))
     assert asked == []
 

@@ -125,7 +125,7 @@ def test_what_is_not_there_is_said_and_not_tried_again(
     with (
         foottile.connect(running.url) as server,
         server.live(**asked) as live,  # type: ignore[arg-type]  # wrong on purpose
-        pytest.raises(foottile.UsageError, match=said),
+        pytest.raises(foottile.InvalidRequestError, match=said),
     ):
         next(live)
 

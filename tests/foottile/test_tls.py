@@ -49,7 +49,7 @@ def test_a_ca_that_is_named_is_trusted_for_questions_and_streams(
         ca = folder
     with foottile.connect(secure, ca=ca) as server:
         assert server.nodes() == []
-        with pytest.raises(foottile.UsageError, match="nobody"):
+        with pytest.raises(foottile.InvalidRequestError, match="nobody"):
             next(server.live("nobody"))
 
 
@@ -57,7 +57,7 @@ def test_a_ca_that_is_named_is_trusted_for_questions_and_streams(
 async def test_asyncio_trusts_it_too(secure: str, tmp_path: Path) -> None:
     async with foottile.connect_async(secure, ca=tmp_path / "ca.pem") as server:
         assert await server.nodes() == []
-        with pytest.raises(foottile.UsageError, match="nobody"):
+        with pytest.raises(foottile.InvalidRequestError, match="nobody"):
             await anext(server.live("nobody"))
     async with foottile.connect_async(secure) as server:
         with pytest.raises(foottile.ServerUnavailableError, match="not trusted"):
@@ -91,7 +91,7 @@ def test_what_is_no_ca_is_said(content: bytes | None, tmp_path: Path) -> None:
     path = tmp_path / "ca.pem"
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(foottile.UsageError, match=r"ca\.pem"):
+    with pytest.raises(foottile.InvalidRequestError, match=r"ca\.pem"):
         foottile.connect("https://127.0.0.1:1", ca=path)
 
 
@@ -106,5 +106,5 @@ def test_plain_http_and_tls_are_not_taken_for_each_other(running: Running, secur
         pytest.raises(foottile.ServerUnavailableError),
     ):
         server.nodes()
-    with pytest.raises(foottile.UsageError, match="https"):
+    with pytest.raises(foottile.InvalidRequestError, match="https"):
         foottile.connect(running.url, ca=HERE)

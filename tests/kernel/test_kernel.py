@@ -87,7 +87,7 @@ def recorded(guest: Guest, server_url: str, name: str, *options: str) -> Iterato
     node.wait_for("tiles at", START_S)
     with foottile.connect(server_url, token=SHARED_TOKEN) as server:
 
-        def record() -> foottile.Session | None:
+        def record() -> foottile.RemoteSession | None:
             try:
                 return server.record(name, name)
             except (ConflictError, foottile.NotFoundError):  # no frame has come yet

@@ -33,7 +33,7 @@ from service.cli.reference_options import LagRangeOption, TableOptions, make_ref
 from storage.sessions.folder import FRAMES_NAME
 
 if TYPE_CHECKING:
-    from foottile.server import Server
+    from foottile.client import Client
     from service.estimation.calibration import Calibration
     from service.offline.mount_calibration import MountCalibrationOptions
 
@@ -110,7 +110,7 @@ def calibrate_live(
         remark(f"written: {out}; its recording is session {weighing['session_id']}")
 
 
-def _select_node(source: Server, name: str | None) -> dict[str, Any]:
+def _select_node(source: Client, name: str | None) -> dict[str, Any]:
     if name is not None:
         return source.node(name)
     nodes = [node for node in source.nodes() if node["connected"]]
@@ -136,7 +136,7 @@ def _check_assignable(node: dict[str, Any], request: WeighingRequest) -> None:
         )
 
 
-def _weigh(source: Server, path: str, body: dict[str, Any]) -> dict[str, Any]:
+def _weigh(source: Client, path: str, body: dict[str, Any]) -> dict[str, Any]:
     """Run a guided weighing on the server, print its prompts and return it when done.
 
     Raises:
@@ -148,7 +148,7 @@ def _weigh(source: Server, path: str, body: dict[str, Any]) -> dict[str, Any]:
     try:
         weighing = _show_until_done(source, path, weighing)
     finally:  # cancels a running weighing, or closes it on the page
-        with suppress(foottile.FootTileError):
+        with suppress(foottile.ClientError):
             source.http.send("DELETE", path, headers={"If-Match": weighing["session_id"]})
     if weighing["state"] == "failed":
         raise CalibrationError(
@@ -157,7 +157,7 @@ def _weigh(source: Server, path: str, body: dict[str, Any]) -> dict[str, Any]:
     return weighing
 
 
-def _show_until_done(source: Server, path: str, weighing: dict[str, Any]) -> dict[str, Any]:
+def _show_until_done(source: Client, path: str, weighing: dict[str, Any]) -> dict[str, Any]:
     """Show the progress of a weighing until its end.
 
     Raises:
@@ -220,7 +220,7 @@ def _ask_to_accept() -> str:
     return answer[:1] if answer[:1] in ("y", "r") else "n"
 
 
-def _assign(source: Server, node: dict[str, Any], calibration: Calibration) -> None:
+def _assign(source: Client, node: dict[str, Any], calibration: Calibration) -> None:
     path = f"/nodes/{quote(node['node'], safe='')}/calibration"
     source.http.send("PUT", path, {"id": calibration.id})
     remark(f"node {node['node']} now uses it")

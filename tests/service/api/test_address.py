@@ -231,7 +231,7 @@ try:
             print(server.nodes(), len(server.create_invite()["urls"]))
             try:
                 next(server.live("nobody"))
-            except foottile.UsageError as error:
+            except foottile.InvalidRequestError as error:
                 print("no node" if "nobody" in str(error) else error)
         asyncio.run(connect_tcp(make_ingest_url(url))).close()
     ticket = subprocess.run(

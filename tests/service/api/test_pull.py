@@ -14,7 +14,7 @@ import pytest
 
 import foottile
 from devices.errors import UsageError
-from foottile import Server
+from foottile import Client
 from service.pull import pull_export, pull_session
 from storage.formats.slice import Slice
 from storage.formats.writers.registry import get_format
@@ -27,14 +27,14 @@ UNKNOWN_ID = "20200101T000000Z-000000"
 
 
 @pytest.fixture
-def server(sealed: Sealed) -> Iterator[Server]:
+def server(sealed: Sealed) -> Iterator[Client]:
     """A client of the server."""
     with foottile.connect(sealed.running.url) as server:
         yield server
 
 
 def test_a_pulled_session_has_the_file_and_verified_sidecars(
-    server: Server, sealed: Sealed, tmp_path: Path
+    server: Client, sealed: Sealed, tmp_path: Path
 ) -> None:
     assert {each.id for each in server.sessions()} == {sealed.id, sealed.recording.id}
     pulled = pull_session(server, sealed.id, tmp_path)
@@ -63,7 +63,7 @@ def test_a_pulled_session_has_the_file_and_verified_sidecars(
 
 
 def test_no_session_is_pulled_into_a_data_folder(
-    server: Server, sealed: Sealed, tmp_path: Path
+    server: Client, sealed: Sealed, tmp_path: Path
 ) -> None:
     folder = sealed.session.folder
     before = (folder / "session.json").read_bytes()
@@ -81,7 +81,7 @@ def test_no_session_is_pulled_into_a_data_folder(
 
 @pytest.mark.parametrize("have", [1, 1000, None])
 def test_a_partial_file_is_resumed(
-    server: Server, sealed: Sealed, tmp_path: Path, have: int | None
+    server: Client, sealed: Sealed, tmp_path: Path, have: int | None
 ) -> None:
     folder = tmp_path / sealed.id
     folder.mkdir()
@@ -102,7 +102,7 @@ def test_a_partial_file_is_resumed(
     ids=["a part", "a part longer than the file", "a whole file"],
 )
 def test_a_wrong_file_is_replaced(
-    server: Server, sealed: Sealed, tmp_path: Path, name: str, content: bytes
+    server: Client, sealed: Sealed, tmp_path: Path, name: str, content: bytes
 ) -> None:
     folder = tmp_path / sealed.id
     folder.mkdir()
@@ -114,7 +114,7 @@ def test_a_wrong_file_is_replaced(
 
 
 def test_an_unknown_or_unsealed_session_is_refused(
-    server: Server, sealed: Sealed, tmp_path: Path
+    server: Client, sealed: Sealed, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
     with pytest.raises(foottile.ConflictError, match=r"is recording.*Stop it"):
@@ -135,7 +135,7 @@ def test_a_missing_server_is_named(running: Running, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("to", ["parquet", "arrow", "csv", "mcap", "mat", "xdf"])
 def test_a_slice_is_the_download_under_a_name_of_its_own(
-    server: Server, sealed: Sealed, tmp_path: Path, to: str
+    server: Client, sealed: Sealed, tmp_path: Path, to: str
 ) -> None:
     names = ("t_ns", "grf_n")
     pulled = pull_export(server, sealed.id, tmp_path, Slice(0.25, 0.5, names), get_format(to))
@@ -148,11 +148,17 @@ def test_a_slice_is_the_download_under_a_name_of_its_own(
 
 
 def test_a_refused_or_damaged_slice_leaves_no_file(
-    server: Server, sealed: Sealed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    server: Client, sealed: Sealed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waiting = r"MATLAB is available when it is sealed.*xdf"
     for id_, part, to, error, reason in (
-        (sealed.id, Slice(columns=("weight_n",)), "arrow", foottile.UsageError, "no column"),
+        (
+            sealed.id,
+            Slice(columns=("weight_n",)),
+            "arrow",
+            foottile.InvalidRequestError,
+            "no column",
+        ),
         (sealed.recording.id, Slice(0, 1), "parquet", foottile.ConflictError, "is recording"),
         (sealed.recording.id, Slice(), "mat", foottile.ConflictError, waiting),
     ):

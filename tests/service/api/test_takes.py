@@ -266,13 +266,13 @@ def test_clients_download_a_take_whole_or_not_at_all(take: Take, tmp_path: Path)
         path = Path(pulled["path"])
         assert path.name == f"take-{take.id}_0s-0.1s.mcap"
         assert len(said_in("mcap", path.read_bytes())) == 2
-        with pytest.raises(foottile.UsageError, match="csv holds one session only"):
+        with pytest.raises(foottile.InvalidRequestError, match="csv holds one session only"):
             pull_take_export(server, take.id, out, Slice(), get_format("csv"))
         assert [*out.iterdir()] == [path]
         assert server.session(take.sessions[0].id).take == take.id
         mat = server.download_take(take.id, tmp_path / "take.mat", format="mat")
         assert [each["node"] for each in said_in("mat", mat.read_bytes())] == ["left", "right"]
-        with pytest.raises(foottile.UsageError, match="holds one session only"):
+        with pytest.raises(foottile.InvalidRequestError, match="holds one session only"):
             server.download_take(take.id, tmp_path / "take.csv", format="csv")
 
     async def download() -> bytes:

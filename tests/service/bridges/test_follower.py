@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import pytest
 from websockets.asyncio.server import ServerConnection, serve
 
-from foottile.errors import FootTileError, NotFoundError
+from foottile.errors import ClientError, NotFoundError
 from service.bridges.follower import Event, LiveClock, Outlet, Reporter, ServerFollower
 from tests.waiting import PATIENCE_S, in_a_loop
 
@@ -34,7 +34,7 @@ class Source:
         self.http = self
         self.url = ""
         self.markers: list[dict[str, Any]] = []
-        self.error: FootTileError | None = None
+        self.error: ClientError | None = None
         self.asked = 0
         self.hellos = 0
 
@@ -96,7 +96,7 @@ async def test_a_session_deleted_meanwhile_is_forgotten() -> None:
 @in_a_loop
 async def test_an_error_of_the_first_connection_is_followed_by_the_next() -> None:
     source, outlet = Source(), Events()
-    source.error = FootTileError("the server ends")
+    source.error = ClientError("the server ends")
     async with serve(source.answer, "127.0.0.1", 0) as listening:
         port = next(iter(listening.sockets)).getsockname()[1]
         source.url = f"http://127.0.0.1:{port}"

@@ -84,7 +84,7 @@ def test_ctrl_c_prints_one_line_and_leaves_no_file_and_no_process(
         ("service.sessions.recovery.recover_locked_folder", "recover data"),
         ("service.offline.estimate.session.estimate_session", "estimate s.parquet --out x.parquet"),
         ("service.offline.doctor.diagnose_bus", "doctor --bus emulated"),
-        ("foottile.server.Server.sessions", "sessions"),
+        ("foottile.client.Client.sessions", "sessions"),
         ("service.pull.pull_session", "pull 20200101T000000Z-000000 --out x"),
     ],
 )

@@ -13,15 +13,15 @@ from urllib.parse import quote
 from foottile.connection import Closeable
 from foottile.http import HttpClient
 from foottile.live import FrameLoss, LiveRequest, LiveStream, Policy
-from foottile.sessions import Session, download
+from foottile.sessions import RemoteSession, download
 
 _PAGE = 500
 
 
-class Server(Closeable):
+class Client(Closeable):
     """Thread-safe client of one server, created by `foottile.connect`.
 
-    Every method raises a `FootTileError` without a response, or for a problem response.
+    Every method raises a `ClientError` without a response, or for a problem response.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class Server(Closeable):
         since: datetime | str | None = None,
         until: datetime | str | None = None,
         complete: bool | str | None = None,
-    ) -> Iterator[Session]:
+    ) -> Iterator[RemoteSession]:
         """Yield sessions, newest first; pages are fetched on demand.
 
         Args:
@@ -93,14 +93,14 @@ class Server(Closeable):
         while True:
             page = self.http.get("/sessions", query, field="next_cursor")
             for metadata in page["items"]:
-                yield Session(self.http, metadata)
+                yield RemoteSession(self.http, metadata)
             if page["next_cursor"] is None:
                 return
             query["cursor"] = page["next_cursor"]
 
-    def session(self, session_id: str) -> Session:
+    def session(self, session_id: str) -> RemoteSession:
         """Return one session."""
-        return Session(
+        return RemoteSession(
             self.http, self.http.get(f"/sessions/{quote(session_id, safe='')}", field="id")
         )
 
@@ -116,7 +116,7 @@ class Server(Closeable):
         """Download all sessions of a take as one file, on the server's time axis.
 
         Args:
-            take: id of the take, `Session.take`.
+            take: id of the take, `RemoteSession.take`.
             path: file to write, atomically.
             format: format for several sessions: `c3d`, `opensim`, `mcap`, `mat`, `xdf`.
             start_s: first instant, seconds after each session's first frame; None: the beginning.
@@ -124,7 +124,7 @@ class Server(Closeable):
 
         Raises:
             ConflictError: a session is not sealed.
-            UsageError: the format holds one session only, or cannot hold one of these.
+            InvalidRequestError: the format holds one session only, or cannot hold one of these.
             OSError: the file cannot be written.
         """
         query = {"format": format, "start_s": start_s, "end_s": end_s}
@@ -139,7 +139,7 @@ class Server(Closeable):
         subject: str | None = None,
         notes: str = "",
         tags: Sequence[str] = (),
-    ) -> Session:
+    ) -> RemoteSession:
         """Start recording a node, `pre_roll_s` in the past; a repeated request starts it once.
 
         As a context manager the session stops at the end of the block.
@@ -147,7 +147,7 @@ class Server(Closeable):
         body: dict[str, object] = {"node": node, "name": name, "pre_roll_s": float(pre_roll_s)}
         body |= {"subject": subject, "notes": notes, "tags": list(tags)}
         key = {"Idempotency-Key": uuid.uuid4().hex}
-        return Session(
+        return RemoteSession(
             self.http, self.http.send("POST", "/sessions", body, headers=key, is_idempotent=True)
         )
 
