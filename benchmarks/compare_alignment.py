@@ -28,7 +28,7 @@ from devices.arrays import Floats
 from devices.errors import ComparisonError
 from devices.scene.scene_file import load_scene
 from service.offline.calibration_lookup import find_calibration
-from service.offline.compare.alignment import Alignment, align_signals
+from service.offline.compare.alignment import ReferenceAlignment, align_signals
 from service.offline.compare.signals import ForceSignal
 from storage.formats.load_trace import read_load_to_emulate
 from studies.benchmark.draws import compute_estimates, record_with_calibration
@@ -66,7 +66,7 @@ class Injected:
     scale: float
     at_s: float
 
-    def of(self, found: Alignment) -> tuple[float, ...]:
+    def of(self, found: ReferenceAlignment) -> tuple[float, ...]:
         """Of each parameter, what should have been found."""
         lag_s = self.lag_s + 1e-6 * self.drift_ppm * (found.mid_t_s - self.at_s)
         return lag_s, self.drift_ppm, self.offset_n, self.scale

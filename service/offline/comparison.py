@@ -17,8 +17,8 @@ from devices.errors import ComparisonError, FileFormatError, UsageError
 from devices.flags import EstimateFlag
 from service.json_output import to_json_text
 from service.offline.compare.alignment import (
-    Alignment,
     ClockLag,
+    ReferenceAlignment,
     align_signals,
     describe_clock_contradiction,
 )
@@ -101,7 +101,7 @@ class Comparison:
 
     session: Mapping[str, object]
     reference: str
-    alignment: Alignment
+    alignment: ReferenceAlignment
     clock_lag: ClockLag | None
     pairs: PairedFrames
     tile_force_n: Floats
@@ -315,7 +315,7 @@ def _make_reference_signals(
 
 
 def _describe_limitations(
-    alignment: Alignment, pairs: PairedFrames, options: CompareOptions
+    alignment: ReferenceAlignment, pairs: PairedFrames, options: CompareOptions
 ) -> Sequence[str]:
     notes = []
     if alignment.ambiguity is not None:
@@ -343,7 +343,7 @@ def _describe_limitations(
     return notes
 
 
-def _give_advice(alignment: Alignment, options: CompareOptions) -> list[str]:
+def _give_advice(alignment: ReferenceAlignment, options: CompareOptions) -> list[str]:
     if options.reference_sigma_n is not None:
         return advise_on_scale(alignment)
     hint = "coverage is not computed: --reference-sigma-n is not given"

@@ -76,7 +76,7 @@ class RivalLag:
 
 
 @dataclass(frozen=True)
-class Alignment:
+class ReferenceAlignment:
     """Clock and scale of a reference relative to ours: our time `t` is its `reference_s(t)`.
 
     Attributes:
@@ -116,7 +116,7 @@ class Alignment:
 
 def align_signals(
     ours: ForceSignal, reference: ForceSignal, *, lag_range_s: tuple[float, float] | None = None
-) -> Alignment:
+) -> ReferenceAlignment:
     """Align a reference with our force.
 
     Args:
@@ -162,7 +162,7 @@ def align_signals(
         raise _make_sign_error()
     # The fit's drift is the lag's change over half of what overlaps.
     covariance = spread.covariance[:2, :2] / np.outer(*2 * (np.array([1.0, best.half_duration_s]),))
-    return Alignment(
+    return ReferenceAlignment(
         lag_s=spread.get_parameter(best.parameters, _LAG),
         drift_ppm=spread.get_parameter(best.parameters, _DRIFT).scale_by(
             1e6 / best.half_duration_s
@@ -370,7 +370,7 @@ class ClockLag:
     """Lag by the clock tables alone.
 
     Attributes:
-        lag_s: as in `Alignment`, at the same time.
+        lag_s: as in `ReferenceAlignment`, at the same time.
         error_bound_s: bound of its error; not a standard uncertainty.
     """
 
@@ -385,7 +385,9 @@ class ClockLag:
         }
 
 
-def describe_clock_contradiction(alignment: Alignment, clock_lag: ClockLag | None) -> list[str]:
+def describe_clock_contradiction(
+    alignment: ReferenceAlignment, clock_lag: ClockLag | None
+) -> list[str]:
     """Return a note if the lag by forces contradicts the lag by clocks; else an empty list."""
     if clock_lag is None:
         return []

@@ -14,7 +14,7 @@ from scipy.stats import bootstrap
 from devices.arrays import Bools, Columns, Floats, Times
 from service.estimation.stances import STANCE_INPUT_COLUMNS
 from service.offline.accuracy import MIN_GRF_N
-from service.offline.compare.alignment import Alignment
+from service.offline.compare.alignment import ReferenceAlignment
 from service.offline.compare.block_covariance import UncertainValue, compute_correlated_mean
 from service.offline.compare.signals import ForceSignal
 
@@ -104,7 +104,7 @@ def seconds_since_first(t_ns: Times) -> Floats:
 def pair_frames(
     columns: Columns,
     reference: ReferenceSignals,
-    alignment: Alignment,
+    alignment: ReferenceAlignment,
     *,
     remove_offset: bool = False,
     contact_n: float | None = None,

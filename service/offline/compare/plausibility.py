@@ -6,7 +6,7 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.errors import ComparisonError
-from service.offline.compare.alignment import Alignment
+from service.offline.compare.alignment import ReferenceAlignment
 from service.offline.compare.paired_frames import PairedFrames
 from service.offline.compare.signals import ForceSignal
 
@@ -50,7 +50,7 @@ def check_time_unit(ours: ForceSignal, reference: ForceSignal) -> None:
             )
 
 
-def check_force_unit(alignment: Alignment) -> None:
+def check_force_unit(alignment: ReferenceAlignment) -> None:
     """Reject a reference whose force is about 1000 times ours, or 1/1000.
 
     Raises:
@@ -66,7 +66,7 @@ def check_force_unit(alignment: Alignment) -> None:
             )
 
 
-def describe_implausible_alignment(alignment: Alignment) -> list[str]:
+def describe_implausible_alignment(alignment: ReferenceAlignment) -> list[str]:
     """Return notes on an implausible scale or drift."""
     notes, scale = [], alignment.scale.value
     if not 1.0 / IMPLAUSIBLE_SCALE < scale < IMPLAUSIBLE_SCALE:
@@ -82,7 +82,7 @@ def describe_implausible_alignment(alignment: Alignment) -> list[str]:
     return notes
 
 
-def advise_on_scale(alignment: Alignment) -> list[str]:
+def advise_on_scale(alignment: ReferenceAlignment) -> list[str]:
     """Return advice for a plausible scale that differs from one."""
     low, high = alignment.scale.interval_95
     if (

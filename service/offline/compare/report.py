@@ -12,7 +12,7 @@ from devices.arrays import Bools, Floats
 from devices.errors import escape_control_chars
 from service.estimation.records import SIGMAS_95
 from service.offline.accuracy import PHASES
-from service.offline.compare.alignment import Alignment, ClockLag
+from service.offline.compare.alignment import ClockLag, ReferenceAlignment
 from service.offline.compare.block_covariance import UncertainValue
 from service.offline.compare.error_figures import ComparisonErrors
 from service.offline.compare.paired_frames import PairedFrames, TrialMean
@@ -59,7 +59,7 @@ FIGURES_WITH_LOWER_LIMIT = frozenset(
 
 def format_comparison_report(
     title: str,
-    alignment: Alignment,
+    alignment: ReferenceAlignment,
     clock_lag: ClockLag | None,
     pairs: PairedFrames,
     errors: ComparisonErrors,
@@ -81,7 +81,7 @@ def format_comparison_report(
 
 
 def _format_alignment(
-    alignment: Alignment, by_clocks: ClockLag | None, pairs: PairedFrames
+    alignment: ReferenceAlignment, by_clocks: ClockLag | None, pairs: PairedFrames
 ) -> Iterator[str]:
     removed = ", removed" if pairs.is_zero_removed else ", not removed"
     rows: list[tuple[str, UncertainValue | None, str]] = [

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from devices.arrays import Floats
-from service.offline.compare.alignment import Alignment
+from service.offline.compare.alignment import ReferenceAlignment
 from service.offline.compare.block_covariance import UncertainValue
 from service.offline.compare.paired_frames import ReferenceSignals
 from service.offline.compare.signals import ForceSignal
@@ -41,10 +41,10 @@ def half_sines(peaks_n: list[float], hz: float = HZ) -> Floats:
     return np.concatenate([flight, *(np.r_[peak * stance, flight] for peak in peaks_n)])
 
 
-def same_clock(lag_s: float = 0.0, lag_sigma_s: float = 0.0) -> Alignment:
+def same_clock(lag_s: float = 0.0, lag_sigma_s: float = 0.0) -> ReferenceAlignment:
     """An alignment that is known beforehand."""
     sure = UncertainValue(0.0, 0.0, 10.0)
-    return Alignment(
+    return ReferenceAlignment(
         lag_s=UncertainValue(lag_s, lag_sigma_s, 10.0),
         drift_ppm=sure,
         offset_n=sure,

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import ComparisonError
-from service.offline.compare.alignment import Alignment, align_signals
+from service.offline.compare.alignment import ReferenceAlignment, align_signals
 from service.offline.compare.signals import ForceSignal
 from tests.service.offline.compare.gaits import Gait, seen
 
@@ -22,7 +22,7 @@ def walk(seed: int, seconds: float = 20.0, **truth: float) -> tuple[ForceSignal,
     return seen(rng, Gait(rng, seconds), **truth)
 
 
-def true_lag_s(found: Alignment, seconds: float) -> float:
+def true_lag_s(found: ReferenceAlignment, seconds: float) -> float:
     return TRUTH["lag_s"] + 1e-6 * TRUTH["drift_ppm"] * (found.mid_t_s - 0.5 * seconds)
 
 

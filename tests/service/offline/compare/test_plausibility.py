@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from devices.errors import ComparisonError
-from service.offline.compare.alignment import Alignment
+from service.offline.compare.alignment import ReferenceAlignment
 from service.offline.compare.block_covariance import UncertainValue
 from service.offline.compare.paired_frames import PairedFrames, pair_frames
 from service.offline.compare.plausibility import (
@@ -27,7 +27,7 @@ FORCE_N = half_sines([10.0, 12.0])
 
 def aligned(
     scale: float = 1.0, sigma: float = 0.0, drift_ppm: tuple[float, float] = (0.0, 0.0)
-) -> Alignment:
+) -> ReferenceAlignment:
     return replace(
         same_clock(),
         scale=UncertainValue(scale, sigma, 8.0),
