@@ -18,7 +18,7 @@ from devices.buses.i2c import I2cBus
 from devices.clock import VirtualClock
 from devices.emulation.chips.mpl115a2 import (
     EmulatedMpl115a2,
-    EmulatedPart,
+    Mpl115a2Part,
     SampleFunction,
 )
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
@@ -100,7 +100,7 @@ class Wires(Adapter):
         self._faults = SceneFaults(())
         self.tiles = [
             EmulatedMpl115a2(
-                EmulatedPart(self.words[i], self.tc_ns[i], counting(100 * i)),
+                Mpl115a2Part(self.words[i], self.tc_ns[i], counting(100 * i)),
                 mode,
                 self._part_faults(f"T{i + 1:02d}"),
             )

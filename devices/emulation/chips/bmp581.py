@@ -106,7 +106,7 @@ SampleFunction = Callable[[int], tuple[float, float]]
 
 
 @dataclass(frozen=True)
-class EmulatedPart:
+class Bmp581Part:
     """Fixed properties of one part.
 
     Attributes:
@@ -137,10 +137,10 @@ class EmulatedBmp581:
 
     def __init__(
         self,
-        part: EmulatedPart,
+        part: Bmp581Part,
         address: int,
         faults: PartFaults | None = None,
-        make_replacement: Callable[[], EmulatedPart] | None = None,
+        make_replacement: Callable[[], Bmp581Part] | None = None,
     ) -> None:
         self.address = address
         self.on_conversion: OnConversion | None = None
@@ -393,7 +393,7 @@ def make_chip(
 ) -> EmulatedBmp581:
     """Make the chip of a scene's tile; `make_site` makes the site of a serial."""
 
-    def make_part(serial: str) -> EmulatedPart:
+    def make_part(serial: str) -> Bmp581Part:
         rng = make_part_rng("bmp581", serial, parts_seed)
         off = float(np.clip(_TOLERANCE * rng.standard_normal(), -_TOLERANCE_MAX, _TOLERANCE_MAX))
         site = make_site(serial)
@@ -407,7 +407,7 @@ def make_chip(
             return frozen_kpa, site.compute_degc(t_s)
 
         part_id = tuple(int(word) for word in rng.integers(1, 0xFFFF, 4))
-        return EmulatedPart(part_id, 1.0 + off, sample, site.noise_label)
+        return Bmp581Part(part_id, 1.0 + off, sample, site.noise_label)
 
     return EmulatedBmp581(
         make_part(tile.serial),

@@ -55,7 +55,7 @@ class ChipProperties:
 
 
 @dataclass(frozen=True)
-class EmulatedPart:
+class Mpl115a2Part:
     """Fixed properties of one part."""
 
     registers: Registers
@@ -84,10 +84,10 @@ class EmulatedMpl115a2:
 
     def __init__(
         self,
-        silicon: EmulatedPart,
+        silicon: Mpl115a2Part,
         read_during_conversion: ReadDuringConversion = "stale",
         faults: PartFaults | None = None,
-        make_replacement: Callable[[], EmulatedPart] | None = None,
+        make_replacement: Callable[[], Mpl115a2Part] | None = None,
     ) -> None:
         self.on_conversion: OnConversion | None = None
         self._silicon = silicon
@@ -319,10 +319,10 @@ def make_chip(
 ) -> EmulatedMpl115a2:
     """Make the chip of a scene's tile; `make_site` makes the site of a serial."""
 
-    def make_part(serial: str) -> EmulatedPart:
+    def make_part(serial: str) -> Mpl115a2Part:
         chip = draw_family_chip(scene.emulation.family, serial, parts_seed)
         fixed_ms = scene.array.conversion_ms
-        return EmulatedPart(
+        return Mpl115a2Part(
             chip.coefficients.to_words(),
             chip.conversion_ns if fixed_ms is None else round(fixed_ms * 1e6),
             FrontEnd(chip, make_site(serial)),

@@ -20,7 +20,7 @@ from devices.array.self_test import (
 from devices.buses.i2c import I2cBus
 from devices.buses.usb_adapters import UsbAdapter
 from devices.clock import VirtualClock
-from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart
+from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, Mpl115a2Part
 from devices.emulation.parts import make_rng
 from devices.errors import BusFaultError, TileSetupError
 from devices.scene.emulation_sections import ReadDuringConversion
@@ -161,7 +161,7 @@ def part_with(
     scl_hz: int = 400_000,
 ) -> Wires:
     wires = Wires(ONE, scl_hz)
-    part = EmulatedMpl115a2(EmulatedPart(DATA_SHEET_CHIP, tc_ns, sense), mode)
+    part = EmulatedMpl115a2(Mpl115a2Part(DATA_SHEET_CHIP, tc_ns, sense), mode)
     wires.tiles[0] = part
     wires.muxes[0]._devices = ((0, part),)
     wires.adapter._devices_by_routing.clear()
@@ -242,7 +242,7 @@ def test_a_tile_is_measured_alone_whatever_is_open() -> None:
     wires = Wires(TWO_MUXES, tc_ns=[1_400_000, 1_500_000, 2_400_000, 2_300_000])
     for tile, label in zip(wires.tiles, "abcd", strict=True):
         conversion_ns = tile._silicon.conversion_ns
-        tile._silicon = EmulatedPart(DATA_SHEET_CHIP, conversion_ns, noisy(label))
+        tile._silicon = Mpl115a2Part(DATA_SHEET_CHIP, conversion_ns, noisy(label))
     for i in (0, 2, 1, 3, 3, 0, 2, 1):
         wires.adapter.i2c_rdwr(i2c_msg.write(0x70, [0xFF]))
         wires.adapter.i2c_rdwr(i2c_msg.write(0x73, [0xFF]))

@@ -18,7 +18,7 @@ from devices.array.startup import (
 )
 from devices.buses.i2c import I2cBus, open_bus
 from devices.clock import VirtualClock
-from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart, draw_chip
+from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, Mpl115a2Part, draw_chip
 from devices.emulation.world import World
 from devices.errors import BusFaultError, SceneError
 from devices.scene.emulation_sections import FaultKind, ReadDuringConversion
@@ -76,7 +76,7 @@ def test_a_part_that_cannot_be_measured_has_a_wait_of_3_ms() -> None:
     chip = world.chips[1]
     assert isinstance(chip, EmulatedMpl115a2)
     words = draw_chip("T02", 0).coefficients.to_words()
-    chip._silicon = EmulatedPart(words, 1_600_000, lambda _: (410, 507))
+    chip._silicon = Mpl115a2Part(words, 1_600_000, lambda _: (410, 507))
     ready = prepare_array(open_bus("emulated", world.i2c_adapter), scene, clock)
     assert ready.unmeasured_serials == ("T02",)
     assert ready.timing.conversions_s[1] == 3.0e-3

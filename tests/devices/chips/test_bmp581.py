@@ -17,7 +17,7 @@ from devices.chips import bmp581
 from devices.chips.bmp581 import BMP581, Bmp581
 from devices.chips.pressure_chip import ChipSettings
 from devices.clock import VirtualClock
-from devices.emulation.chips.bmp581 import EmulatedBmp581, EmulatedPart
+from devices.emulation.chips.bmp581 import Bmp581Part, EmulatedBmp581
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.i2c_bus import EmulatedI2cAdapter
 from devices.errors import NoAcknowledgeError, TileSetupError, UsageError
@@ -39,7 +39,7 @@ class Bench:
         scl_hz: int = 400_000,
     ) -> None:
         self.clock = VirtualClock()
-        self.chip = EmulatedBmp581(EmulatedPart(PART_ID, clock_factor, sample, "bench"), 0x46)
+        self.chip = EmulatedBmp581(Bmp581Part(PART_ID, clock_factor, sample, "bench"), 0x46)
         mux = EmulatedTca9548a(0x70, [(2, self.chip)])
         adapter = EmulatedI2cAdapter([mux], self.clock, scl_hz)
         self.bus: I2cBus = open_bus("emulated", adapter)

@@ -19,7 +19,7 @@ from devices.buses.i2c import I2cBus, open_bus
 from devices.chips.mpl115a2 import Coefficients, Mpl115a2, compute_padc
 from devices.chips.pressure_chips import Compensation
 from devices.clock import VirtualClock
-from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart
+from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, Mpl115a2Part
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.i2c_bus import EmulatedI2cAdapter
 from devices.errors import TileSetupError
@@ -50,7 +50,7 @@ def kpa_of(part: Coefficients, padc: int, tadc: int) -> float:
 def connected(registers: bytes, padc: int, tadc: int) -> tuple[Mpl115a2, VirtualClock]:
     """Return the driver of an emulated part that always measures the same."""
     clock = VirtualClock()
-    chip = EmulatedMpl115a2(EmulatedPart(words_of(registers), 1_600_000, lambda _: (padc, tadc)))
+    chip = EmulatedMpl115a2(Mpl115a2Part(words_of(registers), 1_600_000, lambda _: (padc, tadc)))
     mux = EmulatedTca9548a(0x70, [(2, chip)])
     bus = open_bus("emulated", EmulatedI2cAdapter([mux], clock, 400_000))
     bus.transfer(i2c_msg.write(0x70, [0b100]))

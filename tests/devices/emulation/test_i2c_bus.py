@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from smbus2 import i2c_msg
 
 from devices.clock import VirtualClock
-from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart
+from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, Mpl115a2Part
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.fault_timing import FaultTiming
 from devices.emulation.i2c_bus import EmulatedI2cAdapter
@@ -29,7 +29,7 @@ Words = tuple[int, int, int, int]
 
 
 def part(counts: tuple[int, int] = (410, 507), words: Words = DATA_SHEET_CHIP) -> EmulatedMpl115a2:
-    return EmulatedMpl115a2(EmulatedPart(words, TC_NS, lambda _: counts))
+    return EmulatedMpl115a2(Mpl115a2Part(words, TC_NS, lambda _: counts))
 
 
 def select(mask: int, mux: int = MUX) -> i2c_msg:
@@ -170,7 +170,7 @@ def test_a_transaction_takes_its_scl_periods_to_the_nanosecond(
 
 def test_a_message_object_can_be_used_again() -> None:
     samples = iter([(410, 507), (272, 521)])
-    reader = alone(EmulatedMpl115a2(EmulatedPart(DATA_SHEET_CHIP, TC_NS, lambda _: next(samples))))
+    reader = alone(EmulatedMpl115a2(Mpl115a2Part(DATA_SHEET_CHIP, TC_NS, lambda _: next(samples))))
     pointer, answer = point(), read(2)
     seen = []
     for _ in range(2):

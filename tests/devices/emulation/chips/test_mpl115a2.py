@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from devices.emulation.chips.mpl115a2 import (
     EmulatedMpl115a2,
-    EmulatedPart,
+    Mpl115a2Part,
     SampleFunction,
 )
 from devices.emulation.fault_timing import FaultTiming, PartFaults
@@ -35,11 +35,11 @@ class Samples:
 def part(
     sense: SampleFunction | None = None,
     mode: ReadDuringConversion = "stale",
-    spare: Callable[[], EmulatedPart] | None = None,
+    spare: Callable[[], Mpl115a2Part] | None = None,
     late_ns: int = 0,
     **faults: Any,
 ) -> EmulatedMpl115a2:
-    silicon = EmulatedPart(DATA_SHEET_CHIP, TC_NS, sense or Samples(), late_ns)
+    silicon = Mpl115a2Part(DATA_SHEET_CHIP, TC_NS, sense or Samples(), late_ns)
     return EmulatedMpl115a2(silicon, mode, PartFaults(**faults), spare)
 
 
@@ -211,7 +211,7 @@ def test_a_part_that_was_unplugged_has_empty_registers_and_its_coefficients(
 
 def test_a_replaced_part_is_another_one_after_its_absence() -> None:
     chip = part(
-        spare=lambda: EmulatedPart(FORUM_CHIP, TC_NS, lambda _: (7, 700)),
+        spare=lambda: Mpl115a2Part(FORUM_CHIP, TC_NS, lambda _: (7, 700)),
         replaced=between(TC_NS, 2 * TC_NS),
     )
     convert(chip, 0)
