@@ -35,13 +35,6 @@ class ArrayRecord:
         """Return a deep copy, with writable arrays."""
         return type(self)(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
 
-    def has_equal_values(self, other: Self) -> bool:
-        """Return whether all values are equal; NaN equals NaN."""
-        return all(
-            np.array_equal(getattr(self, f.name), getattr(other, f.name), equal_nan=True)
-            for f in fields(self)
-        )
-
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:
         """Join `parts` along the first axis, in order.

@@ -74,11 +74,6 @@ class SessionReport:
     unproven: list[str] = field(default_factory=list)
     is_in_trash: bool = False
 
-    @property
-    def frame_count(self) -> int:
-        """Number of recorded frames."""
-        return sum(part.recorded for part in self.ledger.parts) if self.ledger else 0
-
     def to_json_dict(self) -> dict[str, Any]:
         """Return ledger and findings for JSON (docs/formats.md)."""
         ledger = self.ledger or Ledger(complete=False, lossy=False, parts=(), missed_slots=0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from http import HTTPStatus
 from math import isfinite
-from typing import Annotated, Literal
+from typing import Annotated
 
 from fastapi import APIRouter, Header
 from pydantic import Field, StringConstraints
@@ -24,7 +24,7 @@ from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.dead_weights import TOLERANCE_PERCENT, check_and_label_weights
 from service.protocol.live import View
 from service.server.node import ServerNode
-from service.server.weighing import Method
+from service.server.weighing import Method, StepName
 from service.server.weighings import NodeWeighing, WeighingPlan, WeighingState
 from service.user_folders import PublicText
 
@@ -203,7 +203,7 @@ class WeighingView(View):
     reference: str
     name: str
     tile: str = Field(description="The tile under way.")
-    step: Literal["empty", "resting", "put on", "holding", "done"]
+    step: StepName
     prompt: str = Field(description="Instruction for now.", examples=["Put 500 g on T02"])
     left_s: float | None = Field(description="Rest of the step; null between steps.")
     warning: str | None = Field(description="Why the last step is repeated.")

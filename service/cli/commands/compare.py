@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -219,12 +219,11 @@ def compare_command(
     Exit codes: 0 success, 1 failure, 2 wrong usage, 3 written, but a limit is missed, or some of
     many sessions failed.
     """
-    from service.offline.compare.report import FIGURE_TITLES
     from service.offline.comparison import write_comparison
     from service.offline.figure_output import create_figure
 
     parsed_limits = {
-        name: _parse_limit(name, text, FIGURE_TITLES)
+        name: _parse_limit(name, text)
         for name, text in parse_named_values(limits, "--limits").items()
     }
     stated: dict[str, str | float | None] = {
@@ -294,11 +293,15 @@ def get_comparison_folder(source: Path, reference: Path) -> Path:
     return source.parent / COMPARISONS_FOLDER / reference.stem
 
 
-def _parse_limit(name: str, text: str, figures: Collection[str]) -> float:
+def _parse_limit(name: str, text: str) -> float:
+    from service.offline.compare.report import FIGURE_TITLES
+
     try:
         limit = float(text)
     except ValueError:
         limit = math.nan
-    if name not in figures or not limit >= 0.0:
-        raise UsageError(f"--limits {name}={text}", expected=f"a limit of {', '.join(figures)}")
+    if name not in FIGURE_TITLES or not limit >= 0.0:
+        raise UsageError(
+            f"--limits {name}={text}", expected=f"a limit of {', '.join(FIGURE_TITLES)}"
+        )
     return limit

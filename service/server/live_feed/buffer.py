@@ -47,17 +47,14 @@ class FeedBuffer:
     Args:
         recompute_turn: semaphore: one reader recomputes at a time, so that live estimation has a
             core.
-        bytes_max: size limit.
     """
 
-    def __init__(
-        self, recompute_turn: asyncio.Semaphore, bytes_max: int = _BUFFER_BYTES_MAX
-    ) -> None:
+    def __init__(self, recompute_turn: asyncio.Semaphore) -> None:
         self.recompute_turn = recompute_turn
         self.encode_cache = EncodeCache()
         """Encoded messages of the batches."""
         self._batches: deque[FeedBatch] = deque()
-        self._bytes_max = bytes_max
+        self._bytes_max = _BUFFER_BYTES_MAX
         self._bytes = 0
         self.next_batch_number = 0
         self._waiting: set[asyncio.Event] = set()
@@ -66,11 +63,6 @@ class FeedBuffer:
     def oldest_batch_number(self) -> int:
         """Number of the oldest batch, or of the next one if the buffer is empty."""
         return self.next_batch_number - len(self._batches)
-
-    @property
-    def reader_count(self) -> int:
-        """Number of present readers."""
-        return len(self._waiting)
 
     def add_batches(self, stream_id: str, batches: list[EstimatedBatch]) -> None:
         """Add due batches, which may be none, and wake all readers."""

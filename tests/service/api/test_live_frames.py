@@ -263,7 +263,7 @@ def test_a_lossless_client_that_does_not_read_is_closed_with_its_position(
     wide.connect()
     wide.tared()
     with running.socket(LIVE, small=True, max_queue=1) as stalled:
-        until(lambda: running.server.live_feeds.get_or_create("bench").reader_count)
+        until(lambda: running.server.live_feeds.get_or_create("bench")._waiting)
         for _ in range(8):
             wide.send(500)
         wide.taken_in()

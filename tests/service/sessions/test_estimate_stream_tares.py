@@ -17,6 +17,7 @@ from devices.frames import FrameBatch
 from service.estimation.tare.tare import Tare
 from service.sessions.estimate_stream import EstimateStream, make_estimate_metadata
 from tests.builders.arrays import COUNT_KPA, UNLOADED_KPA
+from tests.builders.frames import assert_same_bits
 from tests.service.sessions.pieces import Piece, array, cut, frames, hopping, options, run, same
 
 
@@ -185,7 +186,7 @@ def test_a_stream_that_continues_from_a_stored_state_gives_the_bits_of_one(
             stream = EstimateStream(array(), options(lag_ms=lag_ms, tares=tares))
             stream.load_state(kept)
     joined = FrameBatch.concatenate([batch for batch, _ in found])
-    assert joined.has_equal_values(frames_once)
+    assert_same_bits(joined, frames_once)
     same({name: np.concatenate([c[name] for _, c in found]) for name in found[0][1]}, once)
 
 
