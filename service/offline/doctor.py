@@ -19,6 +19,7 @@ from devices.array.schedules import (
 from devices.array.self_test import (
     FoundTile,
     Place,
+    WireTiming,
     find_tiles_on_all_channels,
     make_tile_info,
     measure_conversion_ns,
@@ -124,20 +125,9 @@ def diagnose_bus(
             verdict=_describe_no_tiles(findings),
         )
     wires = measure_wire_timing(bus, clock, tiles[0])
-    measured: dict[Place, TileFinding] = {}
-    conversions_ns: list[int | None] = []
-    for finding, info in zip(sound, tiles, strict=True):
-        try:
-            conversion_ns = measure_conversion_ns(bus, clock, info, wires)
-            never = "its readings never change: it may not be converting"
-            problem = "" if conversion_ns is not None else never
-        except I2cError as error:
-            conversion_ns, problem = None, f"it stopped responding during the measurement: {error}"
-        conversions_ns.append(conversion_ns)
-        conversion_ms = None if conversion_ns is None else conversion_ns / 1e6
-        measured[_place(finding)] = replace(finding, conversion_ms=conversion_ms, problem=problem)
-    findings = tuple(measured.get(_place(f), f) for f in findings)
-    requested = tuple(measured.values())
+    conversions_ns, measured = _measure_conversions(bus, clock, sound, tiles, wires)
+    by_place = {_place(finding): finding for finding in measured}
+    findings = tuple(by_place.get(_place(f), f) for f in findings)
     timing = compute_bus_timing(array, wires, tiles, conversions_ns)
     rates: dict[ScheduleName, float | None] = {
         name: rate
@@ -158,7 +148,7 @@ def diagnose_bus(
     advice = _make_advice(findings, timing, rates, array, requested_hz, choice.schedule, schedule)
     hints = (
         *advice.hints,
-        _describe_slowest_tile(requested, timing, schedule, rates[schedule]),
+        _describe_slowest_tile(measured, timing, schedule, rates[schedule]),
         _advise_oversampling(
             tiles,
             sections,
@@ -180,6 +170,29 @@ def diagnose_bus(
         is_rate_reached=not advice.wrong,
         verdict=" ".join(filter(None, (advice.summary, *advice.wrong, *hints))),
     )
+
+
+def _measure_conversions(
+    bus: I2cBus,
+    clock: Clock,
+    findings: Sequence[TileFinding],
+    tiles: Sequence[TileInfo],
+    wires: WireTiming,
+) -> tuple[list[int | None], tuple[TileFinding, ...]]:
+    """Measure each tile's conversion time; return the times, and the findings with them."""
+    conversions_ns: list[int | None] = []
+    measured: list[TileFinding] = []
+    for finding, info in zip(findings, tiles, strict=True):
+        try:
+            conversion_ns = measure_conversion_ns(bus, clock, info, wires)
+            never = "its readings never change: it may not be converting"
+            problem = "" if conversion_ns is not None else never
+        except I2cError as error:
+            conversion_ns, problem = None, f"it stopped responding during the measurement: {error}"
+        conversions_ns.append(conversion_ns)
+        conversion_ms = None if conversion_ns is None else conversion_ns / 1e6
+        measured.append(replace(finding, conversion_ms=conversion_ms, problem=problem))
+    return conversions_ns, tuple(measured)
 
 
 def _place(tile: FoundTile) -> Place:
