@@ -160,21 +160,8 @@ class World:
             for index, tile in enumerate(scene.tile)
         ]
         """Chips, for judging drivers only; a driver has only the bus."""
-        muxes = [
-            EmulatedTca9548a(
-                address,
-                [
-                    (tile.channel, part)
-                    for tile, part in zip(scene.tile, self.chips, strict=True)
-                    if tile.mux == address
-                ],
-                self._faults.get_fault("brown_out", f"0x{address:02x}"),
-                self._faults.get_fault("mux_reset", f"0x{address:02x}"),
-            )
-            for address in sorted({tile.mux for tile in scene.tile})
-        ]
         self.i2c_adapter = EmulatedI2cAdapter(
-            muxes,
+            self._make_muxes(),
             clock,
             scene.array.scl_hz * scene.emulation.scl_part,
             FaultyWires(self._faults, f"line/{draw}"),
@@ -182,6 +169,22 @@ class World:
         self._indenter_rng = make_rng(f"mill/{draw}")
         if begins_now:
             self.begin_scene_time()
+
+    def _make_muxes(self) -> list[EmulatedTca9548a]:
+        """Make the multiplexers, each with the chips on its channels."""
+        return [
+            EmulatedTca9548a(
+                address,
+                [
+                    (tile.channel, chip)
+                    for tile, chip in zip(self.scene.tile, self.chips, strict=True)
+                    if tile.mux == address
+                ],
+                self._faults.get_fault("brown_out", f"0x{address:02x}"),
+                self._faults.get_fault("mux_reset", f"0x{address:02x}"),
+            )
+            for address in sorted({tile.mux for tile in self.scene.tile})
+        ]
 
     def begin_scene_time(self) -> None:
         """Begin the scene's time now: ground, faults, temperature."""
