@@ -178,26 +178,8 @@ def read_load_to_emulate(path: Path, options: ReferenceOptions | None = None) ->
         return _require_column(columns, names, name, where, may_be_empty=may_be_empty)
 
     time_s = fit_constant_rate_if_times_repeat(numbers("time_s")).time_s
-    if len(time_s) < 2:
-        raise LoadTraceError(f"{len(time_s)} rows", where=where, expected="at least two")
-    steps = np.flatnonzero(np.diff(time_s) <= 0.0)
-    if len(steps):
-        row = int(steps[0])
-        raise LoadTraceError(
-            f"time_s goes from {time_s[row]:g} to {time_s[row + 1]:g} at row {row + 2}",
-            where=where,
-            expected="times that rise from row to row",
-            remedy="Sort the rows and remove repeated ones",
-        )
-    cells = sorted(
-        (int(match[1]), name) for name in columns if (match := re.fullmatch(r"cell(\d+)_n", name))
-    )
-    if cells and [number for number, _ in cells] != list(range(1, len(cells) + 1)):
-        raise LoadTraceError(
-            f"cell columns are numbered {', '.join(str(number) for number, _ in cells)}",
-            where=where,
-            expected="cell1_n, cell2_n, ... without a gap",
-        )
+    _check_rising_times(time_s, where)
+    cells = _list_cell_columns(columns, where)
     has_total = "fz_n" in columns
     if not cells and not has_total:
         raise LoadTraceError(
@@ -207,7 +189,7 @@ def read_load_to_emulate(path: Path, options: ReferenceOptions | None = None) ->
             remedy=_MAP_REMEDY,
         )
     fz_n = numbers("fz_n") if has_total else None
-    cells_n = np.stack([numbers(name) for _, name in cells], axis=1) if cells else None
+    cells_n = np.stack([numbers(name) for name in cells], axis=1) if cells else None
     pressed_n = cells_n if cells_n is not None else fz_n
     if pressed_n is not None and pressed_n.sum() < 0.0:
         raise LoadTraceError(
@@ -229,6 +211,34 @@ def read_load_to_emulate(path: Path, options: ReferenceOptions | None = None) ->
         cop_m=cop_m,
         angle_rad=numbers("angle_rad") if "angle_rad" in columns else None,
     )
+
+
+def _check_rising_times(time_s: Floats, where: str) -> None:
+    if len(time_s) < 2:
+        raise LoadTraceError(f"{len(time_s)} rows", where=where, expected="at least two")
+    steps = np.flatnonzero(np.diff(time_s) <= 0.0)
+    if len(steps):
+        row = int(steps[0])
+        raise LoadTraceError(
+            f"time_s goes from {time_s[row]:g} to {time_s[row + 1]:g} at row {row + 2}",
+            where=where,
+            expected="times that rise from row to row",
+            remedy="Sort the rows and remove repeated ones",
+        )
+
+
+def _list_cell_columns(names: Iterable[str], where: str) -> list[str]:
+    """Return the columns of single cells in the order of their numbers."""
+    cells = sorted(
+        (int(match[1]), name) for name in names if (match := re.fullmatch(r"cell(\d+)_n", name))
+    )
+    if [number for number, _ in cells] != list(range(1, len(cells) + 1)):
+        raise LoadTraceError(
+            f"cell columns are numbered {', '.join(str(number) for number, _ in cells)}",
+            where=where,
+            expected="cell1_n, cell2_n, ... without a gap",
+        )
+    return [name for _, name in cells]
 
 
 def _is_trace_column(name: str) -> bool:

@@ -281,17 +281,9 @@ def _parse_file(content: bytes) -> C3dFile:
     channels = parameters.get_count_or_zero("ANALOG", "USED")
     point_hz = parameters.get_number_or_zero("POINT", "RATE") or frame_hz
     analog_hz = parameters.get_number_or_zero("ANALOG", "RATE")
-    if channels and measures % channels == 0:
-        by_rates = analog_hz / point_hz if point_hz > 0.0 else 0.0
-        if measures != channels or abs(by_rates - samples_a_frame) > 1e-3:
-            samples_a_frame = measures // channels
-        # Some programs store the number of channels in place of the samples in a frame.
-        measures = channels * samples_a_frame
-    elif measures:
-        raise FileFormatError(
-            f"a frame has {measures} analog samples of {channels} channels",
-            expected="the same number of each channel (ANALOG:USED)",
-        )
+    by_rates = analog_hz / point_hz if point_hz > 0.0 else 0.0
+    samples_a_frame = _count_samples_a_frame(measures, channels, samples_a_frame, by_rates)
+    measures = channels * samples_a_frame if channels else measures
     scale = parameters.get_number_or_zero("POINT", "SCALE") or scale
     kind = np.dtype(f"{order}f4" if scale < 0.0 else f"{order}i2")
     width = 4 * points + measures
@@ -323,6 +315,27 @@ def _parse_file(content: bytes) -> C3dFile:
         scale,
         tuple(notes),
     )
+
+
+def _count_samples_a_frame(measures: int, channels: int, stated: int, by_rates: float) -> int:
+    """Return the number of samples of each channel in a frame.
+
+    Args:
+        measures: analog samples in a frame, as stated.
+        channels: number of channels.
+        stated: samples of a channel in a frame, as stated.
+        by_rates: the same by the rates of samples and frames.
+    """
+    if channels and measures % channels == 0:
+        # Some programs store the number of channels in place of the samples in a frame.
+        is_channel_count = measures == channels and not abs(by_rates - stated) > 1e-3
+        return stated if is_channel_count else measures // channels
+    if measures:
+        raise FileFormatError(
+            f"a frame has {measures} analog samples of {channels} channels",
+            expected="the same number of each channel (ANALOG:USED)",
+        )
+    return stated
 
 
 def _count_frames(parameters: _Parameters, stated: int, size: int, width: int) -> int:

@@ -128,14 +128,7 @@ def build_c3d_content(reactions: Sequence[GroundReaction], exports: Sequence[Exp
         exports: exports of the sessions.
     """
     platforms = [_platform_geometry(export) for export in exports]
-    channels: list[Channel] = []
-    for number, (reaction, (centre_m, _)) in enumerate(zip(reactions, platforms, strict=True), 1):
-        named = zip(_PLATFORM_CHANNELS.items(), _platform_signals(reaction, centre_m), strict=True)
-        channels += [(f"{name}{number}", *about, values) for (name, about), values in named]
-    for number, (reaction, export) in enumerate(zip(reactions, exports, strict=True), 1):
-        prefix = f"{number}:" if len(reactions) > 1 else ""
-        for label, unit, text, values in _extra_channels(reaction, export):
-            channels.append((prefix + label, unit, text, values))
+    channels = _list_channels(reactions, exports, [centre_m for centre_m, _ in platforms])
     samples = len(reactions[0].resampling)
     per_frame = -(-samples // C3D_FRAMES_MAX)
     filling = -samples % per_frame
@@ -180,6 +173,21 @@ def build_c3d_content(reactions: Sequence[GroundReaction], exports: Sequence[Exp
         wrapped = {name: textwrap.wrap(text, _TEXT_MAX) or [" "] for name, text in texts.items()}
         groups["FOOTTILE" + (str(number) if len(reactions) > 1 else "")] = wrapped
     return C3dContent(groups, analog)
+
+
+def _list_channels(
+    reactions: Sequence[GroundReaction], exports: Sequence[Export], centres_m: Sequence[Floats]
+) -> list[Channel]:
+    """List the analog channels: those of all force platforms, then each session's others."""
+    channels: list[Channel] = []
+    for number, (reaction, centre_m) in enumerate(zip(reactions, centres_m, strict=True), 1):
+        named = zip(_PLATFORM_CHANNELS.items(), _platform_signals(reaction, centre_m), strict=True)
+        channels += [(f"{name}{number}", *about, values) for (name, about), values in named]
+    for number, (reaction, export) in enumerate(zip(reactions, exports, strict=True), 1):
+        prefix = f"{number}:" if len(reactions) > 1 else ""
+        for label, unit, text, values in _extra_channels(reaction, export):
+            channels.append((prefix + label, unit, text, values))
+    return channels
 
 
 def _metadata_texts(
