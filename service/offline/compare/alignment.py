@@ -138,25 +138,7 @@ def align_signals(
             remedy=_describe_excluded_lag(ours, reference, lag_range_s),
         )
     _check_correlation(peaks, ours, reference, lag_range_s)
-    best = _fit_around_peak(ours, reference, peaks.best, peaks.step_s)
-    rival = peaks.rival
-    ambiguity = None
-    if rival is not None and rival.correlation > MIN_RIVAL_CORRELATION * peaks.best.correlation:
-        other = _fit_around_peak(ours, reference, rival, peaks.step_s)
-        best, other = sorted((best, other), key=lambda fit: fit.residual_n)
-        if not _is_worse(other, best):
-            raise ComparisonError(
-                f"two lags fit equally well: {best.parameters[_LAG]:.4f} s and "
-                f"{other.parameters[_LAG]:.4f} s",
-                expected="a load that does not repeat itself exactly",
-                remedy="Name the lags that can be with --lag-range-s, or begin with a step or a "
-                "tap that comes once",
-            )
-        known = {True: peaks.best.correlation, False: rival.correlation}
-        is_first = abs(best.parameters[_LAG] - peaks.best.lag_s) < abs(
-            best.parameters[_LAG] - rival.lag_s
-        )
-        ambiguity = RivalLag(float(other.parameters[_LAG]), known[not is_first], known[is_first])
+    best, ambiguity = _fit_best_lag(ours, reference, peaks)
     spread = best.compute_uncertainty(ours)
     if best.parameters[_SCALE] <= 0.0:
         raise _make_sign_error()
@@ -175,6 +157,33 @@ def align_signals(
         block_count=spread.block_count,
         ambiguity=ambiguity,
     )
+
+
+def _fit_best_lag(
+    ours: ForceSignal, reference: ForceSignal, peaks: LagCandidates
+) -> tuple[_Fit, RivalLag | None]:
+    """Fit the best lag; with it return a rival that correlates nearly as well, if there is one.
+
+    Raises:
+        ComparisonError: the rival fits equally well.
+    """
+    best, rival = _fit_around_peak(ours, reference, peaks.best, peaks.step_s), peaks.rival
+    if rival is None or not rival.correlation > MIN_RIVAL_CORRELATION * peaks.best.correlation:
+        return best, None
+    other = _fit_around_peak(ours, reference, rival, peaks.step_s)
+    best, other = sorted((best, other), key=lambda fit: fit.residual_n)
+    lag_s, other_s = (float(fit.parameters[_LAG]) for fit in (best, other))
+    if not _is_worse(other, best):
+        raise ComparisonError(
+            f"two lags fit equally well: {lag_s:.4f} s and {other_s:.4f} s",
+            expected="a load that does not repeat itself exactly",
+            remedy="Name the lags that can be with --lag-range-s, or begin with a step or a "
+            "tap that comes once",
+        )
+    correlations = (rival.correlation, peaks.best.correlation)
+    if abs(lag_s - peaks.best.lag_s) >= abs(lag_s - rival.lag_s):
+        correlations = correlations[::-1]
+    return best, RivalLag(other_s, *correlations)
 
 
 def _check_varies(signal: ForceSignal, whose: str) -> None:
