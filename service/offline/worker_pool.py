@@ -253,16 +253,7 @@ def map_on_cluster(
     dask: Any = distributed  # its type stubs lack the functions used here
     for name in ("distributed", "distributed.client"):  # its errors are reported below
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    with ExitStack() as stack:
-        try:
-            client = stack.enter_context(
-                dask.Client(
-                    scheduler_address, timeout=_CONNECT_S, set_as_default=False, name="foottile"
-                )
-            )
-            client.wait_for_workers(1, timeout=_CONNECT_S)
-        except (OSError, ValueError) as error:
-            raise _make_unreachable_error(scheduler_address, error) from error
+    with _connect_to_cluster(dask, scheduler_address) as client:
         _check_worker_versions(client.run(collect_versions, on_error="return"))
         under_way: dict[str, Task] = {}
         done, left = dask.as_completed(loop=client.loop), iter(tasks)
@@ -279,20 +270,32 @@ def map_on_cluster(
                 return
             future = next(done)
             task = under_way.pop(future.key)
-            result: Result | Unfinished | Exception
-            if future.status == "finished":
-                result = future.result()
-            elif future.status == "error":
-                result = future.exception()
-                if isinstance(result, dask.scheduler.KilledWorker):
-                    result = WorkerLostError("several workers were killed while running it")
-            else:
+            if future.status not in ("finished", "error"):
                 raise _make_unreachable_error(scheduler_address, f"a task is {future.status}")
+            result: Result | Unfinished | Exception = (
+                future.exception() if future.status == "error" else future.result()
+            )
+            if isinstance(result, dask.scheduler.KilledWorker):
+                result = WorkerLostError("several workers were killed while running it")
             future.release()
             if isinstance(result, Unfinished):
                 again.append(task)
             else:
                 yield task, result
+
+
+@contextmanager
+def _connect_to_cluster(dask: Any, address: str) -> Iterator[Any]:
+    """Context manager: connect to a scheduler that has a worker; yield the client."""
+    with ExitStack() as stack:
+        try:
+            client = stack.enter_context(
+                dask.Client(address, timeout=_CONNECT_S, set_as_default=False, name="foottile")
+            )
+            client.wait_for_workers(1, timeout=_CONNECT_S)
+        except (OSError, ValueError) as error:
+            raise _make_unreachable_error(address, error) from error
+        yield client
 
 
 def _count_threads(client: Any, address: str) -> int:
