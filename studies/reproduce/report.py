@@ -76,39 +76,7 @@ def _describe_run_time(result: Reproduction) -> str:
 def _format_comparison_table(result: Reproduction) -> Iterator[str]:
     """Yield the table of the paper's and our values."""
     yield from ("## The paper beside this", "", "| | paper | here |", "|---|---|---|")
-    rows: list[tuple[str, str, str]] = []
-    if result.domes:
-        means = [
-            one.indented_tile.tile.rig.r2_of_mean
-            for one in result.domes
-            if one.indented_tile.tile.rig
-        ]
-        each = [
-            one.indented_tile.tile.r2
-            for one in result.domes
-            if one.indented_tile.tile.r2 is not None
-        ]
-        rows.append(("R² of the cubic, mean over loadings", "99.99 % (eq. 2)", _format_span(means)))
-        rows.append(("R² of the same cubic, every loading", "not known here", _format_span(each)))
-        spread = result.repeatability
-        if spread is not None:
-            value, (low, high) = spread
-            rows.append(
-                (
-                    "standard deviation between loadings, normalised",
-                    f"{paper.REPEATABILITY} (III-A)",
-                    f"{value:.3f} ({low:.3f} to {high:.3f}); emulated with 0.03",
-                )
-            )
-        own = [one for one in result.domes if one.expected_range.source == "paper"]
-        rows += [
-            (
-                f"range of {one.dome.name}, N",
-                f"{paper.DOME_RANGE_N[0]:.0f} to {paper.DOME_RANGE_N[1]:.0f} (III-A)",
-                f"{one.full_scale_n[0]:.1f} ± {one.full_scale_n[1]:.1f}",
-            )
-            for one in own
-        ]
+    rows = [*_list_dome_rows(result)] if result.domes else []
     if (rolling := result.find_experiment(ROLLING.name)) is not None:
         rows.append(("rolling: COP error, mm", "below 4 (III)", _describe_cop(rolling)))
     for setup in (ROLLING, POPPY, POPPY_RIM, MUD):
@@ -138,6 +106,29 @@ def _format_comparison_table(result: Reproduction) -> Iterator[str]:
         "of frames under load; whether the paper's is, too, is not known here.",
         "",
     )
+
+
+def _list_dome_rows(result: Reproduction) -> Iterator[tuple[str, str, str]]:
+    """Yield the rows of the domes: figure, the paper's value, ours."""
+    tiles = [one.indented_tile.tile for one in result.domes]
+    means = [tile.rig.r2_of_mean for tile in tiles if tile.rig]
+    each = [tile.r2 for tile in tiles if tile.r2 is not None]
+    yield "R² of the cubic, mean over loadings", "99.99 % (eq. 2)", _format_span(means)
+    yield "R² of the same cubic, every loading", "not known here", _format_span(each)
+    if (spread := result.repeatability) is not None:
+        value, (low, high) = spread
+        yield (
+            "standard deviation between loadings, normalised",
+            f"{paper.REPEATABILITY} (III-A)",
+            f"{value:.3f} ({low:.3f} to {high:.3f}); emulated with 0.03",
+        )
+    for one in result.domes:
+        if one.expected_range.source == "paper":
+            yield (
+                f"range of {one.dome.name}, N",
+                f"{paper.DOME_RANGE_N[0]:.0f} to {paper.DOME_RANGE_N[1]:.0f} (III-A)",
+                f"{one.full_scale_n[0]:.1f} ± {one.full_scale_n[1]:.1f}",
+            )
 
 
 def _format_domes(result: Reproduction) -> Iterator[str]:
