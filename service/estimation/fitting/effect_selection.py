@@ -26,7 +26,11 @@ from service.estimation.fitting.dome_model import (
     DomeModel,
     FittedEffects,
 )
-from service.estimation.fitting.output_error import DomeFit, OutputErrorProblem
+from service.estimation.fitting.output_error import (
+    CorrectionMisfits,
+    DomeFit,
+    OutputErrorProblem,
+)
 from service.estimation.fitting.rig.indentation import LoadingPoints
 from service.estimation.fitting.thermal_soak import list_parameters_at_bound
 from service.estimation.models.hysteresis import WIDTHS_N
@@ -87,7 +91,18 @@ def fit_significant_effects(
             refused[name] = why
     if parts.terms:
         fit = _select_creep_terms(problem, parts, fit)
-    misfits, model, sigma = problem.compute_relative_correction_misfits(fit), fit.model, fit.sigma
+    misfits = problem.compute_relative_correction_misfits(fit)
+    return _make_effects(fit, misfits, temperature, refused)
+
+
+def _make_effects(
+    fit: DomeFit,
+    misfits: CorrectionMisfits,
+    temperature: TemperatureEffect | None,
+    refused: dict[EffectName, str],
+) -> Effects:
+    """Make the effects of a fit, with their uncertainty, and of the thermal soak."""
+    model, sigma = fit.model, fit.sigma
     gas = rubber = hysteresis = None
     if "gamma" in sigma:
         (gamma,) = _make_parameters([model.gamma], sigma["gamma"])
