@@ -15,7 +15,7 @@ import numpy.typing as npt
 from devices.arrays import Floats
 from devices.chips.pressure_chips import Compensation
 from devices.errors import CalibrationError, UsageError
-from devices.frames import ArrayInfo
+from devices.frames import ArrayInfo, TileInfo
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.fault_detection.fault_limits import make_fault_params
 from service.estimation.foot import (
@@ -143,15 +143,7 @@ def make_plan(
     )
     by_model = make_model_params(model_inputs)
     for i, entry in zip(bearing, entries, strict=True):
-        tile = info.tiles[i]
-        if entry.registers not in (None, tile.registers):
-            raise CalibrationError(
-                f"tile {tile.serial} is not the part that was calibrated: its chip has the "
-                f"registers {tile.registers}, the calibrated one "
-                f"{entry.registers}",
-                where=model_inputs.calibration_label,
-                remedy="Press this tile on the test rig and calibrate it, or correct the serial",
-            )
+        _reject_other_part(info.tiles[i], entry, model_inputs.calibration_label)
     tiles = TileParams.array(len(info.tiles))
     tiles[bearing] = _make_bearing_params(info, calibration, tare, bearing, model_inputs, by_model)
     faults, equal_count_limits = make_fault_params(
@@ -204,6 +196,17 @@ def make_plan(
             foot, tiles, np.ascontiguousarray(np.column_stack([normals, offsets_m]))
         ),
     )
+
+
+def _reject_other_part(tile: TileInfo, entry: TileCalibration, where: str) -> None:
+    """Reject the calibration of another chip than the tile's."""
+    if entry.registers not in (None, tile.registers):
+        raise CalibrationError(
+            f"tile {tile.serial} is not the part that was calibrated: its chip has the "
+            f"registers {tile.registers}, the calibrated one {entry.registers}",
+            where=where,
+            remedy="Press this tile on the test rig and calibrate it, or correct the serial",
+        )
 
 
 def _make_foot_params(

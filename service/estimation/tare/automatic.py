@@ -10,11 +10,12 @@ The tare comes from the newest unloaded window among the last frames of the stre
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from devices.arrays import Bools, Times
+from devices.arrays import Bools, Floats, Times
 from devices.errors import TareError
 from devices.frames import NOT_READ, FrameBatch
 from service.estimation.tare.tare import (
@@ -65,21 +66,8 @@ def compute_newest_unloaded_tare(
         )
     if len(frames) < FRAMES_MIN:
         raise TareError(f"only {len(frames)} frames have come", expected=f"at least {FRAMES_MIN}")
-    usual_kpa = recent.rig_noise_kpa
-    if present is not None:
-        usual_kpa = np.where(np.isnan(usual_kpa), present.noise_kpa, usual_kpa)
-    floor_kpa = recent.compute_reading_rounding_sigma_kpa(
-        np.nanmedian(frames.temperature_raw, axis=0)
-    )
-    steps_kpa = np.maximum(recent.step_noise_kpa, floor_kpa)
-    usual_kpa = np.where(np.isnan(usual_kpa), steps_kpa, usual_kpa)
-    window_ns = _compute_window_ns(since_ns)
-    last_ns = int(since_ns[-1]) - window_ns
-    begins_ns = compute_nonempty_window_starts(since_ns, last_ns, -(-window_ns // 4), window_ns)
-    begins_ns = begins_ns[begins_ns <= last_ns][::-1]
-    firsts = np.searchsorted(since_ns, begins_ns)
-    ends = np.searchsorted(since_ns, begins_ns + window_ns, side="right")
-    windows = recent.select_quiet_windows(map(slice, firsts.tolist(), ends.tolist()), usual_kpa)
+    usual_kpa = _compute_usual_noise_kpa(recent, present)
+    windows = recent.select_quiet_windows(_iterate_windows_newest_first(since_ns), usual_kpa)
     if not windows:
         raise TareError(
             "the foot moved or was loaded all the time in the last seconds",
@@ -101,9 +89,28 @@ def compute_newest_unloaded_tare(
     return tare
 
 
-def _compute_window_ns(since_ns: Times) -> int:
+def _compute_usual_noise_kpa(recent: TareFrames, present: Tare | None) -> Floats:
+    """Return each tile's noise at rest: the rig's, else the present tare's, else that of steps."""
+    usual_kpa = recent.rig_noise_kpa
+    if present is not None:
+        usual_kpa = np.where(np.isnan(usual_kpa), present.noise_kpa, usual_kpa)
+    floor_kpa = recent.compute_reading_rounding_sigma_kpa(
+        np.nanmedian(recent.frames.temperature_raw, axis=0)
+    )
+    steps_kpa = np.maximum(recent.step_noise_kpa, floor_kpa)
+    return np.where(np.isnan(usual_kpa), steps_kpa, usual_kpa)
+
+
+def _iterate_windows_newest_first(since_ns: Times) -> Iterator[slice]:
+    """Yield the rows of windows that begin a quarter of a window apart."""
     enough_ns = 1.25 * FRAMES_MIN * float(np.median(np.diff(since_ns)))
-    return int(min(max(WINDOW_NS, enough_ns), WINDOW_MAX_NS))
+    window_ns = int(min(max(WINDOW_NS, enough_ns), WINDOW_MAX_NS))
+    last_ns = int(since_ns[-1]) - window_ns
+    begins_ns = compute_nonempty_window_starts(since_ns, last_ns, -(-window_ns // 4), window_ns)
+    begins_ns = begins_ns[begins_ns <= last_ns][::-1]
+    firsts = np.searchsorted(since_ns, begins_ns)
+    ends = np.searchsorted(since_ns, begins_ns + window_ns, side="right")
+    return map(slice, firsts.tolist(), ends.tolist())
 
 
 def _reject_warming(recent: TareFrames, frames: FrameBatch, tare: Tare) -> None:
