@@ -313,7 +313,7 @@ def _estimate_due_rows(
         out[:] = math.nan
         if foot_params.has_denoise == 1:
             rows = denoise.find_oldest_and_newest_window_rows(
-                buffer.t_mono_ns, i, 0, end, rows, look_ns
+                buffer.t_mono_ns, i, end, rows, look_ns
             )
         unsettled = compute_forces_and_after_saturation(
             params, tile_states, buffer, i, rows, windows, forces

@@ -38,7 +38,7 @@ def denoised(
     out = np.full((4, n, tiles), math.nan)
     columns, scratch, rows = (values, sigmas, t_ns, run), np.empty(denoise.SCRATCH_SHAPE), (0, 0)
     for i in range(n):
-        rows = denoise.find_oldest_and_newest_window_rows(frame_t_ns, i, 0, n, rows, look_ns)
+        rows = denoise.find_oldest_and_newest_window_rows(frame_t_ns, i, n, rows, look_ns)
         for j in range(tiles):
             if not math.isnan(values[i, j]):
                 found, _ = denoise.denoise_sample(

@@ -71,7 +71,6 @@ class WindowDifference(Protocol):
 def find_oldest_and_newest_window_rows(
     frame_t_ns: Times,
     i: int,
-    first: int,
     end: int,
     previous_rows: tuple[int, int],
     lookahead_ns: int,
@@ -81,13 +80,12 @@ def find_oldest_and_newest_window_rows(
     Args:
         frame_t_ns: instants of all rows.
         i: row.
-        first: first row that is stored.
         end: row after the last that is stored.
         previous_rows: answer for the row before, or any row twice.
         lookahead_ns: look-ahead; no more frames arrive within it.
     """
     oldest, newest = previous_rows
-    while oldest > first and frame_t_ns[oldest - 1] >= frame_t_ns[i] - PAST_NS:
+    while oldest > 0 and frame_t_ns[oldest - 1] >= frame_t_ns[i] - PAST_NS:
         oldest -= 1
     while frame_t_ns[oldest] < frame_t_ns[i] - PAST_NS:
         oldest += 1

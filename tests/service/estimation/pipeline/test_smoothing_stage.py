@@ -47,7 +47,7 @@ def _average_all(params: KernelParams, buffer: FrameBuffer, out: Floats) -> None
     rows, windows = (0, 0), np.empty(denoise.SCRATCH_SHAPE)
     for i in range(len(out)):
         rows = denoise.find_oldest_and_newest_window_rows(
-            buffer.t_mono_ns, i, 0, len(out), rows, 100_000_000
+            buffer.t_mono_ns, i, len(out), rows, 100_000_000
         )
         for j in range(len(forces)):
             forces[j].force_n, forces[j].noise_n = buffer.usable_n[i, j], buffer.noise_n[i, j]
