@@ -19,6 +19,7 @@ from types import MappingProxyType
 from devices.errors import (
     CalibrationError,
     DamagedFileError,
+    FileFormatError,
     MissingExtraError,
     StorageError,
     UsageError,
@@ -37,6 +38,7 @@ from service.sessions.calibration_file import (
 from service.user_folders import resolve_user_folder
 from service.version import SOFTWARE_VERSION
 from storage.durable_files import make_synced_folder, read_small_file, set_aside_damaged
+from storage.sessions.reader import SealedFileReader
 
 EMULATED_RIG = "emulated-rig"
 SHIPPED_FOLDER = Path(__file__).parent / "shipped"
@@ -90,6 +92,22 @@ def find_calibration(
     calibration = PRESETS[name]() if name in PRESETS else read_calibration(Path(name))
     calibration.get_tiles_or_wildcard(serials)
     return calibration
+
+
+def read_calibration_of_session(session: SealedFileReader) -> Calibration | None:
+    """Return the calibration that a session contains; None without one.
+
+    Raises:
+        FileFormatError: it is invalid, or of another version.
+    """
+    if "calibration" not in session.notes:
+        return None
+    try:
+        return Calibration.model_validate(session.notes["calibration"])
+    except ValueError as error:
+        raise FileFormatError(
+            f"its calibration is not readable: {error}", where=str(session.path)
+        ) from error
 
 
 def _cache_folder() -> Path | None:

@@ -24,7 +24,8 @@ from devices.errors import CalibrationError, FileFormatError
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration, MountCalibration
 from service.estimation.effects import Parameter
-from service.estimation.foot import fit_tile_axis_angles_rad
+from service.estimation.foot import compute_tilt_loss, fit_tile_axis_angles_rad
+from service.offline.calibration_lookup import read_calibration_of_session
 from service.offline.compare.alignment import HUBER_SIGMAS
 from service.offline.compare.block_covariance import (
     NORMAL_95,
@@ -34,6 +35,7 @@ from service.offline.compare.block_covariance import (
 )
 from service.offline.compare.paired_frames import PairedFrames
 from service.offline.compare.plausibility import describe_implausible_alignment
+from service.offline.compare.signals import compute_robust_deviation
 from service.offline.comparison import ANGLE_COLUMN, CompareOptions, Comparison, compare_session
 from storage.formats.reference import ReferenceOptions
 from storage.sessions.reader import SealedFileReader
@@ -143,8 +145,7 @@ class _LoadedFrames:
         return x, bend_n
 
     def _estimate_noise_n(self, x: Floats) -> float:
-        off_n = self.compute_residual_n(x)
-        noise_n = 1.4826 * float(np.median(np.abs(off_n - np.median(off_n))))
+        noise_n = compute_robust_deviation(self.compute_residual_n(x))
         return max(noise_n, 1e-6 * float(np.ptp(self.reference_n)))
 
 
@@ -373,18 +374,13 @@ def calibrate_mount(
 
 
 def _read_calibration(session: SealedFileReader) -> Calibration:
-    if "calibration" not in session.notes:
+    if (calibration := read_calibration_of_session(session)) is None:
         raise FileFormatError(
             "the session brings no calibration",
             where=str(session.path),
             remedy="Estimate it with one first: foottile estimate --calibration",
         )
-    try:
-        return Calibration.model_validate(session.notes["calibration"])
-    except ValueError as error:
-        raise FileFormatError(
-            f"its calibration is not readable: {error}", where=str(session.path)
-        ) from error
+    return calibration
 
 
 def _compute_tilt_loss(info: ArrayInfo, pairs: PairedFrames) -> Floats:
@@ -397,7 +393,7 @@ def _compute_tilt_loss(info: ArrayInfo, pairs: PairedFrames) -> Floats:
     if info.servo is not None:
         known = pairs.columns.get(ANGLE_COLUMN)
         turned_rad = np.full(len(pairs.t_s), np.nan) if known is None else known.astype(float)
-    return np.asarray(1.0 - np.cos(axes - turned_rad[:, None]))
+    return compute_tilt_loss(axes - turned_rad[:, None])
 
 
 def _combine_gains(gain: Parameter, before: float) -> Parameter:

@@ -32,6 +32,7 @@ from service.offline.compare.signals import (
     EvenSignal,
     ForceSignal,
     LagCandidates,
+    compute_robust_deviation,
     find_lag_candidates,
     low_pass,
 )
@@ -190,7 +191,7 @@ def _check_varies(signal: ForceSignal, whose: str) -> None:
     if len(signal.t_s) < 2:
         raise ComparisonError(f"{whose} has {len(signal.t_s)} samples", expected="at least two")
     height_n = float(np.ptp(signal.force_n))
-    noise_n = _robust_deviation(np.diff(signal.force_n)) / np.sqrt(2.0)
+    noise_n = compute_robust_deviation(np.diff(signal.force_n)) / np.sqrt(2.0)
     # With many samples, noise alone spans some five sigma to either side.
     if not height_n > 12.0 * noise_n or height_n == 0.0:
         raise ComparisonError(
@@ -353,12 +354,8 @@ def _fit_window(
 def _estimate_noise_n(residual: Floats, own_n: Floats) -> float:
     """Estimate the standard deviation of residuals under load, robust to outliers."""
     loaded = own_n - np.median(own_n[own_n <= np.median(own_n)]) > LOADED_SHARE * np.ptp(own_n)
-    noise_n = _robust_deviation(residual[loaded] if loaded.sum() > 1 else residual)
-    return max(noise_n, _robust_deviation(residual), 1e-6 * float(np.ptp(own_n)))
-
-
-def _robust_deviation(values: Floats) -> float:
-    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
+    noise_n = compute_robust_deviation(residual[loaded] if loaded.sum() > 1 else residual)
+    return max(noise_n, compute_robust_deviation(residual), 1e-6 * float(np.ptp(own_n)))
 
 
 def _is_worse(other: _Fit, best: _Fit) -> bool:

@@ -16,7 +16,7 @@ from service.estimation.stances import STANCE_INPUT_COLUMNS
 from service.offline.accuracy import MIN_GRF_N
 from service.offline.compare.alignment import ReferenceAlignment
 from service.offline.compare.block_covariance import UncertainValue, compute_correlated_mean
-from service.offline.compare.signals import ForceSignal
+from service.offline.compare.signals import ForceSignal, compute_robust_deviation
 
 COMPARED_COLUMNS = ("seq", "t_ns", *STANCE_INPUT_COLUMNS, "cop_y_m", "cop_sigma_y_m")
 """Session columns that a comparison reads."""
@@ -161,7 +161,7 @@ def _estimate_reference_zero(
     values_n = reference_n[rows]
     # Contacts that only the reference shows are not noise.
     middle_n = np.median(values_n)
-    noise_n = 1.4826 * float(np.median(np.abs(values_n - middle_n)))
+    noise_n = compute_robust_deviation(values_n)
     quiet = np.abs(values_n - middle_n) <= max(CONTACT_SIGMAS * noise_n, MIN_GRF_N)
     if quiet.sum() < MIN_FLIGHT_FRAMES:
         return None, noise_n

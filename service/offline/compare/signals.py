@@ -149,6 +149,11 @@ def resample_evenly(
     return EvenSignal(float(signal.t_s[0]), step_s, step, force_n, signal.is_known(t_s))
 
 
+def compute_robust_deviation(values: Floats) -> float:
+    """Estimate the standard deviation of normal values by their median absolute deviation."""
+    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
+
+
 def low_pass(
     signal: ForceSignal,
     width_s: float,

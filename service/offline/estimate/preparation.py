@@ -23,7 +23,11 @@ from service.estimation.calibration import Calibration
 from service.estimation.estimate import Estimator, ModelEstimator
 from service.estimation.pipeline.plan import EstimationPlan, compute_settling_time_s
 from service.estimation.tare.tare import Tare
-from service.offline.calibration_lookup import EMULATED_RIG, find_calibration
+from service.offline.calibration_lookup import (
+    EMULATED_RIG,
+    find_calibration,
+    read_calibration_of_session,
+)
 from service.sessions.estimate_stream import EstimateOptions
 from storage.formats.slice import Slice
 from storage.schema import INDENTER_COLUMNS, PART_COLUMNS, TRUTH_COLUMNS
@@ -244,14 +248,11 @@ def _find_calibration(
         wanted.get_tiles_or_wildcard(serials)
         return wanted
     inside = None
-    if "calibration" in notes:
-        try:
-            inside = Calibration.model_validate(notes["calibration"])
-        except ValueError as error:
-            if wanted is None:
-                raise FileFormatError(
-                    f"its calibration is not readable: {error}", where=where
-                ) from error
+    try:
+        inside = read_calibration_of_session(session)
+    except FileFormatError:
+        if wanted is None:
+            raise
     if inside is not None and wanted in (None, inside.id):
         return inside
     name = wanted or (scene.calibration if scene is not None else None)
