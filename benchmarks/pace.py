@@ -23,8 +23,7 @@ from devices.array.schedules import compute_frame_s
 from devices.array.startup import prepare_array
 from devices.arrays import Floats
 from devices.buses.i2c import i2c_msg, open_bus
-from devices.clock import Clock, SpinningClock, SystemClock, UtcAnchor
-from devices.emulation.driver_clock import DriverClock, WireClock
+from devices.clock import Clock, DriverClock, SpinningClock, SystemClock, UtcAnchor, WireClock
 from devices.emulation.world import World
 from devices.realtime import set_timer_slack
 from devices.scene.scene_file import Scene, load_scene

@@ -30,7 +30,7 @@ from devices.chips.dynamixel.position_sources import ThreadedServoSource
 from devices.chips.dynamixel.protocol import COUNTS_PER_TURN
 from devices.chips.dynamixel.servo_setup import open_servo
 from devices.chips.mcp3208 import COUNTS_MAX, COUNTS_PER_VREF, Mcp3208
-from devices.clock import Clock, SpinningClock, SystemClock, UtcAnchor
+from devices.clock import Clock, DriverClock, SpinningClock, SystemClock, UtcAnchor, WireClock
 from devices.errors import FootTileError, I2cError, SpiError, TileSetupError, UsageError
 from devices.flags import FrameFlag, TileFlag
 from devices.frames import ArrayInfo, Edge, FrameBatch, ServoInfo, TileInfo
@@ -446,8 +446,6 @@ class Rig:
         pressed = options.foot.compute_tile_load(scene)
         clock: Clock = self._line_clock
         if options.is_emulated:
-            from devices.emulation.driver_clock import DriverClock, WireClock
-
             self._clock = driver = DriverClock(self._clock)
             clock = WireClock(driver, self._line_clock)
         return options.foot.make_world(scene, clock, pressed, is_repeated=True, in_real_time=True)

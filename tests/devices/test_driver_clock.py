@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from devices.array.startup import prepare_array
 from devices.buses.i2c import i2c_msg, open_bus
-from devices.clock import Clock, VirtualClock
-from devices.emulation.driver_clock import LAG_MAX_NS, DriverClock, WireClock
+from devices.clock import LAG_MAX_NS, Clock, DriverClock, VirtualClock, WireClock
 from devices.emulation.world import World
 from devices.scene.scene_file import load_scene
 from tests.builders.scenes import make_scene
