@@ -48,6 +48,14 @@ UnquantizedOption = Annotated[
 ChipOption = Annotated[
     str | None, typer.Option(help="Kind of pressure chip in all tiles; default: the scene's.")
 ]
+BusOption = Annotated[
+    str | None,
+    typer.Option(help="I2C bus: /dev/i2c-1, usb:1c40:0534 or emulated; default: the scene's."),
+]
+ServoOption = Annotated[
+    str | None,
+    typer.Option(help="Serial port of the servo, emulated, or none; default: the scene's."),
+]
 EstimatorOption = Annotated[
     str,
     typer.Option(

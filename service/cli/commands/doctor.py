@@ -17,7 +17,15 @@ from devices.errors import UsageError, require_extra
 from devices.scene.hardware_sections import EMULATED, ServoSection
 from devices.scene.scene_file import Scene, load_scene
 from devices.vitals import Vitals, VitalsWarnings, read_vitals
-from service.cli.options import JsonOption, echo, print_json, show_progress, stdout
+from service.cli.options import (
+    BusOption,
+    JsonOption,
+    ServoOption,
+    echo,
+    print_json,
+    show_progress,
+    stdout,
+)
 
 if TYPE_CHECKING:
     from service.offline.doctor import BusDiagnosis, ServoDiagnosis
@@ -31,17 +39,11 @@ def doctor_command(
         str | None,
         typer.Option(help="Scene with the expected tiles; default: accept any."),
     ] = None,
-    bus: Annotated[
-        str | None,
-        typer.Option(help="I2C bus: /dev/i2c-1, usb:1c40:0534 or emulated; default: the scene's."),
-    ] = None,
+    bus: BusOption = None,
     rate_hz: Annotated[
         float, typer.Option(min=0.0, help="Required frame rate; 0: the scene's, or the highest.")
     ] = 0.0,
-    servo: Annotated[
-        str | None,
-        typer.Option(help="Serial port of a servo, emulated, or none; default: the scene's."),
-    ] = None,
+    servo: ServoOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find the tiles of a bus, measure it, and predict its frame rate.

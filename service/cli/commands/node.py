@@ -18,9 +18,11 @@ import typer
 from devices.errors import StorageError, UsageError
 from devices.types import check_user_name
 from service.cli.options import (
+    BusOption,
     CaOption,
     ChipOption,
     FootOptions,
+    ServoOption,
     add_options,
     create_stop_event,
     echo,
@@ -48,14 +50,8 @@ def node_command(
             "network; with --record: none."
         ),
     ] = None,
-    bus: Annotated[
-        str | None,
-        typer.Option(help="I2C bus: /dev/i2c-1, usb:1c40:0534 or emulated; default: the scene's."),
-    ] = None,
-    servo: Annotated[
-        str | None,
-        typer.Option(help="Serial port, emulated, or none; default: the scene's."),
-    ] = None,
+    bus: BusOption = None,
+    servo: ServoOption = None,
     name: Annotated[
         str | None, typer.Option(help="Name of this node; default: this machine's.")
     ] = None,
