@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from devices.errors import UsageError, escape_control_chars
+from service.cli.multi_session import EXIT_INCOMPLETE
 from service.cli.options import (
     JsonOption,
     echo,
@@ -25,8 +26,6 @@ from service.cli.options import (
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-_EXIT_INCOMPLETE = 3
 
 
 def query_command(
@@ -84,7 +83,7 @@ def query_command(
     for place, reason in archive.left_out_reasons.items():
         remark(f"{place} is left out: {reason}")
     if archive.left_out_reasons:
-        raise typer.Exit(_EXIT_INCOMPLETE)
+        raise typer.Exit(EXIT_INCOMPLETE)
 
 
 def _to_rows(table: pa.Table) -> list[dict[str, Any]]:

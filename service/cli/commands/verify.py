@@ -217,7 +217,7 @@ def _format_stream(report: StreamReport) -> str:
     )
 
 
-_EXIT_FAILED, _EXIT_INCOMPLETE = 1, 3
+_EXIT_FAILED = 1
 
 
 def recover_command(
@@ -262,7 +262,7 @@ def recover_command(
     if recovery.problems or any(found.outcome == "failed" for found in recovery.sessions):
         raise typer.Exit(_EXIT_FAILED)
     if any(found.ledger is None or not found.ledger.complete for found in recovery.sessions):
-        raise typer.Exit(_EXIT_INCOMPLETE)
+        raise typer.Exit(EXIT_INCOMPLETE)
 
 
 def _make_recovery_json(recovery: RecoveryReport) -> dict[str, Any]:
