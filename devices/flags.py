@@ -36,6 +36,10 @@ class FrameFlag(IntFlag):
     SERVO_TURN_UNKNOWN = 32
 
 
+CONTACT_UNKNOWN = 255
+"""Value of an estimate's `contact` where it is unknown."""
+
+
 class EstimateFlag(IntFlag):
     """Flags of an estimated frame; bits of `Estimates.estimate_flags`."""
 

@@ -27,7 +27,7 @@ import pyarrow as pa
 
 from devices.chips.pressure_chips import check_chips, get_raw_type
 from devices.errors import DamagedFileError, FileFormatError
-from devices.flags import EstimateFlag, FrameFlag, TileFlag, list_bits
+from devices.flags import CONTACT_UNKNOWN, EstimateFlag, FrameFlag, TileFlag, list_bits
 from devices.frames import (
     FRAME_COLUMNS,
     NO_SERVO_AGE,
@@ -128,8 +128,6 @@ MEASURED_COLUMNS = (
 """Columns that a node measures: `devices.frames.FrameBatch`."""
 
 _F32 = pa.float32()
-
-CONTACT_UNKNOWN = 255
 
 ESTIMATE_COLUMNS = (
     Column("gauge_kpa", _F32, "kPa", "gas pressure above the tile's own baseline", True),

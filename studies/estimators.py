@@ -13,9 +13,8 @@ import numpy as np
 from devices.arrays import Floats, Ints
 from devices.chips.pressure_chips import Compensation, get_raw_type
 from devices.errors import UsageError
-from devices.flags import EstimateFlag
+from devices.flags import CONTACT_UNKNOWN, EstimateFlag
 from devices.frames import NOT_READ, FrameBatch, HeldTemperature, hold_temperature
-from service.estimation import CONTACT_UNKNOWN
 from service.estimation.estimate import Estimator, ModelEstimator
 from service.estimation.models.static import compute_forces
 from service.estimation.pipeline.plan import SIGNIFICANCE_SIGMAS, EstimationPlan

@@ -15,10 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Floats, Times
-from devices.flags import EstimateFlag
+from devices.flags import CONTACT_UNKNOWN, EstimateFlag
 from devices.frames import FrameBatch, allocate_columns
 from devices.jit import jit_cached, jit_inlined
-from service.estimation import CONTACT_UNKNOWN
 from service.estimation.foot import interpolate_servo_counts, is_debounced, transform_to_ground_x_m
 from service.estimation.models import denoise
 from service.estimation.pipeline import grf_cop

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Columns, Floats, Times
-from devices.flags import EstimateFlag
-from service.estimation import CONTACT_UNKNOWN, LONG_GAP_NS
+from devices.arrays import Bools, Columns, Floats, Times
+from devices.flags import CONTACT_UNKNOWN, EstimateFlag
+from service.estimation import LONG_GAP_NS
 from service.estimation.records import SIGMAS_95
 from service.estimation.stance_curves import PeakSearch
 
@@ -219,7 +219,7 @@ class _KnownFrames:
     seq: npt.NDArray[np.uint64]
     t_ns: Times
     part: npt.NDArray[Any]
-    loaded: npt.NDArray[np.bool_]
+    loaded: Bools
     grf_n: Floats
 
     def get_frame(self, i: int) -> _Frame:

@@ -12,11 +12,10 @@ import numpy.typing as npt
 
 from devices.arrays import Columns, Floats, Ints
 from devices.errors import FileFormatError
-from devices.flags import EstimateFlag
+from devices.flags import CONTACT_UNKNOWN, EstimateFlag
 from devices.frames import FrameBatch
 from service.estimation.stances import Stance, StanceDetector
 from service.offline.accuracy import ACCURACY_COLUMNS, Accuracy, compute_accuracy
-from storage.schema import CONTACT_UNKNOWN
 from storage.sessions.reader import SealedFileReader
 
 if TYPE_CHECKING:

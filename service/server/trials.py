@@ -16,8 +16,8 @@ from pydantic import AfterValidator, Field, StringConstraints, ValidationError
 
 from devices.clock import server_utc_ns
 from devices.errors import FileFormatError, FootTileError, StateError, StorageError, UsageError
+from devices.flags import CONTACT_UNKNOWN
 from devices.types import StrictModel, check_user_name, check_user_text
-from service.estimation import CONTACT_UNKNOWN
 from service.protocol.live import TrialState, TrialsView, TrialView
 from service.server.estimates.node_estimator import EstimatedBatch
 from service.server.node import ServerNode

@@ -32,7 +32,7 @@ from storage.formats.readers.table import (
     ForceTable,
     fit_constant_rate_if_times_repeat,
 )
-from storage.formats.reference import ReferenceOptions, table_to_reference
+from storage.formats.reference import PLAUSIBLE_MAX, ReferenceOptions, table_to_reference
 from storage.schema import read_array_info
 from storage.sessions.time_axis import NODE_AXIS, TimeAxis
 
@@ -148,9 +148,6 @@ def _reference_tile_numbers(schema: pa.Schema | None) -> set[int] | None:
 
 VALUES_MAX = 20_000_000
 """Limit of rows times columns: an hour of eight cells at 500 Hz, 160 MB in memory."""
-
-PLAUSIBLE_MAX = 1e9
-"""Limit of plausible values, in s, N and m."""
 
 _TRACE_COLUMN_PATTERN = re.compile(r"time_s|fz_n|cop_[xy]_m|angle_rad|cell\d+_n")
 """Pattern of the columns that are read."""

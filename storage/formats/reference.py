@@ -38,6 +38,7 @@ SIGN_FACTORS: Mapping[str, float] = {"+": 1.0, "-": -1.0}
 """Factors by the stated sign of a force under load."""
 
 PLAUSIBLE_MAX = 1e9
+"""Limit of plausible values, in s, N and m."""
 TIME_MAX_S = 1e11
 """Limit of times: Unix time in seconds is far below it, and above it in any other unit."""
 GAP_MIN_STEPS = 3.5

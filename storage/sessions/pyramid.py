@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from devices.flags import CONTACT_UNKNOWN
 from devices.frames import NOT_READ
-from storage.schema import CONTACT_UNKNOWN, Array
+from storage.schema import Array
 from storage.sessions.time_axis import TimeAxis
 
 FRAMES_PER_FINEST_BIN = 64

@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Floats
+from devices.flags import CONTACT_UNKNOWN
 from devices.frames import FrameBatch
-from service.estimation import CONTACT_UNKNOWN
 from service.protocol.codec import encode_message
 from service.protocol.live import FrameMessage, FramesDropped, SessionProgress, SessionsProgress
 from storage.intervals import NO_END, Intervals

@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.flags import EstimateFlag
-from service.estimation import CONTACT_UNKNOWN
+from devices.flags import CONTACT_UNKNOWN, EstimateFlag
 from service.estimation.stances import Stance, StanceDetector, compute_stances
 
 STEP_NS = 2_000_000

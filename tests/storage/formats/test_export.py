@@ -14,17 +14,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from devices.arrays import Times
 from devices.errors import UsageError
+from devices.flags import CONTACT_UNKNOWN
 from devices.frames import NO_SERVO_COUNTS, NOT_READ, ArrayInfo
 from storage.clock.bounds import OffsetRows
 from storage.clock.table import ClockTable, StreamClockFacts
 from storage.formats.export import make_one_pass_frame_source
 from storage.formats.slice import Slice
-from storage.schema import ARRAY_INFO_KEY, CONTACT_UNKNOWN, MEASURED_COLUMNS
+from storage.schema import ARRAY_INFO_KEY, MEASURED_COLUMNS
 from storage.sessions.footer import NOTES_KEY
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.frames import make_frames
-from tests.storage.clock.clocks import BEGIN_NS, HOUR, SECOND, Clock, Int64, every
+from tests.storage.clock.clocks import BEGIN_NS, HOUR, SECOND, Clock, every
 from tests.storage.formats.exports import (
     NOTES,
     ROWS,
@@ -309,7 +311,7 @@ SLOW_PERIOD_NS = 20_000_000
 FRAMES = 3000
 
 
-def write_export(path: Path, clock: Clock, *, late_ns: int, measured_parts: int) -> Int64:
+def write_export(path: Path, clock: Clock, *, late_ns: int, measured_parts: int) -> Times:
     """Write what `foottile export --clock server` does; return the server's times of frames."""
     t_mono_ns = BEGIN_NS + late_ns + SLOW_PERIOD_NS * np.arange(FRAMES, dtype=np.int64)
     utc_offset_ns = UTC_NS - clock.offset_ns

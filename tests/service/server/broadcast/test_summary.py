@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from devices.flags import CONTACT_UNKNOWN
 from devices.frames import FrameBatch
-from service.estimation import CONTACT_UNKNOWN
 from service.protocol.live import SessionProgress
 from service.server.broadcast.summary import (
     SUMMARY_NS,
