@@ -17,9 +17,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import gammaln
 
+from devices.arrays import Ints
 from devices.frames import FRAME_COLUMNS, FrameBatch
 
 TAPS = 16
@@ -27,8 +27,6 @@ _COEFFICIENT_BITS = 32
 _EXACT_BITS_MAX = 8
 TIMES = ("seq", "t_mono_ns", "t_ns", "sample_offset_us", "servo_age_us")
 """When it was, as against what was measured."""
-
-Integers = npt.NDArray[np.int64]
 
 
 def bytes_per_frame(frames: FrameBatch) -> dict[str, float]:
@@ -53,7 +51,7 @@ def bytes_per_frame(frames: FrameBatch) -> dict[str, float]:
     return {name: total / 8 / len(frames) for name, total in bits.items()}
 
 
-def code_bits(residuals: Integers) -> float:
+def code_bits(residuals: Ints) -> float:
     """How many bits these numbers take, each on its own."""
     sign = residuals < 0
     size = np.abs(residuals).astype(np.uint64)
@@ -68,7 +66,7 @@ def code_bits(residuals: Integers) -> float:
     return best
 
 
-def _adaptive_bits(counts: npt.NDArray[np.int64]) -> float:
+def _adaptive_bits(counts: Ints) -> float:
     """Length of the adaptive code of Krichevsky and Trofimov; the order does not matter to it."""
     kinds, n = len(counts), int(counts.sum())
     if kinds == 1:
@@ -78,7 +76,7 @@ def _adaptive_bits(counts: npt.NDArray[np.int64]) -> float:
     return float(nats / np.log(2))
 
 
-def _residuals(values: Integers, beside: list[Integers]) -> Iterator[tuple[Integers, float]]:
+def _residuals(values: Ints, beside: list[Ints]) -> Iterator[tuple[Ints, float]]:
     """What predictors leave, and the bits that their coefficients cost."""
     before = np.concatenate([[0], values[:-1]])
     yield values, 0.0

@@ -10,16 +10,14 @@ temperatures, any number of rows.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Floats
 from devices.chips.mpl115a2 import COUNTS_MAX, PRESSURE_MAX_KPA, PRESSURE_MIN_KPA, Coefficients
 from devices.flags import TileFlag
 from devices.frames import NOT_READ, FrameBatch
 from service.estimation.calibration import CUBIC_TERMS, LOOP_HALF_WIDTH_FORCE_N
 from service.estimation.pipeline.grf_cop import HULL_SIGMAS
 from service.estimation.pipeline.plan import SIGNIFICANCE_SIGMAS, TARE_OLD_NS, EstimationPlan
-
-Floats = npt.NDArray[np.float64]
 
 
 def _column(values: object) -> Floats:

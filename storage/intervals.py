@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from devices.arrays import Bools
+
 NO_END = 2**62
 """Stand-in for the last number of an interval without an end."""
 
@@ -133,9 +135,7 @@ class Intervals:
             gaps._intervals.append((at, last))
         return gaps
 
-    def contains_ranges(
-        self, first: npt.NDArray[Any], count: npt.NDArray[Any]
-    ) -> npt.NDArray[np.bool_]:
+    def contains_ranges(self, first: npt.NDArray[Any], count: npt.NDArray[Any]) -> Bools:
         """Return a mask of the ranges that are in this set completely.
 
         Args:
@@ -145,7 +145,7 @@ class Intervals:
         begins, ends = np.array([(0, 0), *self._intervals], np.int64).T  # one before the first
         first = first.astype(np.int64)
         at = np.searchsorted(begins[1:], first, side="right")
-        found: npt.NDArray[np.bool_] = (at > 0) & (ends[at] >= first + count.astype(np.int64) - 1)
+        found: Bools = (at > 0) & (ends[at] >= first + count.astype(np.int64) - 1)
         return found
 
     def __or__(self, other: Intervals) -> Intervals:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Columns, Floats, Times
+from devices.arrays import Columns, Floats, Ints, Times
 
 OVERLAY_COLUMNS = ("grf_n", "cop_x_m", "cop_y_m")
 """Columns of estimates in the overlay."""
@@ -34,7 +34,7 @@ class CurveStatistics:
 
     mean: Floats
     sd: Floats
-    count: npt.NDArray[np.int64]
+    count: Ints
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,11 @@ class Overlay:
     """
 
     statistics: Mapping[str, CurveStatistics]
-    rows: npt.NDArray[np.int64]
+    rows: Ints
     curves: Mapping[str, Floats]
 
 
-def select_evenly(count: int, max_count: int) -> npt.NDArray[np.int64]:
+def select_evenly(count: int, max_count: int) -> Ints:
     """Return at most `max_count` of `count` indices: first, last, and evenly in between."""
     if count <= max_count:
         return np.arange(count)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Bools, Floats
+from devices.arrays import Bools, Floats, Times
 from devices.flags import EstimateFlag
 from service.estimation.records import SIGMAS_95
 
@@ -183,7 +183,7 @@ def compute_accuracy(columns: Mapping[str, npt.NDArray[Any]], *, lag_ms: float =
     )
 
 
-def classify_phases(t_ns: npt.NDArray[np.int64], true_grf_n: Floats) -> npt.NDArray[np.intp]:
+def classify_phases(t_ns: Times, true_grf_n: Floats) -> npt.NDArray[np.intp]:
     """Return every frame's index into `PHASES`, by the true force alone.
 
     Flight: the true force is exactly zero. Each interval between two flights is classified by its
@@ -210,7 +210,7 @@ def classify_phases(t_ns: npt.NDArray[np.int64], true_grf_n: Floats) -> npt.NDAr
 
 
 def _compute_published_error_n(
-    columns: Mapping[str, npt.NDArray[Any]], lag_ns: int, rows: npt.NDArray[np.bool_]
+    columns: Mapping[str, npt.NDArray[Any]], lag_ns: int, rows: Bools
 ) -> Floats:
     # From the first frame: float64 cannot represent nanoseconds since 1970.
     since_ns = (columns["t_ns"] - columns["t_ns"][0]).astype(np.float64)

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
-from devices.arrays import Floats
+from devices.arrays import Floats, Times
 
 REST_S = 4.0
 HOLD_S = 5.0
@@ -139,9 +138,7 @@ class Weighing:
             case _:
                 return f"All weights are done: unload {tile}"
 
-    def feed_tile_pressures(
-        self, t_ns: npt.NDArray[np.int64], tile_absolute_kpa: Floats
-    ) -> list[MarkerChange]:
+    def feed_tile_pressures(self, t_ns: Times, tile_absolute_kpa: Floats) -> list[MarkerChange]:
         """Feed readings of the tile; return the changes of markers, in order.
 
         Args:

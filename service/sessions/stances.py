@@ -17,6 +17,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from devices.arrays import Times
 from devices.errors import FileFormatError, FootTileError, StorageError, UnknownError
 from service.estimation.stance_curves import (
     OVERLAY_COLUMNS,
@@ -58,7 +59,7 @@ class StancesWriter:
     def try_add_frames(
         self,
         seq: npt.NDArray[np.uint64],
-        t_ns: npt.NDArray[np.int64],
+        t_ns: Times,
         columns: Mapping[str, npt.NDArray[Any]],
     ) -> None:
         """Add the next frames with their columns; without estimates there are no stances."""

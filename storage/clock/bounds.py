@@ -25,8 +25,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-Int64 = npt.NDArray[np.int64]
-Float64 = npt.NDArray[np.float64]
+from devices.arrays import Bools, Floats, Times
 
 CRYSTAL_RATE_LIMIT = 100e-6
 """Rate limit of two uncompensated crystals, each 50 ppm off at most over temperature and age."""
@@ -55,9 +54,9 @@ class OffsetRows:
         uncertainty_ns: bound of the offset's error, plus or minus.
     """
 
-    t_mono_ns: Int64
-    offset_ns: Int64
-    uncertainty_ns: Int64
+    t_mono_ns: Times
+    offset_ns: Times
+    uncertainty_ns: Times
 
     def __len__(self) -> int:
         return len(self.t_mono_ns)
@@ -76,7 +75,7 @@ class _Cones:
     """
 
     def __init__(
-        self, x: Float64, low: Float64, high: Float64, slowest: float, fastest: float
+        self, x: Floats, low: Floats, high: Floats, slowest: float, fastest: float
     ) -> None:
         self.slowest = slowest
         self.fastest = fastest
@@ -87,7 +86,7 @@ class _Cones:
         self._behind_high = np.concatenate((least((high - slowest * x)[::-1])[::-1], none))
         self._behind_low = np.concatenate((most((low - fastest * x)[::-1])[::-1], -none))
 
-    def bounds_at(self, x: Float64, rows_before: npt.NDArray[np.intp]) -> tuple[Float64, Float64]:
+    def bounds_at(self, x: Floats, rows_before: npt.NDArray[np.intp]) -> tuple[Floats, Floats]:
         """Return least and greatest offset at `x`, given the number of rows up to it."""
         high = np.minimum(
             self.fastest * x + self._ahead_high[rows_before],
@@ -142,7 +141,7 @@ class OffsetStretch:
             None if self.mean_rate_bounds == (-self._limit, self._limit) else self.mean_rate_bounds
         )
 
-    def offset_bounds_at(self, t_mono_ns: Int64) -> tuple[Int64, Int64]:
+    def offset_bounds_at(self, t_mono_ns: Times) -> tuple[Times, Times]:
         """Compute least and greatest offset in ns at any instants, also outside the rows."""
         low, high = self._cones.bounds_at(
             self._ns_since_begin(t_mono_ns),
@@ -153,12 +152,12 @@ class OffsetStretch:
             self._reference_ns + np.ceil(high).astype(np.int64),
         )
 
-    def _ns_since_begin(self, t_mono_ns: Int64) -> Float64:
+    def _ns_since_begin(self, t_mono_ns: Times) -> Floats:
         # Exact up to 104 days; beyond, a rate's 1e-4 of the rounding is still below 1 ns.
-        x: Float64 = (t_mono_ns - self._begin_ns).astype(np.float64)
+        x: Floats = (t_mono_ns - self._begin_ns).astype(np.float64)
         return x
 
-    def _fit(self, x: Float64, low: Float64, high: Float64, limit: float, wander: float) -> bool:
+    def _fit(self, x: Floats, low: Floats, high: Floats, limit: float, wander: float) -> bool:
         """Fit bounds of rate and offset; False if no rate within `wander` of its mean fits."""
         before = np.searchsorted(x, x, side="right")
         self.mean_rate_bounds = (-limit, limit)
@@ -183,16 +182,16 @@ class OffsetStretch:
 class BoundedOffset(NamedTuple):
     """Offset of a clock, within plus or minus a bound; (n,) each."""
 
-    offset_ns: Int64
-    bound_ns: Int64
+    offset_ns: Times
+    bound_ns: Times
 
 
 class OffsetRange(NamedTuple):
     """Bounds of the offset over n time ranges, (n,) each."""
 
-    least_ns: Int64
-    greatest_ns: Int64
-    is_certain: npt.NDArray[np.bool_]
+    least_ns: Times
+    greatest_ns: Times
+    is_certain: Bools
     """(n,); False where a step may lie in the range, which has no bound."""
 
 
@@ -212,7 +211,7 @@ class ClockOffsets:
         self._begins_ns = np.array([s.begin_t_mono_ns for s in self.stretches], dtype=np.int64)
         self._ends_ns = np.array([s.end_t_mono_ns for s in self.stretches], dtype=np.int64)
 
-    def offset_and_bound_at(self, t_mono_ns: Int64) -> BoundedOffset:
+    def offset_and_bound_at(self, t_mono_ns: Times) -> BoundedOffset:
         """Compute the offset and its bound at each instant; every instant independently.
 
         Between two stretches the instant of the step is unknown, and the bound covers both
@@ -238,7 +237,7 @@ class ClockOffsets:
         offset = (low >> 1) + (high >> 1) + (low & high & 1)  # the sum might not fit
         return BoundedOffset(offset, np.maximum(high - offset, offset - low))
 
-    def bound_offset_in_ranges(self, begins_t_mono_ns: Int64, ends_t_mono_ns: Int64) -> OffsetRange:
+    def bound_offset_in_ranges(self, begins_t_mono_ns: Times, ends_t_mono_ns: Times) -> OffsetRange:
         """Compute bounds of the offset over n time ranges.
 
         Args:
@@ -262,7 +261,7 @@ class ClockOffsets:
         )
 
 
-def _offset_intervals(rows: OffsetRows) -> tuple[Float64, Float64]:
+def _offset_intervals(rows: OffsetRows) -> tuple[Floats, Floats]:
     """Return lowest and highest offset at each row, relative to the first row's."""
     offset = _subtract_first(rows.offset_ns, rows.offset_ns[0])
     # The server read its clock at some instant of the round trip; the row is about the middle.
@@ -272,7 +271,7 @@ def _offset_intervals(rows: OffsetRows) -> tuple[Float64, Float64]:
     return offset - half, offset + half
 
 
-def _subtract_first(values: Int64, first: np.int64) -> Float64:
+def _subtract_first(values: Times, first: np.int64) -> Floats:
     """Return differences to `first`: exact, or, where they wrap in 64 bits, to a microsecond."""
     steps = values - first
     does_wrap = ((values ^ first) & (values ^ steps)) < 0

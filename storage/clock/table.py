@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
+from devices.arrays import Bools, Times
 from devices.errors import DamagedFileError, FileFormatError
 from devices.types import OFFSET_NS_END, T_MONO_NS_END, T_NS_END
-from storage.clock.bounds import ClockOffsets, Int64, OffsetRange, OffsetRows, OffsetStretch
+from storage.clock.bounds import ClockOffsets, OffsetRange, OffsetRows, OffsetStretch
 from storage.clock.log import ClockOffset
 from storage.parquet_hash import read_hashed_table, write_hashed_table
 from storage.schema import UNKNOWN_T_NS, Array
@@ -76,7 +76,7 @@ class ClockTable:
                 self._maps[stream.stream_id] = ClockOffsets(own)
 
     def compute_server_time_columns_or_unknown(
-        self, t_mono_ns: Int64, t_ns: Int64, part: Array | None
+        self, t_mono_ns: Times, t_ns: Times, part: Array | None
     ) -> dict[str, Array]:
         """Compute the server's time of frames and its bound, as two columns.
 
@@ -105,7 +105,7 @@ class ClockTable:
         return {"t_server_ns": t_server_ns, "t_server_uncertainty_ns": uncertainty_ns}
 
     def bound_offset_in_ranges(
-        self, begins_t_mono_ns: Int64, ends_t_mono_ns: Int64, part: int
+        self, begins_t_mono_ns: Times, ends_t_mono_ns: Times, part: int
     ) -> OffsetRange | None:
         """Compute bounds of `t_server_ns - t_ns` over n time ranges; None: never measured.
 
@@ -192,7 +192,7 @@ def _check_rows_in_range(rows: OffsetRows, stream_id: str, where: str) -> None:
             )
 
 
-def _mask_within(values: Int64, end: int) -> npt.NDArray[np.bool_]:
+def _mask_within(values: Times, end: int) -> Bools:
     return (values > -end) & (values < end)
 
 

@@ -26,7 +26,7 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
 
-from devices.arrays import Floats, Times
+from devices.arrays import Bools, Floats, Times
 from devices.errors import FileFormatError, UsageError
 from devices.input_files import read_bytes
 from storage.durable_files import write_atomically
@@ -157,7 +157,7 @@ def _parse(content: bytes, *, is_csv: bool) -> pa.Table:
 
 
 def _check(columns: dict[str, Any]) -> AngleTable:
-    def refuse(is_wrong: npt.NDArray[np.bool_], problem: str, expected: str) -> None:
+    def refuse(is_wrong: Bools, problem: str, expected: str) -> None:
         if is_wrong.any():
             row = int(np.argmax(is_wrong)) + 1
             raise FileFormatError(f"{problem} in row {row} of its numbers", expected=expected)

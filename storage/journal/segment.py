@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from devices.arrays import Bools
 from devices.errors import DamagedFileError, FileFormatError, StorageError
 from devices.types import SEQ_END
 from storage.durable_files import try_set_aside_and_describe, write_atomically
@@ -84,12 +85,12 @@ def is_record_intact(record: Any) -> bool:
     return is_checked and int(record["seq_first"]) < SEQ_END and int(record["offset"]) < _OFFSET_END
 
 
-def mask_intact_records(index: Records) -> npt.NDArray[np.bool_]:
+def mask_intact_records(index: Records) -> Bools:
     """Return a mask of the records that `is_record_intact` accepts."""
     content = memoryview(np.ascontiguousarray(index).tobytes())
     begins = range(0, len(content), RECORD_DTYPE.itemsize)
     checks = [zlib.crc32(content[at : at + _CHECKED_BYTES]) for at in begins]
-    found: npt.NDArray[np.bool_] = np.array(checks, np.uint32) == index["check"]
+    found: Bools = np.array(checks, np.uint32) == index["check"]
     return found & (index["seq_first"] < SEQ_END) & (index["offset"] < _OFFSET_END)
 
 

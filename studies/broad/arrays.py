@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Floats
+from devices.arrays import Bools, Floats
 from devices.chips.pressure_chips import Compensation
 from devices.emulation.parts import DomeProperties, make_rng
 from devices.emulation.world import DomeEffect, World
@@ -66,7 +66,7 @@ EFFECT_PERCENTILE = 95
 
 def evaluate_estimates(
     columns: Mapping[str, npt.NDArray[Any]],
-    find_unsaturated: Callable[[], npt.NDArray[np.bool_]],
+    find_unsaturated: Callable[[], Bools],
     lag_ms: float,
 ) -> CaseResult:
     """Compute errors, coverage and flag counts.
@@ -127,7 +127,7 @@ def _count_alarms(status: npt.NDArray[np.uint16]) -> int:
     )
 
 
-def find_unsaturated_tiles(recording: DrawRecording, world: World) -> npt.NDArray[np.bool_]:
+def find_unsaturated_tiles(recording: DrawRecording, world: World) -> Bools:
     """Return which tiles are surely within calibration and chip range, (n, tiles)."""
     t_ns = recording.frames.t_mono_ns
     chip_max_kpa = Compensation(recording.info.tiles).max_kpa

@@ -10,9 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import UsageError
-from devices.flags import EstimateFlag, TileFlag
+from devices.flags import CONTACT_UNKNOWN, EstimateFlag, TileFlag
 from devices.frames import NOT_READ, FrameBatch
-from service.estimation import CONTACT_UNKNOWN
 from service.estimation.estimate import Estimator
 from service.estimation.pipeline.plan import EstimationPlan
 from service.estimation.records import Estimates

@@ -6,9 +6,9 @@ import math
 from typing import Any, Generic, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
+from devices.arrays import Floats
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration
 from service.estimation.compilation import is_compiling
@@ -236,5 +236,5 @@ def make_tile_views(info: ArrayInfo, ranges: TileRanges | None) -> list[TileView
     ]
 
 
-def _nan_to_none(values: npt.NDArray[np.float64]) -> list[float | None]:
+def _nan_to_none(values: Floats) -> list[float | None]:
     return [value if math.isfinite(value) else None for value in values.tolist()]

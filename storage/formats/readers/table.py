@@ -7,13 +7,12 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
-from devices.arrays import Floats
+from devices.arrays import Floats, Ints
 from devices.errors import FileFormatError
 
-Column = npt.NDArray[np.float64] | npt.NDArray[np.int64]
+Column = Floats | Ints
 """(n,), float64 with NaN in empty cells; int64 for instants in nanoseconds."""
 ColumnFilter = Callable[[str], bool]
 """Predicate of column names; only columns for which it is true are read."""

@@ -28,7 +28,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.csv as pacsv
 
-from devices.arrays import Floats
+from devices.arrays import Bools, Floats
 from devices.errors import UsageError
 from storage.formats.export import Export
 from storage.formats.writers.format import (
@@ -163,9 +163,7 @@ def _compute_gapless_foot_loads(
     )
 
 
-def _fill_force_gaps(
-    time_s: Floats, force_n: Floats, known: npt.NDArray[np.bool_]
-) -> tuple[Floats, npt.NDArray[np.bool_]]:
+def _fill_force_gaps(time_s: Floats, force_n: Floats, known: Bools) -> tuple[Floats, Bools]:
     """Return forces without NaN, and the mask of the interpolated samples."""
     at = np.flatnonzero(known)
     after = np.searchsorted(at, np.arange(len(time_s)))

@@ -16,9 +16,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from devices.arrays import Floats, Times
+from devices.arrays import Bools, Floats, Ints, Times
 from devices.errors import UsageError
 from devices.flags import EstimateFlag
 from devices.frames import ArrayInfo
@@ -32,8 +31,6 @@ COINCIDENCE_PERIODS = 1e-3
 """Distance, in periods, up to which a sample has exactly a frame's values."""
 _NOMINAL_RATE_TOLERANCE = 0.01
 """Relative difference of the median rate up to which frames have the nominal rate."""
-
-Indices = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -51,10 +48,10 @@ class Resampling:
 
     rate_hz: float
     begin_ns: int
-    frame_before: Indices
-    frame_after: Indices
+    frame_before: Ints
+    frame_after: Ints
     fraction: Floats
-    has_frames: npt.NDArray[np.bool_]
+    has_frames: Bools
 
     def __len__(self) -> int:
         return len(self.frame_before)
@@ -250,7 +247,7 @@ class GroundReaction:
         )
 
     @property
-    def is_frame_unloaded(self) -> npt.NDArray[np.bool_]:
+    def is_frame_unloaded(self) -> Bools:
         """Mask (m,) of the frames known to be without contact."""
         return np.asarray(self.columns["contact"] == 0)
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from hypothesis import strategies as st
 
+from devices.arrays import Times
 from storage.clock.bounds import RATE_TOLERANCE, OffsetRows
 
-Int64 = npt.NDArray[np.int64]
 SECOND = 1_000_000_000
 HOUR = 3600 * SECOND
 BEGIN_NS = 77 * SECOND
@@ -25,7 +24,7 @@ class Clock:
     steps: tuple[tuple[int, int], ...] = ()
     """Instants after `BEGIN_NS`, and by how many ns."""
 
-    def at(self, t_mono_ns: Int64) -> Int64:
+    def at(self, t_mono_ns: Times) -> Times:
         x = (t_mono_ns - BEGIN_NS).astype(np.float64)
         knots = np.arange(len(self.rates_ppm) + 1) * 10.0 * SECOND
         rates = np.array(self.rates_ppm) * 1e-6
@@ -36,7 +35,7 @@ class Clock:
             offset += np.where(t_mono_ns - BEGIN_NS > after_ns, jump_ns, 0)
         return offset
 
-    def measured(self, t_mono_ns: Int64, seed: int, *, slow_ns: float = 3e6) -> OffsetRows:
+    def measured(self, t_mono_ns: Times, seed: int, *, slow_ns: float = 3e6) -> OffsetRows:
         """Best of eight probes at each instant: ways back take three times as long as ways there.
 
         The server is read when the probe arrives; the row is about the middle of the round trip.
@@ -54,7 +53,7 @@ class Clock:
         return OffsetRows(middle, server - middle, (came - sent + 1) // 2)
 
 
-def every(seconds: float, n: int) -> Int64:
+def every(seconds: float, n: int) -> Times:
     return BEGIN_NS + np.arange(n, dtype=np.int64) * round(seconds * SECOND)
 
 
@@ -62,7 +61,7 @@ def rows_of(*rows: tuple[int, int, int]) -> OffsetRows:
     return OffsetRows(*np.array(rows, dtype=np.int64).T.copy())
 
 
-def anywhere(rows: OffsetRows, seed: int, n: int = 500, beyond_ns: int = 0) -> Int64:
+def anywhere(rows: OffsetRows, seed: int, n: int = 500, beyond_ns: int = 0) -> Times:
     random = np.random.default_rng(seed + 1)
     begin, end = int(rows.t_mono_ns.min()), int(rows.t_mono_ns.max())
     drawn = random.integers(begin - beyond_ns, end + beyond_ns + 1, n)

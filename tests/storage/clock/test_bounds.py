@@ -11,6 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
+from devices.arrays import Times
 from devices.types import OFFSET_NS_END, T_MONO_NS_END
 from storage.clock.bounds import (
     CRYSTAL_RATE_LIMIT,
@@ -26,7 +27,6 @@ from tests.storage.clock.clocks import (
     RATES,
     SECOND,
     Clock,
-    Int64,
     anywhere,
     every,
     rows_of,
@@ -34,7 +34,7 @@ from tests.storage.clock.clocks import (
 )
 
 
-def assert_within(found: ClockOffsets, true: Clock, t_mono_ns: Int64) -> None:
+def assert_within(found: ClockOffsets, true: Clock, t_mono_ns: Times) -> None:
     """The true offset is within the bound at each of these instants."""
     offset, bound = found.offset_and_bound_at(t_mono_ns)
     assert (np.abs(offset - true.at(t_mono_ns)) <= bound).all()

@@ -10,13 +10,14 @@ import pyarrow as pa
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 
+from devices.flags import CONTACT_UNKNOWN
 from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, NOT_READ, ArrayInfo, FrameBatch
 from storage.clock.table import ClockTable
 from storage.formats.export import Export, FrameSource, make_one_pass_frame_source
 from storage.formats.markers import PlacedMarkers
 from storage.formats.slice import FormatOptions, Slice
 from storage.formats.writers.registry import get_format
-from storage.schema import CONTACT_UNKNOWN, Array
+from storage.schema import Array
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.frames import make_frames
 

@@ -16,9 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
+from devices.flags import CONTACT_UNKNOWN
 from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, NOT_READ, FrameBatch
 from storage.durable_files import remove_dead_process_temporaries
-from storage.schema import CONTACT_UNKNOWN
 from storage.sessions import reader
 from storage.sessions.reader import SealedFileReader
 from storage.sessions.writer import SealedFileWriter

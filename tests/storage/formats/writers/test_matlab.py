@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
+from devices.flags import CONTACT_UNKNOWN
 from devices.frames import NO_SERVO_COUNTS, NOT_READ
 from storage.formats.export import make_sealed_export
 from storage.formats.slice import NO_OPTIONS, Slice
 from storage.formats.writers import matlab
 from storage.formats.writers.matlab import MATLAB
-from storage.schema import CONTACT_UNKNOWN
 from storage.sessions import reader as reader_module
 from storage.sessions.reader import SealedFileReader
 from storage.sessions.writer import SealedFileWriter

@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from devices.chips.pressure_chips import Compensation
 from devices.errors import UsageError
-from devices.flags import TileFlag
+from devices.flags import CONTACT_UNKNOWN, TileFlag
 from devices.frames import NOT_READ
 from storage.clock.bounds import OffsetRows
 from storage.clock.table import ClockTable, StreamClockFacts
@@ -27,7 +27,7 @@ from storage.formats.export import make_one_pass_frame_source
 from storage.formats.markers import PLACEMENT_COLUMNS, PlacedMarkers, place_markers
 from storage.formats.slice import NO_OPTIONS, FormatOptions, Slice
 from storage.formats.writers.mcap_messages import make_ros2_name
-from storage.schema import CONTACT_UNKNOWN, Array
+from storage.schema import Array
 from storage.sessions.folder import Marker
 from tests.builders.arrays import make_array
 from tests.storage.formats.exports import NOTES, ROWS, cut, export, extra, frames
