@@ -296,7 +296,7 @@ def benchmark_command(
         raise typer.Exit(3)
 
 
-TRIALS_MAX, JOBS_MAX = 100, 64
+TRIALS_MAX, TRIAL_JOBS_MAX = 100, 64
 
 
 @require_extra("server", "`foottile reproduce`")
@@ -319,7 +319,9 @@ def reproduce_command(
     parts_seed: Annotated[int, typer.Option(min=0, max=SEED_MAX, help="Random seed of parts.")] = 0,
     jobs: Annotated[
         int | None,
-        typer.Option(min=1, max=JOBS_MAX, help="Parallel trials; default: one per core, up to 2."),
+        typer.Option(
+            min=1, max=TRIAL_JOBS_MAX, help="Parallel trials; default: one per core, up to 2."
+        ),
     ] = None,
     angle: Annotated[
         str,
