@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from service.offline.archive.locations import SessionLocation
     from service.offline.archive.tasks import SessionTask
 
-EXIT_INCOMPLETE = 3
-"""Exit code: finished, but some sessions failed."""
-
 
 @dataclass(frozen=True)
 class BatchOptions:

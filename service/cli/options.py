@@ -80,6 +80,10 @@ StartOption = Annotated[
 EndOption = Annotated[float | None, typer.Option(help="End, exclusive, in the same seconds.")]
 
 
+EXIT_INCOMPLETE = 3
+"""Exit code: finished, but something failed, is missing, or is not as it was required."""
+
+
 class _SafeConsole(Console):
     """Console that escapes control characters in texts and table cells."""
 
@@ -221,6 +225,14 @@ def remark(message: str) -> None:
     stderr.print(
         escape_control_chars(message), style="dim", highlight=False, markup=False, soft_wrap=True
     )
+
+
+def exit_incomplete_for(problems: Collection[str]) -> None:
+    """Print each problem on stderr, and exit with code 3 if there is one."""
+    for problem in problems:
+        remark(problem)
+    if problems:
+        raise typer.Exit(EXIT_INCOMPLETE)
 
 
 @dataclass(frozen=True)

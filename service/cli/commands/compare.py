@@ -14,20 +14,20 @@ import typer
 from devices.errors import UsageError, require_extra
 from service.cli.commands.sessions import find_sealed_file
 from service.cli.multi_session import (
-    EXIT_INCOMPLETE,
     BatchOptions,
     run_jobs_with_report,
 )
 from service.cli.options import (
+    EXIT_INCOMPLETE,
     DataOption,
     JsonOption,
     add_options,
     echo,
     echo_lines,
+    exit_incomplete_for,
     open_result_folder,
     parse_pair,
     print_json,
-    remark,
     show_progress,
 )
 from service.cli.reference_options import (
@@ -270,10 +270,7 @@ def compare_command(
     else:
         echo_lines(done.report_text)
         echo(f"{folder}: compare.json, compare.md, compare.png, series.parquet")
-    for line in done.missed_limits:
-        remark(f"limit missed: {line}")
-    if done.missed_limits:
-        raise typer.Exit(3)
+    exit_incomplete_for([f"limit missed: {line}" for line in done.missed_limits])
 
 
 def get_comparison_folder(source: Path, reference: Path) -> Path:

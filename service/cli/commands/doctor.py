@@ -18,6 +18,7 @@ from devices.scene.hardware_sections import EMULATED, ServoSection
 from devices.scene.scene_file import Scene, load_scene
 from devices.vitals import Vitals, VitalsWarnings, read_vitals
 from service.cli.options import (
+    EXIT_INCOMPLETE,
     BusOption,
     JsonOption,
     ServoOption,
@@ -90,7 +91,7 @@ def doctor_command(
     if not diagnosis.rates_hz:
         raise typer.Exit(1)
     if not diagnosis.is_rate_reached or (found is not None and not found.is_well):
-        raise typer.Exit(3)
+        raise typer.Exit(EXIT_INCOMPLETE)
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from devices.chips.pressure_chips import PRESSURE_CHIPS, get_chip
 from devices.errors import UsageError
-from service.cli.options import JsonOption, echo, print_json, stdout
+from service.cli.options import EXIT_INCOMPLETE, JsonOption, echo, print_json, stdout
 from service.estimation.domes import (
     PAPER_CHIP,
     SlowSaturationLoad,
@@ -96,7 +96,7 @@ def domes_command(
         if load_n is not None:
             echo(f"For {load_n:g} N: {_format_choice(selected, load_n, full_kpa)}")
     if load_n is not None and selected is None:
-        raise typer.Exit(3)
+        raise typer.Exit(EXIT_INCOMPLETE)
 
 
 _NOTES = """\

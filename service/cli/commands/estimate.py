@@ -11,12 +11,12 @@ import typer
 
 from devices.errors import UsageError, require_extra
 from service.cli.multi_session import (
-    EXIT_INCOMPLETE,
     BatchOptions,
     is_single_session,
     run_task,
 )
 from service.cli.options import (
+    EXIT_INCOMPLETE,
     EndOption,
     EstimatorOption,
     JsonOption,

@@ -18,6 +18,7 @@ import typer
 from devices.errors import StorageError, UsageError
 from devices.types import check_user_name
 from service.cli.options import (
+    EXIT_INCOMPLETE,
     BusOption,
     CaOption,
     ChipOption,
@@ -146,7 +147,7 @@ def node_command(
             "this node runs again"
         )
     if outcome.lost_frames or outcome.undelivered_frames or outcome.is_lossy:
-        raise typer.Exit(3)
+        raise typer.Exit(EXIT_INCOMPLETE)
 
 
 async def _run_node(options: NodeOptions, chosen_id: str | None) -> NodeOutcome:

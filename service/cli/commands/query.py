@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from devices.errors import UsageError, escape_control_chars
-from service.cli.multi_session import EXIT_INCOMPLETE
 from service.cli.options import (
+    EXIT_INCOMPLETE,
     JsonOption,
     echo,
     print_json,

@@ -13,12 +13,12 @@ from pydantic.fields import FieldInfo
 
 from devices.errors import UsageError, escape_control_chars
 from service.cli.multi_session import (
-    EXIT_INCOMPLETE,
     BatchOptions,
     is_single_session,
     run_task,
 )
 from service.cli.options import (
+    EXIT_INCOMPLETE,
     SESSION_REMEDY,
     CaOption,
     DataOption,
@@ -241,7 +241,7 @@ def pull_command(
             remark(f"resumed after {pulled['resumed_bytes']} bytes")
     if pulled["complete"] == "lossy":
         remark("the session is lossy: frames are lost")
-        raise typer.Exit(3)
+        raise typer.Exit(EXIT_INCOMPLETE)
 
 
 @add_format_options
@@ -288,7 +288,7 @@ def export_command(
     ] = False,
     options: FormatOptions,
 ) -> None:
-    """Write a sealed session, or a slice, in another format.
+    """Write a sealed session, or a slice of it, in another format.
 
     Each of many sessions is written into a folder of its id in --out; a repeated command resumes.
     Exit code 3: some sessions failed.

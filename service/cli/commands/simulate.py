@@ -11,6 +11,7 @@ from devices.errors import UsageError, require_extra
 from devices.scene.hardware_sections import AnySchedule, ScheduleName
 from devices.scene.scene_file import load_scene
 from service.cli.options import (
+    EXIT_INCOMPLETE,
     ChipOption,
     FootOptions,
     JsonOption,
@@ -122,7 +123,7 @@ def simulate_command(
         for name, file in plates.items():
             echo(f"{file}: the {name}; {make_injected_path(file)}: what was injected into it")
     if result.missed_slots:
-        raise typer.Exit(3)
+        raise typer.Exit(EXIT_INCOMPLETE)
 
 
 def _make_json(result: SimulationResult, path: Path) -> dict[str, object]:

@@ -20,6 +20,7 @@ from service.cli.options import (
     check_emulated,
     echo,
     echo_lines,
+    exit_incomplete_for,
     open_result_folder,
     print_json,
     remark,
@@ -100,13 +101,12 @@ def benchmark_broad(
     figures = {"broad.png": plot_broad(broad.results)}
     _write_and_print_result(folder, "broad", content, text, figures, as_json=as_json)
     refused = [(f"array {r.number}, {f.what}", f.why) for r in broad.results for f in r.refusals]
-    for what, why in [*refused, *((f.what, f.why) for f in broad.lost_arrays)]:
-        remark(f"no result: {what}: {why}")
+    lost = [*refused, *((f.what, f.why) for f in broad.lost_arrays)]
     missed = [goal for goal in goals if check_goals and not goal.is_met]
-    for goal in missed:
-        remark(f"goal not met: {goal.mode}: {goal.figure}: {goal.value:.3g}")
-    if refused or broad.lost_arrays or missed:
-        raise typer.Exit(3)
+    exit_incomplete_for(
+        [f"no result: {what}: {why}" for what, why in lost]
+        + [f"goal not met: {goal.mode}: {goal.figure}: {goal.value:.3g}" for goal in missed]
+    )
 
 
 def _write_and_print_result(
@@ -282,18 +282,15 @@ def benchmark_command(
         _write_and_print_result(
             folder, "benchmark", result.as_dict(), text, figures, as_json=as_json
         )
-    for name, failure in result.failures:
-        remark(f"not measured: {name}, {failure.what}: {failure.why}")
-    missed = [
-        (name, goal)
-        for name, goals in result.goals.items()
-        for goal in goals
-        if check_goals and not goal.is_met
-    ]
-    for name, goal in missed:
-        remark(f"goal not met: {name}, {goal.mode}: {goal.figure}: {goal.value:.3g}")
-    if result.failures or missed:
-        raise typer.Exit(3)
+    exit_incomplete_for(
+        [f"not measured: {name}, {each.what}: {each.why}" for name, each in result.failures]
+        + [
+            f"goal not met: {name}, {goal.mode}: {goal.figure}: {goal.value:.3g}"
+            for name, goals in result.goals.items()
+            for goal in goals
+            if check_goals and not goal.is_met
+        ]
+    )
 
 
 TRIALS_MAX, TRIAL_JOBS_MAX = 100, 64
@@ -360,7 +357,4 @@ def reproduce_command(
             result = run_reproduction(options, folder, report_step)
             text, figures = format_reproduction_report(result), draw_figures(result)
         _write_and_print_result(folder, "reproduce", result, text, figures, as_json=as_json)
-    for name, why in result.failures.items():
-        remark(f"not measured: {name}: {why}")
-    if result.failures:
-        raise typer.Exit(3)
+    exit_incomplete_for([f"not measured: {name}: {why}" for name, why in result.failures.items()])

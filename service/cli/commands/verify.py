@@ -9,12 +9,12 @@ import typer
 
 from devices.errors import UsageError
 from service.cli.multi_session import (
-    EXIT_INCOMPLETE,
     BatchOptions,
     is_single_session,
     run_task,
 )
 from service.cli.options import (
+    EXIT_INCOMPLETE,
     SESSION_REMEDY,
     JsonOption,
     add_options,
