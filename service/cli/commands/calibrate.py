@@ -21,6 +21,7 @@ from service.cli.options import (
     CaOption,
     JsonOption,
     add_options,
+    exit_incomplete_for,
     parse_pair,
     print_json,
     remark,
@@ -364,6 +365,33 @@ def calibrate_command(
     for_plate = table != TableOptions() or lag_range_s is not None
     if per_tile or shear or reference_gain_sigma or for_plate:
         raise UsageError("these options go with --reference", remedy="Add --reference FILE")
+    calibration = _fit_recordings(
+        recordings,
+        out,
+        plot,
+        name=name,
+        sensor=sensor,
+        reference_delay_ms=reference_delay_ms,
+        reference_delay_sigma_ms=reference_delay_sigma_ms,
+        as_json=as_json,
+    )
+    exit_incomplete_for(
+        [f"tile {serial} refused: {reason}" for serial, reason in calibration.refused.items()]
+    )
+
+
+def _fit_recordings(
+    recordings: list[Path],
+    out: Path,
+    plot: Path | None,
+    *,
+    name: str | None,
+    sensor: str,
+    reference_delay_ms: float | None,
+    reference_delay_sigma_ms: float,
+    as_json: bool,
+) -> Calibration:
+    """Fit the tiles of rig recordings, write and print the calibration."""
     from service.cli.calibration_report import make_calibration_json, make_calibration_tables
     from service.estimation.effects import Parameter
     from service.estimation.fitting.effects_fit import DEFAULT_REFERENCE_DELAY
@@ -412,10 +440,7 @@ def calibrate_command(
     else:
         for result in make_calibration_tables(calibration):
             stdout.print(result)
-    for serial, reason in calibration.refused.items():
-        remark(f"tile {serial} refused: {reason}")
-    if calibration.refused:
-        raise typer.Exit(3)
+    return calibration
 
 
 def _calibrate_mounted_foot(
