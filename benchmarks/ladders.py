@@ -34,11 +34,7 @@ from studies.benchmark.draws import (
     record_with_calibration,
     time_model_sets,
 )
-from studies.benchmark.figures import (
-    ModelSetFigures,
-    find_pareto_front,
-    summarize_model_sets,
-)
+from studies.benchmark.figures import ModelSetFigures, find_pareto_front, summarize_model_sets
 
 MARK = "<!-- tables -->"
 FRAMES = {"live": 1000, "offline": 8 * BATCH_FRAMES["offline"]}

@@ -47,14 +47,7 @@ from storage.formats.slice import Slice
 from storage.formats.writers.tables import ARROW
 from storage.parquet_hash import compute_sha256
 from storage.schema import ESTIMATE_COLUMNS, Array
-from storage.sessions.folder import (
-    FRAMES_NAME,
-    Ledger,
-    Part,
-    PartLedger,
-    Session,
-    SessionsFolder,
-)
+from storage.sessions.folder import FRAMES_NAME, Ledger, Part, PartLedger, Session, SessionsFolder
 from storage.sessions.reader import SealedFileReader
 from storage.sessions.writer import SealedFileWriter
 

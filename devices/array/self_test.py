@@ -16,13 +16,7 @@ from statistics import linear_regression, median
 from devices.array.schedules import ADDRESS_BITS, CONVERT_BITS, count_read_bits
 from devices.buses.i2c import I2cBus, i2c_msg
 from devices.buses.usb_adapters import find_adapter
-from devices.chips.pressure_chip import (
-    ChipDriver,
-    ChipSettings,
-    Counts,
-    PressureChip,
-    Registers,
-)
+from devices.chips.pressure_chip import ChipDriver, ChipSettings, Counts, PressureChip, Registers
 from devices.chips.pressure_chips import PRESSURE_CHIPS, get_chip
 from devices.chips.tca9548a import ADDRESSES, CHANNELS, MuxRouter, Tca9548a
 from devices.clock import Clock

@@ -17,13 +17,7 @@ from contextlib import suppress
 import numpy as np
 
 from devices.buses.i2c import I2cBus, i2c_msg
-from devices.chips.pressure_chip import (
-    ChipSettings,
-    Counts,
-    PressureChip,
-    PressureLaw,
-    Registers,
-)
+from devices.chips.pressure_chip import ChipSettings, Counts, PressureChip, PressureLaw, Registers
 from devices.errors import NoAcknowledgeError, TileSetupError, UsageError
 from devices.flags import TileFlag
 from devices.frames import NOT_READ

@@ -15,13 +15,7 @@ import numpy.typing as npt
 
 from devices.arrays import Floats
 from devices.buses.i2c import I2cBus, i2c_msg
-from devices.chips.pressure_chip import (
-    ChipSettings,
-    Counts,
-    PressureChip,
-    PressureLaw,
-    Registers,
-)
+from devices.chips.pressure_chip import ChipSettings, Counts, PressureChip, PressureLaw, Registers
 from devices.errors import TileSetupError, UsageError
 from devices.flags import TileFlag
 

@@ -30,12 +30,7 @@ from foottile.errors import ClientError, NotFoundError
 from service.protocol.codec import run_until_first_ends
 from service.protocol.live import LIVE_PATH
 from storage.clock.bounds import BoundedOffset, ClockOffsets, OffsetRows
-from storage.schema import (
-    SERVER_TIME_COLUMNS,
-    UNKNOWN_T_NS,
-    Array,
-    read_array_info,
-)
+from storage.schema import SERVER_TIME_COLUMNS, UNKNOWN_T_NS, Array, read_array_info
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -42,12 +42,7 @@ from service.estimation.pipeline.state import (
     compact_or_grow_buffer,
     make_frame_buffer,
 )
-from service.estimation.records import (
-    ColumnDict,
-    Estimates,
-    RecordArray,
-    view_records_as_bytes,
-)
+from service.estimation.records import ColumnDict, Estimates, RecordArray, view_records_as_bytes
 
 _COP_MASKED = int(EstimateFlag.COP_MASKED)
 _AFTER_SATURATION = int(EstimateFlag.AFTER_SATURATION)

@@ -36,11 +36,7 @@ from devices.scene.scene_file import Scene
 from service.offline.estimate_summary import EstimateSummarizer, EstimateSummary
 from service.rig.emulated_foot import EmulatedFoot
 from service.rig.rig import make_array_info, open_reference_sensor, open_scene_recovery
-from service.sessions.estimate_stream import (
-    EstimateOptions,
-    EstimateStream,
-    make_estimate_metadata,
-)
+from service.sessions.estimate_stream import EstimateOptions, EstimateStream, make_estimate_metadata
 from storage.sessions.writer import SealedFileWriter
 
 START_NS = 1_577_836_800_000_000_000

@@ -47,11 +47,7 @@ from service.sessions.lifecycle import (
 )
 from service.sessions.parts import NodeFacts, find_first_seq
 from service.sessions.sealing import write_sealed_files
-from storage.clock.table import (
-    ClockTable,
-    StreamClockFacts,
-    group_rows_by_stream_in_given_order,
-)
+from storage.clock.table import ClockTable, StreamClockFacts, group_rows_by_stream_in_given_order
 from storage.edges import read_edges
 from storage.intervals import NO_END, Intervals, to_open_pairs
 from storage.sessions.folder import IdempotencyRecord, Ledger, Marker, Part, Session

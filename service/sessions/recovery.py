@@ -33,12 +33,7 @@ from service.sessions.lifecycle import (
     compute_present_ledger,
     create_session,
 )
-from service.sessions.parts import (
-    FramesToCome,
-    NodeFacts,
-    SessionStream,
-    bound_lost_tail_frames,
-)
+from service.sessions.parts import FramesToCome, NodeFacts, SessionStream, bound_lost_tail_frames
 from service.sessions.sealing import rebuild_damaged_session_json, write_sealed_files
 from service.sessions.tares import TareHistory
 from storage.clock.log import ClockLog

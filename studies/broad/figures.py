@@ -18,13 +18,7 @@ from studies.benchmark.figures import (
     Quantiles,
 )
 from studies.broad.arrays import CLEAN, CONDITIONS, HEAVY, SCENES, SERIALS
-from studies.broad.results import (
-    ArrayResult,
-    CaseResult,
-    PhaseCounts,
-    TileResult,
-    make_case_key,
-)
+from studies.broad.results import ArrayResult, CaseResult, PhaseCounts, TileResult, make_case_key
 
 MIN_EFFECT_N = 0.1
 """Effect on the force above which a tile needs the model."""

@@ -15,11 +15,7 @@ import errno
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from devices.buses.serial_line import (
-    PORT_ERRORS,
-    SEND_TIMEOUT_ERROR,
-    SerialPort,
-)
+from devices.buses.serial_line import PORT_ERRORS, SEND_TIMEOUT_ERROR, SerialPort
 from devices.chips.dynamixel.protocol import (
     FIRMWARES,
     CountRange,

@@ -13,10 +13,7 @@ import typer
 
 from devices.errors import UsageError, require_extra
 from service.cli.commands.sessions import find_sealed_file
-from service.cli.multi_session import (
-    BatchOptions,
-    run_jobs_with_report,
-)
+from service.cli.multi_session import BatchOptions, run_jobs_with_report
 from service.cli.options import (
     EXIT_INCOMPLETE,
     DataOption,

@@ -10,11 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from devices.errors import UsageError, require_extra
-from service.cli.multi_session import (
-    BatchOptions,
-    is_single_session,
-    run_task,
-)
+from service.cli.multi_session import BatchOptions, is_single_session, run_task
 from service.cli.options import (
     EXIT_INCOMPLETE,
     EndOption,
@@ -109,10 +105,7 @@ def estimate_command(
     from service.offline.archive.tasks import EstimateTask
     from service.offline.estimate.session import estimate_session
     from service.offline.estimate.table_angle import check_film_of_session, read_angle_track
-    from service.offline.estimate_summary import (
-        compute_estimate_change,
-        read_stored_estimates,
-    )
+    from service.offline.estimate_summary import compute_estimate_change, read_stored_estimates
     from storage.formats.slice import Slice
     from studies.estimators import get_estimator
 

@@ -12,11 +12,7 @@ from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
 from devices.errors import UsageError, escape_control_chars
-from service.cli.multi_session import (
-    BatchOptions,
-    is_single_session,
-    run_task,
-)
+from service.cli.multi_session import BatchOptions, is_single_session, run_task
 from service.cli.options import (
     EXIT_INCOMPLETE,
     SESSION_REMEDY,

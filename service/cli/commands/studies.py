@@ -68,11 +68,7 @@ def benchmark_broad(
     """
     from service.offline.figure_output import create_figure
     from studies.broad.arrays import BroadOptions, run_broad_benchmark
-    from studies.broad.figures import (
-        compare_with_goals,
-        count_models,
-        summarize_cases,
-    )
+    from studies.broad.figures import compare_with_goals, count_models, summarize_cases
     from studies.broad.report import format_broad_report, plot_broad
     from studies.broad.results import Seeds
 

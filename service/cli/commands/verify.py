@@ -8,11 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from devices.errors import UsageError
-from service.cli.multi_session import (
-    BatchOptions,
-    is_single_session,
-    run_task,
-)
+from service.cli.multi_session import BatchOptions, is_single_session, run_task
 from service.cli.options import (
     EXIT_INCOMPLETE,
     SESSION_REMEDY,

@@ -26,11 +26,7 @@ from service.estimation.fitting.dome_model import (
     DomeModel,
     FittedEffects,
 )
-from service.estimation.fitting.output_error import (
-    CorrectionMisfits,
-    DomeFit,
-    OutputErrorProblem,
-)
+from service.estimation.fitting.output_error import CorrectionMisfits, DomeFit, OutputErrorProblem
 from service.estimation.fitting.rig.indentation import LoadingPoints
 from service.estimation.fitting.thermal_soak import list_parameters_at_bound
 from service.estimation.models.hysteresis import WIDTHS_N

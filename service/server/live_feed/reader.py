@@ -27,11 +27,7 @@ from service.estimation.compilation import is_compiling
 from service.estimation.pipeline.plan import compute_settling_time_s
 from service.protocol.codec import CloseConnection, LinkCloseCode
 from service.protocol.live import Policy
-from service.server.estimates.live_estimator import (
-    STATE_PERIOD_NS,
-    EstimateEpoch,
-    make_live_plan,
-)
+from service.server.estimates.live_estimator import STATE_PERIOD_NS, EstimateEpoch, make_live_plan
 from service.server.estimates.node_estimator import EstimatedBatch
 from service.server.live_feed.buffer import FeedBuffer, StreamView, wait_briefly_for_batch
 from service.server.live_feed.cursors import QUEUE_NS, LosslessCursor, LossyCursor, Recompute

@@ -20,12 +20,7 @@ from service.api.routes.common import (
     problem_responses,
     require_frames,
 )
-from service.api.routes.exports import (
-    Chunks,
-    TakeDataQuery,
-    make_file_stem,
-    respond_with_export,
-)
+from service.api.routes.exports import Chunks, TakeDataQuery, make_file_stem, respond_with_export
 from service.api.routes.recordings import sessions as one
 from service.protocol.live import SessionView, View
 from service.server.broadcast.views import make_session_view
