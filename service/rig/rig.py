@@ -187,10 +187,6 @@ class ReferenceForceSensor:
     """
 
     def __init__(self, adc: Mcp3208, scene: ReferenceSection) -> None:
-        self.failed_readings = 0
-        """Number of failed readings: no transfer, or no converter."""
-        self.saturated_readings = 0
-        """Number of readings at either end of the converter's range, which are no force."""
         self.warning = ""
         """Reason why the last reading gave no force; empty if it gave one."""
         self._adc = adc
@@ -208,11 +204,9 @@ class ReferenceForceSensor:
         try:
             counts = self._adc.read_counts(self._channel)
         except SpiError as error:
-            self.failed_readings += 1
             self.warning = f"no reference force: {error}"
             return math.nan
         if counts in (0, COUNTS_MAX):
-            self.saturated_readings += 1
             self.warning = "no reference force: the amplifier is off, unplugged or overloaded"
             return math.nan
         self.warning = ""

@@ -42,7 +42,7 @@ class Dead:
 def test_a_force_is_read_within_half_a_count(force_n: float) -> None:
     sensor = reference(connected(make_amplifier(lambda t_ns: force_n, SCENE)))
     assert sensor.read_force_n() == pytest.approx(force_n, abs=0.5 * 100 / 4096 + 1e-9)
-    assert (sensor.failed_readings, sensor.saturated_readings) == (0, 0)
+    assert sensor.warning == ""
 
 
 def test_a_scale_may_be_negative_and_a_reference_voltage_another() -> None:
@@ -59,7 +59,6 @@ def test_an_amplifier_at_a_rail_gives_no_force_and_a_warning_until_it_is_repaire
     at_input = [volts]
     sensor = reference(connected(lambda channel, t_ns: at_input[0]))
     assert math.isnan(sensor.read_force_n())
-    assert (sensor.failed_readings, sensor.saturated_readings) == (0, 1)
     assert "amplifier" in sensor.warning
     at_input[0] = 1.65
     assert sensor.read_force_n() == pytest.approx(0.0, abs=0.02)
@@ -78,13 +77,12 @@ def unplugged(data: list[int]) -> list[int]:
 
 
 @pytest.mark.parametrize("exchange", [unplugged, lambda data: [0xFF] * len(data)])
-def test_a_failed_reading_is_counted_and_is_no_force(
+def test_a_failed_reading_is_no_force_and_a_warning(
     exchange: Callable[[list[int]], list[int]],
 ) -> None:
     sensor = reference(Dead(exchange))
     assert math.isnan(sensor.read_force_n())
     assert math.isnan(sensor.read_force_n())
-    assert (sensor.failed_readings, sensor.saturated_readings) == (2, 0)
     assert sensor.warning.startswith("no reference force: rig, channel 3: ")
 
 
@@ -139,4 +137,4 @@ def test_a_force_beyond_the_range_of_the_converter_is_unknown(
     assert sensor.read_force_n() == pytest.approx(15.0, abs=0.2)
     clock.sleep_until_ns(world.epoch_ns + 1_300_000_000 + 3_000_000_000)
     assert np.isnan(sensor.read_force_n())
-    assert sensor.saturated_readings == 1
+    assert "amplifier" in sensor.warning
