@@ -9,11 +9,40 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any, NamedTuple
 
+import numpy as np
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
+
+from service.bridges.follower import LiveFrames
+from storage.schema import map_flat_columns
+from tests.builders.arrays import make_array
+from tests.waiting import PATIENCE_S
+
+
+def make_live_frames(
+    t_server_ns: np.ndarray, node: str, *, tiles: int = 2, seq_first: int = 0
+) -> LiveFrames:
+    """Frames in which every value differs, and every second row has unknown forces."""
+    info = make_array(tiles, node=node)
+    n = len(t_server_ns)
+    columns = {
+        name: np.arange(n) + number
+        for number, name in enumerate(map_flat_columns(tiles))
+        if name.startswith(
+            ("seq", "tile_flags", "frame_flags", "estimate_flags", "t_mono_ns", "t_ns")
+        )
+    }
+    for number, (name, column) in enumerate(map_flat_columns(tiles).items()):
+        if name not in columns:
+            columns[name] = np.where(np.arange(n) % 2, np.nan, 100.0 + number)
+            if column.name == "contact":
+                columns[name] = np.where(np.arange(n) % 2, 255, 1)
+    columns["seq"] = columns["seq"] + seq_first
+    columns |= {"t_server_ns": t_server_ns, "t_server_uncertainty_ns": np.full(n, 300)}
+    return LiveFrames(node, info.stream_id, info, columns, True)
 
 
 class Seen(NamedTuple):
@@ -49,7 +78,7 @@ class Viewer:
     def close(self) -> None:
         self._stack.close()
 
-    def receive(self, timeout_s: float = 60.0) -> Seen:
+    def receive(self, timeout_s: float = PATIENCE_S) -> Seen:
         """The next message of any topic."""
         while True:
             message = self._socket.recv(timeout=timeout_s)
@@ -61,6 +90,14 @@ class Viewer:
             content = json.loads(message)
             if content["op"] == "advertise":
                 self._subscribe(content["channels"])
+
+    def receive_next(self, timeout_s: float) -> bool:
+        """Whether a message of any topic comes within this time."""
+        try:
+            self.receive(timeout_s)
+        except TimeoutError:
+            return False
+        return True
 
     def receive_of(self, topic: str, is_wanted: Callable[[Any], bool] = bool) -> Seen:
         """The next message of a topic that is wanted."""

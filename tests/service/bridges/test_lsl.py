@@ -10,10 +10,10 @@ import pytest
 
 import foottile as client
 from devices.flags import EstimateFlag
-from service.bridges.follower import Event, LiveClock, LiveFrames, Reporter
+from service.bridges.follower import Event, LiveClock, Reporter
 from service.bridges.lsl import TIME_BOUND, LslOutlet, limit_to_this_machine
 from storage.schema import UNKNOWN_T_NS, map_flat_columns
-from tests.builders.arrays import make_array
+from tests.service.bridges.readers import make_live_frames
 from tests.service.fake_node import FakeNode, Play
 from tests.service.process import Process, Start
 from tests.service.running import Running
@@ -33,24 +33,6 @@ def pull(inlet: pylsl.StreamInlet, n: int) -> tuple[np.ndarray, np.ndarray]:
     """So many samples, and their instants by the clock of the inlet's machine."""
     rows, at_s = zip(*(inlet.pull_sample(timeout=PATIENCE_S) for _ in range(n)), strict=True)
     return np.array(rows), np.array(at_s) + inlet.time_correction(timeout=PATIENCE_S)
-
-
-def make_live_frames(t_server_ns: np.ndarray, node: str) -> LiveFrames:
-    """Frames of two tiles: every value differs, and every second row has unknown forces."""
-    info = make_array(2, node=node)
-    n = len(t_server_ns)
-    columns = {
-        name: np.arange(n) + number
-        for number, name in enumerate(map_flat_columns(2))
-        if name.startswith(("seq", "tile_flags", "frame_flags", "estimate_flags", "t_mono_ns"))
-    }
-    for number, (name, column) in enumerate(map_flat_columns(2).items()):
-        if name not in columns:
-            columns[name] = np.where(np.arange(n) % 2, np.nan, 100.0 + number)
-            if column.name == "contact":
-                columns[name] = np.where(np.arange(n) % 2, 255, 1)
-    columns |= {"t_server_ns": t_server_ns, "t_server_uncertainty_ns": np.full(n, 300)}
-    return LiveFrames(node, info.stream_id, info, columns, True)
 
 
 def test_samples_have_all_values_with_units_and_their_instant_within_the_stated_bound() -> None:
