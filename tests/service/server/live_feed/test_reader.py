@@ -170,20 +170,29 @@ def test_estimates_of_a_stream_that_has_ended_are_the_bits_of_live(world: World)
     assert compared > 390
 
 
-CUT, BACK, END = 17_000, 18_500, 20_000
+STATE, CUT, BACK, END = 4000, 5000, 5600, 6200
+"""Numbers of the frames: of the only stored state, of the cut, of the link's return, of the end."""
+NOISE = np.random.default_rng(3).normal(0.0, 1.0, (20_000, 2))
 
 
 def walk_with_a_lost_baseline(seq: Ints) -> Ints:
     """Counts of a foot that steps once a second and whose first tile is pressed sideways early."""
     load = np.maximum(0.0, 25 * np.sin(2 * np.pi * seq / 500))
     pressed = np.where((seq > 1000) & (seq < 1600), 20, 0)
-    noise = np.random.default_rng(3).normal(0.0, 1.0, (END, 2))[seq]
-    return np.rint(500 - np.stack([load - pressed, 0.8 * load], 1) + noise).astype(np.int64)
+    load_n = np.stack([load - pressed, 0.8 * load], 1)
+    return np.rint(500 - load_n + NOISE[seq]).astype(np.int64)
+
+
+def store_states_every(frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have a state stored every so many frames instead of every 30 s."""
+    for module in (live_estimator, reader_module):
+        monkeypatch.setattr(module, "STATE_PERIOD_NS", frames * PERIOD_NS)
 
 
 @pytest.fixture
-def cut(tmp_path: Path) -> Iterator[World]:
-    """A world whose link was cut for three seconds after half a minute; the backlog is to come."""
+def cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
+    """A world whose link was cut for a second after ten seconds; the backlog is to come."""
+    store_states_every(STATE, monkeypatch)
     world = World(tmp_path, models=("static", "denoise"))
     world.present.counts = walk_with_a_lost_baseline
     for _ in range(CUT // 100):
@@ -233,7 +242,7 @@ def test_late_frames_go_on_from_the_state_before_them_and_are_estimated_once(
         cut.send_newest(20)
         cut.send(begin, begin + 19)
         items += all_of(cut, reader)
-    assert len(fed) <= 2 * (END - CUT) + (CUT - 15_000)
+    assert len(fed) <= 2 * (END - CUT) + (CUT - STATE)
     whole, found = in_one_run(cut), estimates_of(items)
     assert [seq for seq in range(CUT, BACK - WAITING) if found[seq] != whole[seq]] == []
 
@@ -243,8 +252,8 @@ def test_frames_of_live_are_as_they_were_also_behind_a_gap_that_was_filled(cut: 
         cut.send_newest(100)
     cut.send(CUT, BACK - 1)
     cut.forget()
-    live = [*range(14_000, CUT - WAITING), *range(BACK, END - 100)]
-    for first in (14_000, 16_000, BACK + 200):
+    live = [*range(STATE - 500, CUT - WAITING), *range(BACK, END - 100)]
+    for first in (STATE - 500, STATE + 500, BACK + 200):
         found = estimates_of(all_of(cut, cut.reader("lossless", Position(FIRST, first))))
         numbers = [seq for seq in live if seq >= first]
         assert [seq for seq in numbers if found[seq] != cut.published[FIRST, seq]] == []
@@ -263,9 +272,8 @@ def test_a_replay_from_before_the_oldest_state_has_the_bits_of_live_behind_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(live_estimator, "_STATES_MAX", 2)
-    for module in (live_estimator, reader_module):
-        monkeypatch.setattr(module, "STATE_PERIOD_NS", 2000 * PERIOD_NS)
-    world = walking(World(tmp_path, models=("static", "denoise")), 16_000)
+    store_states_every(1500, monkeypatch)
+    world = walking(World(tmp_path, models=("static", "denoise")), 9000)
     oldest = min(e.seq for e in world.node.estimator.live.epochs.list_epochs() if e.state)
     found = estimates_of(all_of(world, world.reader("lossless", Position(FIRST, oldest - 500))))
     differ = [seq for seq, each in found.items() if each != world.published[FIRST, seq]]
@@ -275,27 +283,30 @@ def test_a_replay_from_before_the_oldest_state_has_the_bits_of_live_behind_it(
 
 
 def test_frames_of_a_calibration_that_was_removed_are_replayed_with_it(tmp_path: Path) -> None:
-    world = walking(World(tmp_path), 8000)
+    world = walking(World(tmp_path), 3000)
     world.calibration = None
     world.connect()
     walking(world, 200)
-    found = estimates_of(all_of(world, world.reader("lossless", Position(FIRST, 6000))))
-    numbers = range(6000, 8000 - WAITING)
+    found = estimates_of(all_of(world, world.reader("lossless", Position(FIRST, 1000))))
+    numbers = range(1000, 3000 - WAITING)
     differ = [seq for seq in numbers if found[seq] != world.published[FIRST, seq]]
     world.close()
     assert differ == []
 
 
-def test_tares_of_ended_streams_outlive_their_states(tmp_path: Path) -> None:
-    world = walking(World(tmp_path), 16_000)
+def test_tares_of_ended_streams_outlive_their_states(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store_states_every(1000, monkeypatch)
+    world = walking(World(tmp_path), 2000)
     world.tare((world.node.last_t_ns or 0) - 50 * PERIOD_NS, counts=-5)
-    walking(world, 1000)
+    walking(world, 500)
     for _ in range(2):
         world.reboot()
         walking(world, 100)
     items = all_of(world, world.reader("lossless", Position(FIRST, 0)))
     found = estimates_of([item for item in items if item.stream_id == FIRST])
-    numbers = range(17_000 - WAITING)
+    numbers = range(2500 - WAITING)
     differ = [seq for seq in numbers if found[seq] != world.published[FIRST, seq]]
     epochs = world.node.estimator.epochs_since_server_start(FIRST)
     world.close()
@@ -304,7 +315,7 @@ def test_tares_of_ended_streams_outlive_their_states(tmp_path: Path) -> None:
 
 
 def test_a_reader_that_is_served_from_the_buffer_again_holds_no_journal_open(world: World) -> None:
-    walking(world, 10_000)
+    walking(world, 3000)
     before = count_open_journals()
     reader = world.reader("lossless", Position(FIRST, 0))
     assert isinstance(world.read(reader), FrameRows)
