@@ -74,6 +74,7 @@ def is_of_this_run(item: pytest.Item) -> bool:
 
 @pytest.hookimpl(tryfirst=True)  # a worker's own loop ends the call
 def pytest_runtestloop() -> None:
+    gc.freeze()  # what collection made stays, and each search of everything took 0.4 s
     gc.enable()
 
 

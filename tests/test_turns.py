@@ -46,8 +46,9 @@ def test_tests_of_the_same_parameters_are_played_together(monkeypatch: pytest.Mo
         assert first == second
 
 
-def test_the_search_for_garbage_is_on_while_tests_run() -> None:
+def test_the_search_for_garbage_is_on_while_tests_run_and_leaves_out_what_collection_made() -> None:
     assert gc.isenabled()
+    assert gc.get_freeze_count()
 
 
 def _play(
