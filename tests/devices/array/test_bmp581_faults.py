@@ -207,7 +207,10 @@ def test_another_part_in_a_tiles_place_is_named() -> None:
     rig.scan(20)
     with rig.world.inject_fault("replaced", "T02"):
         rig.scan(5)
-    rig.scan(1500)
+    for _ in range(30):  # 3 s
+        if rig.array.replaced_serials:
+            break
+        rig.scan(50)
     assert rig.array.replaced_serials == ("T02",)
     assert "another part answers" in rig.array.get_warnings()["T02"]
 
@@ -258,7 +261,8 @@ def test_tiles_of_two_kinds_that_are_swapped_while_running_are_flagged(
     assert all(frame[0] & frame[1] & TileFlag.NO_ANSWER for frame in flags[1:])
     assert not any(any(frame[2:]) for frame in flags[1:])
     swap_plugs(rig.world, 0, 1)
-    assert rig.scan(1500)[-1] == [0, 0, 0, 0]
+    assert any(rig.scan(50)[-1] == [0, 0, 0, 0] for _ in range(30))
+    assert rig.scan(20) == [[0, 0, 0, 0]] * 20
 
 
 def test_a_silent_kind_of_chip_does_not_keep_the_other_from_converting() -> None:
@@ -280,4 +284,4 @@ def test_a_part_that_is_silent_for_seconds_comes_back(settings: dict[str, Any]) 
         until_ns = rig.clock.now_ns() + 3_000_000_000
         while rig.clock.now_ns() < until_ns:
             assert rig.scan(2)[-1][0] & TileFlag.NO_ANSWER
-    assert not any(rig.scan(600)[-1])
+    assert any(not any(rig.scan(20)[-1]) for _ in range(30))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from functools import cache
 
 import numpy as np
 import pytest
@@ -232,11 +233,17 @@ def apart(signal: ForceSignal, at_s: float, by_s: float) -> ForceSignal:
     return ForceSignal(signal.t_s + by_s * (signal.t_s >= at_s), signal.force_n)
 
 
+@cache
+def clean_walk() -> tuple[ForceSignal, ForceSignal, Alignment]:
+    """Return a walk of both sides, and its alignment."""
+    ours, reference = walk(4, 12.0, lag_s=0.5)
+    return ours, reference, align_signals(ours, reference)
+
+
 @pytest.mark.parametrize("by_s", [3.0, 86_400.0, 1e9])
 @pytest.mark.parametrize("at", ["first", "last", "middle"])
 def test_a_wrong_stamp_or_a_long_pause_costs_no_memory_and_no_truth(at: str, by_s: float) -> None:
-    ours, reference = walk(4, 12.0, lag_s=0.5)
-    clean = align_signals(ours, reference)
+    ours, reference, clean = clean_walk()
     if at == "middle":  # both have paused, and nobody presses meanwhile
         ours, reference = apart(ours, 6.1, by_s), apart(reference, 6.6, by_s)
     else:
