@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import math
-import struct
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -123,16 +121,8 @@ def test_each_step_of_the_handshake_is_needed_once(healthy: FakeNode, odd: FakeN
 @pytest.mark.parametrize(
     ("place", "value"),
     [
-        (("stored",), [[-1, 5]]),
-        (("stored",), [[0]]),
-        (("lost",), {"Evicted!": [[0, 1]]}),
-        (("earlier",), [{}]),
-        (("protocol",), "one"),
         (("surprise",), 1),
-        (("calibration",), {"version": 1}),
-        (("scene",), []),
         (("array_info", "tiles"), ()),
-        (("array_info", "tiles", 0, "x_m"), math.inf),
         *[
             (("array_info", "stream_id"), stream_id)
             for stream_id in ("../x", "", "0" * 31, "G" * 32, "0" * 32 + "/..")
@@ -221,21 +211,8 @@ def reverse(node: FakeNode, payload: bytes) -> bytes:
 
 @pytest.mark.parametrize(
     "spoil",
-    [
-        lambda _, payload: b"",
-        lambda _, payload: b"\0",
-        lambda _, payload: payload[: len(payload) // 2],
-        lambda _, payload: payload[:-1],
-        lambda _, payload: payload[8:],
-        lambda _, payload: np.random.default_rng(3).bytes(len(payload)),
-        lambda _, payload: b"\xff" * 4 + np.random.default_rng(4).bytes(len(payload)),
-        reverse,
-        lambda _, payload: payload[:4] + struct.pack("<i", 2**31 - 1) + payload[8:],
-    ],
-    ids=[
-        *("empty", "one byte", "half", "all but one byte", "without a head", "random", "marked"),
-        *("in another order", "of 2 GiB by its head"),
-    ],
+    [lambda _, payload: payload[: len(payload) // 2], reverse],
+    ids=["half", "in another order"],
 )
 def test_a_damaged_batch_is_refused_and_asked_for_again(
     healthy: FakeNode, odd: FakeNode, spoil: Callable[[FakeNode, bytes], bytes]
