@@ -12,6 +12,7 @@ import shlex
 import shutil
 import subprocess
 from collections.abc import Iterator
+from functools import cache
 from importlib.util import module_from_spec, spec_from_file_location
 from itertools import pairwise
 from pathlib import Path
@@ -186,6 +187,7 @@ def test_the_calibration_file_is_described() -> None:
         assert f"`{name}" in FORMATS
 
 
+@cache
 def openapi() -> dict[str, Any]:
     with TemporaryDirectory() as folder:
         server = Server(Path(folder))
