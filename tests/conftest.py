@@ -21,6 +21,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell's background jobs ignore SIGINT; processes of the tests must not inherit that.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+TESTS = Path(__file__).parent
 TURN = os.environ.get("FOOTTILE_TURN")
 """Number of the run, of which the part in turn follows; None: all tests are run."""
 PARTS = 4
@@ -85,6 +86,8 @@ def pytest_report_header() -> str | None:
 @pytest.hookimpl(tryfirst=True)  # before -m chooses by these marks
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     plays_all = config.getoption("--soak")
+    # First those of packages and extras: their processes take longest, and would end alone.
+    items.sort(key=lambda item: item.path.parent != TESTS)
     for item in items:
         is_slow = item.get_closest_marker("slow") or item.get_closest_marker("in_turn")
         if is_slow and (plays_all or not is_of_this_run(item)):
