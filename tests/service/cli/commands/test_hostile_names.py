@@ -11,15 +11,11 @@ from pathlib import Path
 import pytest
 
 from service.cli.main import SUMMARIES
-from storage.journal.journal import Journal
-from storage.journal.stream_notes import StreamNotes
-from storage.sessions.folder import Marker, Part, Session, SessionsFolder
-from tests.builders.arrays import UTC_NS, make_array
-from tests.builders.frames import make_frames
+from storage.sessions.folder import Marker
+from tests.builders.arrays import UTC_NS
 from tests.service.cli.outcome import Run
+from tests.service.sessions.crashed import ID, info_of, session, stream
 
-ID = "20200101T000000Z-00000a"
-BOOT = "a" * 32
 FORGED = "FORGED: everything is whole"
 HOSTILE = (
     f"walk\n{FORGED}\r\n{FORGED}\x1b[2J\x1b]0;title\x07\x9b31m\u202egnp\u200b\ufeff\u2028{FORGED}"
@@ -29,20 +25,11 @@ HOSTILE = (
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
     """A folder whose session has a hostile text wherever a text can be."""
-    root, info = tmp_path / "data", make_array(stream_id=BOOT)
-    folder = root / "journal" / "bench" / BOOT
-    journal = Journal(folder, info)
-    journal.append_new_frames(make_frames(100, tile_flags=7))
-    journal.close()
-    StreamNotes(array_info=info, next_seq=100).save(folder)
-    kept = Session(
-        id=ID,
+    root = tmp_path / "data"
+    stream(root, info_of(), (0, 99), next_seq=100)
+    session(
+        root,
         name=HOSTILE,
-        node="bench",
-        state="recording",
-        started_t_ns=UTC_NS,
-        parts=(Part(stream_id=BOOT, seq_first=0),),
-        scene="test",
         subject=HOSTILE,
         notes=HOSTILE,
         tags=(HOSTILE,),
@@ -50,7 +37,6 @@ def data(tmp_path: Path) -> Path:
         take="20200101T000000Z-00000b",
         problem=HOSTILE,
     )
-    SessionsFolder(root / "sessions").save_session_json(kept)
     return root
 
 

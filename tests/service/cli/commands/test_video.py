@@ -11,25 +11,18 @@ from pathlib import Path
 import pytest
 
 from storage.durable_files import remove_dead_process_temporaries
-from storage.journal.journal import Journal
-from storage.journal.stream_notes import StreamNotes
-from tests.builders.arrays import make_array
-from tests.builders.frames import make_frames
 from tests.service.cli.commands.test_any_value import PLACES
-from tests.service.cli.commands.test_verify import BOOT, ID, begun
 from tests.service.cli.outcome import Run
+from tests.service.sessions.crashed import ID, info_of, session, stream
 from tests.service.video.short_film import PICTURES, short_film
 
 
 @pytest.fixture
 def folder(run: Run, tmp_path: Path) -> Path:
     """The folder of a sealed session, in the data folder `data`."""
-    root, info = tmp_path / "data", make_array(stream_id=BOOT)
-    journal = Journal(root / "journal" / "bench" / BOOT, info)
-    journal.append_new_frames(make_frames(100))
-    journal.close()
-    StreamNotes(array_info=info, next_seq=100).save(root / "journal" / "bench" / BOOT)
-    begun(root)
+    root = tmp_path / "data"
+    stream(root, info_of(), (0, 99), next_seq=100)
+    session(root)
     run("recover", root).succeeds()
     return root / "sessions" / ID
 
