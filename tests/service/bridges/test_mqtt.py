@@ -13,6 +13,7 @@ from collections.abc import Iterator
 import pytest
 
 from devices.errors import UsageError
+from service.bridges import mqtt
 from service.bridges.follower import Event, LiveClock, Reporter
 from service.bridges.mqtt import MqttOutlet
 from tests.service.bridges.broker import RunningBroker
@@ -169,7 +170,10 @@ async def test_an_event_waits_for_the_next_connection_until_it_is_acknowledged()
 
 
 @in_a_loop
-async def test_it_ends_although_the_broker_hangs() -> None:
+async def test_it_ends_although_the_broker_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert mqtt._FAREWELL_S <= 5.0
+    monkeypatch.setattr(mqtt, "_FAREWELL_S", 0.5)
+
     def accept_and_hang(connection: socket.socket, ended: threading.Event) -> None:
         connection.recv(1 << 16)
         connection.sendall(b"\x20\x02\x00\x00")

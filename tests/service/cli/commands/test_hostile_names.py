@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from service.cli.commands import find
 from service.cli.main import SUMMARIES
 from storage.sessions.folder import Marker
 from tests.builders.arrays import UTC_NS
@@ -93,8 +94,9 @@ def test_every_command_is_tried() -> None:
 @pytest.mark.parametrize("is_sealed", [False, True])
 @pytest.mark.parametrize("command", COMMANDS)
 def test_no_name_controls_a_terminal_or_makes_a_line(
-    run: Run, data: Path, command: str, is_sealed: bool
+    run: Run, data: Path, command: str, is_sealed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(find, "_SEARCH_S", 0.05)
     if is_sealed:
         run("recover", data)
     for arguments in COMMANDS[command]:
