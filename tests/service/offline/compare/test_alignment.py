@@ -234,7 +234,7 @@ def apart(signal: ForceSignal, at_s: float, by_s: float) -> ForceSignal:
 
 
 @cache
-def clean_walk() -> tuple[ForceSignal, ForceSignal, Alignment]:
+def clean_walk() -> tuple[ForceSignal, ForceSignal, ReferenceAlignment]:
     """Return a walk of both sides, and its alignment."""
     ours, reference = walk(4, 12.0, lag_s=0.5)
     return ours, reference, align_signals(ours, reference)
