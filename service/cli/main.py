@@ -96,7 +96,7 @@ def get_command_function(name: str) -> Callable[..., None]:
 
 
 def load_command(name: str) -> Any:
-    """Return a command with its options, or a group of them, as typer runs it."""
+    """Return a command with its options, or a group of commands, as typer runs it."""
     from service.cli.options import require_finite_numbers
 
     app = typer.Typer(

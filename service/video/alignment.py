@@ -106,7 +106,7 @@ _SAME_S = 0.05
 _INTERVALS_MIN = 1
 """Intervals that have to agree before touchdowns outside the session count as possible."""
 _FIRST_TOUCHDOWNS = 12
-"""Touchdowns with which matches are tried: the first ones, of which some may be wrong."""
+"""Touchdowns with which matches are tried: the first ones; some may be wrong."""
 
 
 class Instants(NamedTuple):

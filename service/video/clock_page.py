@@ -1,4 +1,4 @@
-"""Clock of the page `/clock`, and its time in a film of the screen.
+"""Clock of the page `/clock`: its layout, and its time in a film of the screen.
 
 The page is a grid of `UNITS`, white, with an ArUco tag (dictionary 4x4_50) in each corner, by which
 the grid is found in perspective, and between them `CELLS` cells, black for 1. Row by row they are

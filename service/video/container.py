@@ -47,7 +47,7 @@ _VARIABLE_BEYOND = 0.2
 """A film's rate is variable if an interval differs by more than this part of their median."""
 _PIXELS_MAX = 8192 * 8192
 _UNORDERED = ("h264", "hevc")
-"""Codecs of which the library does not find the order of time where a file has none, as AVI."""
+"""Codecs whose pictures the library cannot put in order where the file does not, as AVI."""
 _ASPECT_RATIO_MAX = 4
 """A pixel that is wider or higher than so many times its other side is an error of the file."""
 _PICTURES_MAX = 5_000_000
@@ -63,9 +63,9 @@ _MISSING_INTERVALS_MAX = 5.0
 
 
 def read_film(path: Path, capture_rate_hz: float | None = None) -> tuple[FilmInfo, Floats]:
-    """Read what a film is, and the time of each picture in s from the first.
+    """Read the facts of a film, and the time of each picture in s from the first.
 
-    Of the pictures the first one is decoded.
+    Only the first picture is decoded.
 
     Args:
         path: the film.

@@ -32,7 +32,7 @@ By chance motions of 2 Hz in 1000 parts reach 0.67 in the offsets of an hour.
 _GRID_STEPS = 96
 """Offsets of the fine grid."""
 _PARTS_MAX = 1024
-"""Parts of the picture, the ones that change most, in which the code is looked for."""
+"""Parts of the picture in which the code is looked for: those with the greatest changes."""
 _CHUNK = 4096
 """Offsets that are tried at once."""
 _ROUGH_PICTURES = 24

@@ -89,7 +89,7 @@ class _Film:
     on_picture: Callable[[int], None]
 
     def run(self, task: str, **options: Any) -> dict[str, Any]:
-        """Run a task on the film in a process of its own."""
+        """Run a task on the film in a separate process."""
         rate_hz = self.video.film.capture_rate_hz
         return run_film_task(
             task, self.path, on_picture=self.on_picture, capture_rate_hz=rate_hz, **options

@@ -1,10 +1,10 @@
 """Angle of the foot's segment in a film, from two markers along it.
 
-Markers are ArUco tags (4x4, of which any two pairs of numbers may be on the leg), or dots: bright
-ones, as of retro-reflective tape, or of a colour. The angle is that of the line from the lower to
-the upper marker against the picture's upright, positive as the foot rolls forward, and 0 where the
-user says: a camera is seldom level. It is known in the picture's plane; a camera that looks
-obliquely by `a` turns it by up to (1 / cos a - 1) of its sine.
+Markers are ArUco tags (4x4_50, any two numbers), or dots: bright ones, as of retro-reflective tape,
+or of a colour. The angle is that of the line from the lower to the upper marker against the
+picture's upright, positive as the foot rolls forward, and 0 where the user says: a camera is seldom
+level. It is known in the picture's plane; a camera that looks obliquely by `a` turns it by up to (1
+/ cos a - 1) of its sine.
 
 The uncertainty is mostly measured on the film itself: the distance of each angle from a parabola
 through its neighbours is noise of the detection (and motion faster than the film shows, which

@@ -62,10 +62,9 @@ def check_extra_installed() -> None:
 def describe_film(
     path: Path, name: str, capture_rate_hz: float | None = None
 ) -> tuple[FilmInfo, bytes]:
-    """Read what a film is, and that its first and last pictures can be decoded.
+    """Read the facts of a film, and check that its first and last pictures can be decoded.
 
-    The times of its pictures, as `write_times` takes them, are not parsed: that would hold up a
-    server's event loop.
+    The times of its pictures stay text: parsing them would hold up a server's event loop.
 
     Args:
         path: the film.
@@ -88,7 +87,7 @@ def describe_film(
 def run_film_task(
     task: str, path: Path, *, on_picture: Callable[[int], None] = lambda _: None, **options: Any
 ) -> dict[str, Any]:
-    """Run a task on a film in a process of its own, and return its result.
+    """Run a task on a film in a separate process, and return its result.
 
     Args:
         task: name in `_TASKS`.

@@ -326,8 +326,8 @@ class IncomingVideo:
         """Describe the film that is now complete, and put the video in place.
 
         Args:
-            describe: reads a film and the times of its pictures, JSON with `film_s`, in a process
-                of its own; raises if it is none.
+            describe: reads a film and the times of its pictures, JSON with `film_s`, in a separate
+                process; raises if it is none.
 
         Raises:
             UnknownError: the session was deleted meanwhile.
@@ -375,7 +375,7 @@ def _check_space(folder: Path, size_bytes: int) -> None:
 
 
 def remove_video(session_folder: Path, video_id: str) -> None:
-    """Delete a video with all that was made of it.
+    """Delete a video with its alignment and tables.
 
     Raises:
         UnknownError: there is none with this id.
