@@ -259,12 +259,12 @@ def test_a_lossless_client_that_does_not_read_is_closed_with_its_position(
     running: Running, node_of: NodeOf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(service.api.routes.sockets.live, "TOO_SLOW_S", 0.05)
-    wide = node_of(running, tiles=64)  # two seconds of its frames fill the kernels' buffers
+    wide = node_of(running, tiles=64)  # its frames fill the buffers of any kernel
     wide.connect()
     wide.tared()
     with running.socket(LIVE, small=True, max_queue=1) as stalled:
         until(lambda: running.server.live_feeds.get_or_create("bench")._waiting)
-        for _ in range(3):
+        for _ in range(8):
             wide.send(500)
         wide.taken_in()
         with running.socket(LIVE + "&columns=grf_n") as other:
