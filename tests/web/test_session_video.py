@@ -261,9 +261,9 @@ def test_a_strip_of_stills_is_one_picture(
 def test_a_film_that_the_browser_cannot_play_is_said(
     session: Recording, videos: str, tmp_path: Path, open_page: OpenPage
 ) -> None:
-    added(session, make_film(tmp_path / "walk.avi", "libx264"), begin_s=None)
+    added(session, make_film(tmp_path / "walk.avi", "libvpx-vp9"), begin_s=None)
     page = open_page(url_of(session), 1280, 900)
-    expect(page.locator("#film-problem")).to_contain_text("cannot play h264 in AVI")
+    expect(page.locator("#film-problem")).to_contain_text("cannot play vp9 in AVI")
     expect(page.locator("#film-tools")).to_be_hidden()
     expect(page.locator("#videos-list li")).to_have_count(1)
     page.click("#alignment summary")
