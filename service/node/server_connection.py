@@ -244,10 +244,11 @@ async def connect_tcp(url: str) -> socket.socket:
     try:
         while loop.time() < end_s and refused is None:
             attempts.add(asyncio.create_task(_connect_once(host, port)))
-            done, attempts = await asyncio.wait(
+            done, _ = await asyncio.wait(
                 attempts, timeout=ATTEMPT_INTERVAL_S, return_when=asyncio.FIRST_COMPLETED
             )
             for attempt in done:
+                attempts.discard(attempt)
                 error = attempt.exception()
                 if error is None:
                     return attempt.result()
