@@ -95,6 +95,7 @@ def test_a_paused_picture_stands_still_says_so_and_goes_on(
     with Play(scripted.node, 20.0) as play:
         page = live(open_page(scripted.url))
         expect(page.locator("#paused")).to_be_hidden()
+        expect(page.locator("#grf")).to_contain_text("40")  # before a frame nothing is held
         page.keyboard.press("p")
         expect(page.locator("#paused")).to_contain_text("Acquisition and recording continue")
         expect(page.locator("#pause-text")).to_have_text("Resume")

@@ -26,6 +26,7 @@ def take(server: Running, monkeypatch: pytest.MonkeyPatch) -> Take:
 def test_the_others_of_a_take_come_in_the_same_file(take: Take, open_page: OpenPage) -> None:
     page = open_page(f"{take.running.url}/sessions/{take.sessions[0].id}?from=0&to=0.1")
     expect(page.locator("#plots[data-settled=true]")).to_have_count(1)
+    expect(page.locator("#download-take-text")).to_contain_text("right")  # it moves the others
     page.click("#downloads-more summary")
     together = page.get_by_label("whole take in one file (with right)")
     offered = page.locator("#download-list [data-format]:visible")
