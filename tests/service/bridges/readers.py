@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 import struct
+import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any, NamedTuple
@@ -45,6 +47,9 @@ def make_live_frames(
     return LiveFrames(node, info.stream_id, info, columns, True)
 
 
+_UNKNOWN_CHANNEL = re.compile(r"Unknown channel ID: (\d+)")
+
+
 class Seen(NamedTuple):
     """A message as a viewer sees it."""
 
@@ -64,6 +69,7 @@ class Viewer:
         self.topics: dict[int, str] = {}
         self.schemas: dict[str, str] = {}
         self._decoders: dict[int, Callable[[bytes], Any]] = {}
+        self._closed: set[int] = set()
         self._stack = ExitStack()
         self._socket = self._stack.enter_context(
             connect(
@@ -80,19 +86,29 @@ class Viewer:
 
     def receive(self, timeout_s: float = PATIENCE_S) -> Seen:
         """The next message of any topic."""
+        end_s = time.monotonic() + timeout_s
         while True:
-            message = self._socket.recv(timeout=timeout_s)
+            message = self._socket.recv(timeout=max(end_s - time.monotonic(), 0.0))
             if isinstance(message, bytes):
                 kind, channel, log_time_ns = struct.unpack_from("<BIQ", message)
                 assert kind == 1
                 content = self._decoders[channel](message[13:])
                 return Seen(self.topics[channel], log_time_ns, content)
             content = json.loads(message)
-            if content["op"] == "advertise":
-                self._subscribe(content["channels"])
+            match content["op"]:
+                case "advertise":
+                    for channel in content["channels"]:
+                        self._read_schema(channel)
+                        self._subscribe(channel["id"])
+                case "unadvertise":
+                    self._closed.update(content["channelIds"])
+                case "status" if found := _UNKNOWN_CHANNEL.fullmatch(content["message"]):
+                    # foxglove-sdk 0.30.3 advertises a channel before it knows it itself.
+                    if int(found[1]) not in self._closed:
+                        self._subscribe(int(found[1]))
 
-    def receive_next(self, timeout_s: float) -> bool:
-        """Whether a message of any topic comes within this time."""
+    def skip_message(self, timeout_s: float) -> bool:
+        """Receive a message of any topic; whether one came within this time."""
         try:
             self.receive(timeout_s)
         except TimeoutError:
@@ -101,21 +117,22 @@ class Viewer:
 
     def receive_of(self, topic: str, is_wanted: Callable[[Any], bool] = bool) -> Seen:
         """The next message of a topic that is wanted."""
+        end_s = time.monotonic() + PATIENCE_S
         while True:
-            seen = self.receive()
+            seen = self.receive(end_s - time.monotonic())
             if seen.topic == topic and is_wanted(seen.content):
                 return seen
 
-    def _subscribe(self, channels: list[dict[str, Any]]) -> None:
-        for channel in channels:
-            assert channel["encoding"] == channel["schemaEncoding"] == "protobuf"
-            number, name = channel["id"], channel["schemaName"]
-            pool = DescriptorPool()
-            for file in FileDescriptorSet.FromString(base64.b64decode(channel["schema"])).file:
-                pool.Add(file)
-            decoder = GetMessageClass(pool.FindMessageTypeByName(name))
-            self.topics[number], self.schemas[channel["topic"]] = channel["topic"], name
-            self._decoders[number] = decoder.FromString
-            # One by one: a channel that was closed meanwhile would have the others refused.
-            asked = [{"id": number, "channelId": number}]
-            self._socket.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
+    def _subscribe(self, number: int) -> None:
+        # One by one: a channel that was closed meanwhile would have the others refused.
+        asked = [{"id": number, "channelId": number}]
+        self._socket.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
+
+    def _read_schema(self, channel: dict[str, Any]) -> None:
+        assert channel["encoding"] == channel["schemaEncoding"] == "protobuf"
+        number, name = channel["id"], channel["schemaName"]
+        pool = DescriptorPool()
+        for file in FileDescriptorSet.FromString(base64.b64decode(channel["schema"])).file:
+            pool.Add(file)
+        self.topics[number], self.schemas[channel["topic"]] = channel["topic"], name
+        self._decoders[number] = GetMessageClass(pool.FindMessageTypeByName(name)).FromString
