@@ -103,8 +103,8 @@ _STEP_S = 0.5
 _CERTAIN_BY = 3.0
 """Least lead of the best match over one by another step: odds of 20."""
 _SAME_S = 0.05
-_INTERVALS_MIN = 1
-"""Intervals that have to agree before touchdowns outside the session count as possible."""
+_AGREE_MIN = 2
+"""Touchdowns that have to agree before those outside the session count as possible."""
 _FIRST_TOUCHDOWNS = 12
 """Touchdowns with which matches are tried: the first ones; some may be wrong."""
 
@@ -139,9 +139,9 @@ def match_contacts(
     """Match the touchdowns of a film with the contacts of a session; either may lack some.
 
     Each of the first touchdowns is tried with every contact. The others then agree within their
-    uncertainties and the drift, or were missed; one before or after the other recording counts
-    neither way. But a match is certain only if no other would be as good if those agreed, too: a
-    film that begins before the session shows the same steps earlier.
+    uncertainties and the drift, or were missed. A touchdown outside the session costs nothing, but
+    a match is certain only if it leads both without these and as if all of them agreed: a film that
+    begins before the session shows the same steps earlier.
 
     Args:
         touchdowns: of the film, in s from its first picture.
@@ -161,8 +161,12 @@ def match_contacts(
             if near_s[0] <= offset_s <= near_s[1]:
                 matches.append(_match_by(touchdowns, contacts, first, contact))
     best = max(matches, key=lambda match: match.score, default=_Match(0.0, 0.0, 0.0, []))
-    rivals = [m.possible for m in matches if abs(m.offset_s - best.offset_s) > _SAME_S]
-    if best.score <= 0.0 or best.possible - max(rivals, default=-math.inf) < _CERTAIN_BY:
+    rivals = [match for match in matches if abs(match.offset_s - best.offset_s) > _SAME_S]
+    lead = min(
+        best.score - max((rival.score for rival in rivals), default=-math.inf),
+        best.possible - max((rival.possible for rival in rivals), default=-math.inf),
+    )
+    if best.score <= 0.0 or lead < _CERTAIN_BY:
         count = f"{len(touchdowns.at_s)} touchdowns and {len(contacts.at_s)} contacts"
         raise FileFormatError(
             f"{count} do not agree" if best.score <= 0.0 else f"{count} agree in more than one way",
@@ -197,7 +201,7 @@ def _match_by(touchdowns: Instants, contacts: Instants, first: int, contact: int
     filmed[nearest[agree]] = False
     misses = int((covered & ~agree).sum()) + int(touchdowns.is_complete) * int(filmed.sum())
     score = float(gain[agree].sum()) - _MISS_COST * misses
-    outside = int((~covered & ~agree).sum()) * (agree.sum() > _INTERVALS_MIN)
+    outside = int((~covered & ~agree).sum()) * (agree.sum() >= _AGREE_MIN)
     return _Match(
         score=score,
         possible=score + float(gain[agree].mean()) * outside,

@@ -146,6 +146,13 @@ def test_steps_that_repeat_hide_whether_a_film_began_before_its_session() -> Non
         match_contacts(early, contacts)
 
 
+def test_touchdowns_outside_the_session_do_not_speak_for_a_match() -> None:
+    touchdowns = Instants(np.array([0.775, 1.411, 1.996, 2.668]), np.full(4, 4e-3), 3.17)
+    contacts_s = np.array([0.412, 1.007, 1.606, 2.205, 2.745, 3.32, 3.951])
+    with pytest.raises(FileFormatError, match="agree in more than one way"):
+        match_contacts(touchdowns, Instants(contacts_s, np.full(7, 2e-3), 4.42))
+
+
 def test_chosen_touchdowns_need_not_be_all_of_the_film() -> None:
     hops_s = np.array([2.041, 2.919, 3.801, 6.682])
     contacts = Instants(hops_s, np.full(4, 2e-3), 10.8)
