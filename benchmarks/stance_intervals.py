@@ -87,6 +87,11 @@ def simulate(scene: str, seed: int, path: Path) -> None:
         load = path.with_suffix(".csv")
         write_load(scene, seed, load)
         options.append(f"--load={load}")
+    run_simulate(path, options)
+
+
+def run_simulate(path: Path, options: list[str]) -> None:
+    """Run `foottile simulate` in this process."""
     sys.argv = ["foottile", "simulate", f"--out={path}", *options]
     try:
         foottile()

@@ -18,14 +18,15 @@ from devices.arrays import Floats, Times
 from devices.flags import CONTACT_UNKNOWN, EstimateFlag
 from devices.frames import FrameBatch, allocate_columns
 from devices.jit import jit_cached, jit_inlined
-from service.estimation.foot import interpolate_servo_counts, is_debounced, transform_to_ground_x_m
+from service.estimation.foot import interpolate_servo_counts, transform_to_ground_x_m
 from service.estimation.models import denoise
 from service.estimation.pipeline import grf_cop
+from service.estimation.pipeline.contact import update_contact
 from service.estimation.pipeline.params import KernelParams
 from service.estimation.pipeline.plan import EstimationPlan
 from service.estimation.pipeline.sample_stage import (
     append_frames_to_buffer,
-    compute_apparent_forces_and_contact,
+    compute_apparent_forces,
 )
 from service.estimation.pipeline.smoothing_stage import (
     BOUND_SIGMAS,
@@ -262,9 +263,7 @@ def _step(
     # With look-ahead and averages, a frame waits for the next one, for outlier replacement.
     end = foot_state.end_row if is_final else foot_state.end_row - foot_params.waits_for_next
     while foot_state.sample_row < end:
-        compute_apparent_forces_and_contact(
-            params, foot_state, tile_states, buffer, foot_state.sample_row
-        )
+        compute_apparent_forces(params, foot_state, tile_states, buffer, foot_state.sample_row)
         foot_state.sample_row += 1
     until, due_ns = foot_state.release_row, foot_state.newest_ns - foot_params.lag_ns
     while until < foot_state.sample_row and (is_final or buffer.t_mono_ns[until] <= due_ns):
@@ -317,10 +316,8 @@ def _estimate_due_rows(
             out[grf_cop.FOOT_ANGLE] = (counts - foot_params.zero_counts) * foot_params.rad_per_count
         grf_cop.set_plate_shear_fractions_and_sigma(params, forces, out[grf_cop.FOOT_ANGLE])
         grf_cop.compute_grf_cop(params, forces, out)
-        min_ns = foot_params.contact_min_ns
-        if is_debounced(buffer.since_ns, buffer.t_mono_ns, i, end, min_ns, lookahead_ns):
-            foot_state.is_contact = row.is_loaded
-        in_contact = foot_state.is_contact == 1
+        update_contact(foot_params, foot_state.contact, buffer, i, end, forces)
+        in_contact = foot_state.contact.is_contact == 1
         masked = grf_cop.is_cop_unreliable(params, out) or not in_contact
         # A lower bound can prove contact, and never its absence.
         is_proven = in_contact and out[grf_cop.GRF_LOWER_BOUND] >= foot_params.contact_bound_n
@@ -335,7 +332,7 @@ def _estimate_due_rows(
             if params.tiles[j].is_load_bearing == 1:
                 by_tile[_FORCE, k, j], by_tile[_SIGMA, k, j] = _force_or_bound(forces[j])
         seq[k], t_ns[k] = row.seq, row.t_ns
-        contact[k] = foot_state.is_contact if is_known else CONTACT_UNKNOWN
+        contact[k] = foot_state.contact.is_contact if is_known else CONTACT_UNKNOWN
         flags[k] = (
             row.flags | (_COP_MASKED if masked else 0) | (_AFTER_SATURATION if unsettled else 0)
         )

@@ -112,6 +112,8 @@ class FootParams(KernelRecord):
     # Contact: forces at which it begins and ends, and the time for which a change has to last.
     contact_on_n: float
     contact_off_n: float
+    contact_on_share: float  # of the greatest recent force, if that is more
+    contact_off_share: float
     contact_min_ns: int
     contact_pause_ns: int  # time without frames does not prove that contact has changed
     contact_bound_n: float  # lower bound of the GRF that proves contact: `contact_on_n` as mounted

@@ -45,6 +45,11 @@ from service.estimation.tare.unloaded_windows import compute_variance_inflation
 
 CONTACT_ON_SIGMA = 5.0  # of the GRF unloaded: noise alone does not get there
 CONTACT_OFF_SIGMA = 3.0  # lower than on, so that noise about a threshold does not chatter
+CONTACT_ON_SHARE = 0.02
+"""Share of the greatest recent force at which contact begins; it ends at half of that. Corrections
+of creep and loop leave less of a load."""
+CONTACT_ON_SHARE_CREEP = 0.1
+"""Share without the model `rubber`: domes creep by 2 to 15 % of a load."""
 CONTACT_MIN_NS = 10_000_000  # a shorter change is an outlier or a bounce
 SIGNIFICANCE_SIGMAS = 5.0
 """Least GRF for a COP, in its sigmas: below, the first-order variance of a ratio is invalid. Also
@@ -217,6 +222,7 @@ def _make_foot_params(
     # With look-ahead and averages, a frame waits for the next one. Without look-ahead the next
     # frame is not there, and may be of the same instant.
     waits_for_next = has_denoise and lag_ns > 0
+    on_share = CONTACT_ON_SHARE if "rubber" in models else CONTACT_ON_SHARE_CREEP
     gap_ns = round(GAP_PERIODS * 1e9 / info.nominal_rate_hz)
     columns: dict[str, Any] = {
         "has_ambient": "ambient" in models,
@@ -231,6 +237,8 @@ def _make_foot_params(
         "is_tare_lost": tare.is_lost,
         "tare_ns": tare.t_ns,
         "is_scale_assumed": calibration.has_assumed_scale(serials),
+        "contact_on_share": on_share,
+        "contact_off_share": 0.5 * on_share,
         "contact_min_ns": CONTACT_MIN_NS,
         "contact_pause_ns": max(CONTACT_MIN_NS, gap_ns),
         "cop_sigma_max_m": COP_SIGMA_MAX_M,

@@ -28,7 +28,7 @@ from service.estimation.fault_detection.baseline_loss import (
 )
 from service.estimation.fault_detection.clipping import update_clipping_limit_kpa
 from service.estimation.fault_detection.stuck import update_stuck_and_load_changes
-from service.estimation.foot import store_servo_reading_and_link_to_previous, update_candidate
+from service.estimation.foot import store_servo_reading_and_link_to_previous
 from service.estimation.models import gas
 from service.estimation.models.ambient import low_pass_ambient_kpa
 from service.estimation.models.denoise import WINDOW_READINGS_MAX, is_outlier
@@ -67,14 +67,14 @@ _BASELINE_LOST = int(EstimateFlag.BASELINE_LOST)
 
 
 @jit_inlined
-def compute_apparent_forces_and_contact(
+def compute_apparent_forces(
     params: KernelParams,
     foot_state: FootState,
     tile_states: RecordArray[TileState],
     buffer: FrameBuffer,
     i: int,
 ) -> None:
-    """Compute apparent forces, contact candidate and flags of row `i`, in the buffer.
+    """Compute apparent forces and flags of row `i`, in the buffer.
 
     Args:
         params: of the estimate.
@@ -133,11 +133,8 @@ def compute_apparent_forces_and_contact(
         # Of offsets: the sum of instants may overflow.
         offset_sum_ns += at_ns - t_ns
     # The known tiles may prove contact by themselves.
-    is_known_enough = math.isnan(total_n) and known_n >= foot_params.contact_on_n
-    contact_n = known_n if is_known_enough else total_n
-    on_n, off_n = foot_params.contact_on_n, foot_params.contact_off_n
-    update_candidate(on_n, off_n, foot_state.contact, contact_n, t_ns, row.after_contact_pause == 1)
-    row.is_loaded, buffer.since_ns[i] = foot_state.contact.is_loaded, foot_state.contact.since_ns
+    row.is_contact_bound = 1 if math.isnan(total_n) else 0
+    buffer.contact_n[i] = known_n if row.is_contact_bound == 1 else total_n
     buffer.usable_n[i, n], buffer.noise_n[i, n] = usable_n, math.sqrt(noise_n2)
     buffer.sampled_ns[i, n] = t_ns + offset_sum_ns // foot_params.n_load_bearing
 

@@ -35,6 +35,8 @@ class TileForce(KernelRecord):
 
     # While saturated: least force if nothing is uncertain. NaN where unknown, or without load.
     force_n: float
+    dome_n: float  # force on the dome: without the gain of its mount
+    correction_n: float  # of loop and creep: `dome_n` less the averaged apparent force
     sigma_n: float  # standard uncertainty of the force
     sigma_independent_n: float  # its part that is independent between tiles
     sigma_common_n: Annotated[Floats, (N_COMMON,)]  # signed errors that all tiles share
@@ -120,7 +122,8 @@ def _correct_force(
     )
     common_n = force.sigma_common_n
     common_n[0] = sample.gas_error_n
-    common_n[1] = tile_params.dome_misfit * (force_n - averaged_n)
+    force.dome_n, force.correction_n = force_n, force_n - averaged_n
+    common_n[1] = tile_params.dome_misfit * force.correction_n
     common_n[2], common_n[3] = sample.gas_alt_error_n, dome_alt_n
     common_n[4], common_n[5] = force.smoothing_error_n, sample.thermal_error_n
     common_n[6] = rate * tile_params.sample_delay_common_sigma_s

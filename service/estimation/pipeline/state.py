@@ -12,11 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Floats, Ints, Times
+from devices.flags import CONTACT_UNKNOWN
 from devices.frames import NOT_READ
 from service.estimation.fault_detection.baseline_loss import BaselineLossState, ThermalDriftState
 from service.estimation.fault_detection.clipping import ClippingState
 from service.estimation.fault_detection.stuck import StuckState
-from service.estimation.foot import ContactState, ServoReading
+from service.estimation.foot import ServoReading
 from service.estimation.models.ambient import AmbientState
 from service.estimation.models.gas import GasState
 from service.estimation.models.hysteresis import HysteresisState
@@ -58,6 +59,17 @@ class TileState(KernelRecord):
     has_previous_force: int
 
 
+class ContactState(KernelRecord):
+    """State of the contact."""
+
+    is_contact: int = CONTACT_UNKNOWN  # contact in the last estimate; unknown until decided
+    # Candidate of contact, the instant since which it lasts, and the greatest recent force.
+    is_loaded: int = CONTACT_UNKNOWN
+    since_ns: int
+    peak_n: float
+    peak_ns: int
+
+
 class FootState(KernelRecord):
     """State of the foot."""
 
@@ -71,7 +83,6 @@ class FootState(KernelRecord):
     load_changes: int  # loadings and unloadings of all tiles so far
     ambient: AmbientState
     contact: ContactState
-    is_contact: int  # contact in the last estimate
 
 
 ROWS_MIN = 1024
@@ -86,7 +97,7 @@ class FrameRow(KernelRecord):
     after_gap: int  # 1: a gap precedes it
     after_contact_pause: int  # 1: a pause in which the candidate of contact was not observed
     flags: int  # bits of `EstimateFlag` of the frame by itself
-    is_loaded: int  # 1: candidate of contact
+    is_contact_bound: int  # 1: tiles are missing, `contact_n` is of the others
 
 
 class TileSample(KernelRecord):
@@ -120,7 +131,7 @@ class FrameBuffer(NamedTuple):
         readings: (n,), of the servo.
         t_mono_ns: (n,), instants on the monotonic clock.
         run: (n,), number of the gapless run of each frame.
-        since_ns: (n,), `ContactState.since_ns` after each frame.
+        contact_n: (n,), sum of the apparent forces, for contact.
         usable_n: (n, tiles + 1), apparent forces for averaging, and their sum; NaN while
             saturated.
         noise_n: (n, tiles + 1), standard deviation of these by the noise of a single reading.
@@ -132,7 +143,7 @@ class FrameBuffer(NamedTuple):
     readings: RecordArray[ServoReading]
     t_mono_ns: Times
     run: Ints
-    since_ns: Times
+    contact_n: Floats
     usable_n: Floats
     noise_n: Floats
     sampled_ns: Times
@@ -146,7 +157,7 @@ def make_frame_buffer(n_rows: int, tiles: int) -> FrameBuffer:
         readings=np.zeros(n_rows, ServoReading.dtype()),
         t_mono_ns=np.zeros(n_rows, np.int64),
         run=np.zeros(n_rows, np.int64),
-        since_ns=np.zeros(n_rows, np.int64),
+        contact_n=np.zeros(n_rows),
         usable_n=np.zeros((n_rows, tiles + 1)),
         noise_n=np.zeros((n_rows, tiles + 1)),
         sampled_ns=np.zeros((n_rows, tiles + 1), np.int64),

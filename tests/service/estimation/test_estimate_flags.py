@@ -114,16 +114,17 @@ def test_a_gap_flags_the_frame_after_it(columns: dict[str, Any], after_gap: list
 
 def test_a_gap_between_two_batches_is_flagged_and_ends_contact() -> None:
     # 8 ms of load on each side of a minute are no contact
-    first = loaded_frames(np.concatenate([repeat_load([0] * 4, 3), repeat_load([9] * 4, 5)]))
+    first = loaded_frames(np.concatenate([repeat_load([0] * 4, 6), repeat_load([9] * 4, 5)]))
     later = replace(
-        first.slice_rows(3, 8),
-        seq=first.seq[3:8] + np.uint64(30_000),
-        t_mono_ns=first.t_mono_ns[3:8] + 60_000_000_000,
+        first.slice_rows(6, 11),
+        seq=first.seq[6:11] + np.uint64(30_000),
+        t_mono_ns=first.t_mono_ns[6:11] + 60_000_000_000,
     )
     for lag_ms in (0, 100):
         e = estimate(newton_plan(INFO, lag_ms=lag_ms), first, later)
-        assert find(EstimateFlag.GAP, e.estimate_flags) == [8]
-        assert e.contact.tolist() == [0] * 13
+        assert find(EstimateFlag.GAP, e.estimate_flags) == [11]
+        unknown = 0 if lag_ms else 5
+        assert e.contact.tolist() == [255] * unknown + [0] * (16 - unknown)
 
 
 # --- tares ----------------------------------------------------------------------------------------
