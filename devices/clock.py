@@ -8,6 +8,7 @@ for an emulated bus in real time.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -135,6 +136,19 @@ class WireClock:
         self._driver.continue_from(t_ns)
 
 
+_UTC_READINGS = 5
+
+
+def _read_utc_offset_ns(read_ns: Callable[[], int]) -> int:
+    """Return UTC minus a clock, from the shortest of some readings.
+
+    A process that is stopped between the two clocks of one would keep the time of its stop.
+    """
+    readings = [(read_ns(), time.time_ns(), read_ns()) for _ in range(_UTC_READINGS)]
+    before_ns, t_ns, after_ns = min(readings, key=lambda reading: reading[2] - reading[0])
+    return t_ns - (before_ns + after_ns) // 2
+
+
 @dataclass(frozen=True)
 class UtcAnchor:
     """Offset from CLOCK_MONOTONIC to UTC, fixed for a whole stream.
@@ -153,9 +167,7 @@ class UtcAnchor:
     @classmethod
     def measure(cls, *, clock_set: bool) -> UtcAnchor:
         """Read both clocks of this machine as nearly at one instant as possible."""
-        before_ns = time.monotonic_ns()
-        t_ns = time.time_ns()
-        return cls.from_readings((before_ns + time.monotonic_ns()) // 2, t_ns, clock_set=clock_set)
+        return cls(_read_utc_offset_ns(time.monotonic_ns), clock_set)
 
     @classmethod
     def from_readings(cls, t_mono_ns: int, t_ns: int, *, clock_set: bool) -> UtcAnchor:
@@ -168,7 +180,7 @@ def _read_boottime_ns() -> int:
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
-_UTC_OFFSET_NS = time.time_ns() - _read_boottime_ns()
+_UTC_OFFSET_NS = _read_utc_offset_ns(_read_boottime_ns)
 
 
 def server_utc_ns() -> int:

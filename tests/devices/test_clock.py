@@ -66,6 +66,31 @@ def test_an_anchor_converts_the_time_of_one_clock_to_the_other(t_mono_ns: int, t
     assert not anchor.clock_set
 
 
+class StoppedTime:
+    """Stands in for module `time`: the process is stopped for a minute behind one of its calls."""
+
+    def __init__(self, stopped_behind: int) -> None:
+        self.t_ns, self.calls, self.stopped_behind = 1_000, 0, stopped_behind
+
+    def monotonic_ns(self) -> int:
+        self.calls += 1
+        t_ns = self.t_ns
+        self.t_ns += 60_000_000_000 if self.calls == self.stopped_behind else 100
+        return t_ns
+
+    def time_ns(self) -> int:
+        return self.monotonic_ns() + 5_000_000_000
+
+
+@pytest.mark.parametrize("stopped_behind", range(1, 16))
+def test_a_stop_between_two_clocks_is_not_in_the_anchor(
+    stopped_behind: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("devices.clock.time", StoppedTime(stopped_behind))
+    anchor = UtcAnchor.measure(clock_set=True)
+    assert anchor.offset_ns == pytest.approx(5_000_000_000, abs=1_000)
+
+
 HOUR_NS = 3_600_000_000_000
 
 
