@@ -190,10 +190,11 @@ class ThreadedServoSource(_ServoSourceBase):
         """Return the newest position sampled by `t_mono_ns`, and its instant; None if none exists.
 
         The thread continues during a frame, so newer readings may exist: they belong to the next
-        frame. If all are newer, return the oldest, with age 0.
+        frame. If all are newer, return the oldest, with age 0; None if it is as far away as a stale
+        one, since then the bus was held up.
         """
         recent = self._recent
-        if not recent:
+        if not recent or recent[-1].t_mono_ns - t_mono_ns > self.stale_after_ns:
             return None
         reading = next((r for r in recent if r.t_mono_ns <= t_mono_ns), recent[-1])
         self.is_turn_known = reading.is_turn_known

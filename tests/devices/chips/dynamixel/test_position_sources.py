@@ -314,12 +314,23 @@ def test_a_thread_reads_ever_newer_positions_and_a_frame_gets_that_of_its_instan
         until(lambda: servo.readings > readings + 3)
         later = find_position(source, t_mono_ns)
         newest = find_position(source, time.monotonic_ns())
-        oldest = find_position(source, 0)
     assert later[1] <= t_mono_ns < newest[1]
     assert 0 <= later[0] - at_once[0] <= 1, "one reading may have been on its way"
     assert newest[0] > readings + 2
-    assert oldest[1] == 0, "no age is negative"
     assert "servo" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_a_frame_whose_bus_was_held_up_gets_no_position_of_a_later_instant() -> None:
+    servo: Any = CountingServo()
+    with ThreadedServoSource(servo, SystemClock(), rate_hz=500.0) as source:
+        until(lambda: servo.readings > 1)
+        source._stop.set()
+        source._thread.join()
+        recent = source._recent
+        just_before_ns = recent[-1].t_mono_ns - source.stale_after_ns
+        assert find_position(source, just_before_ns)[1] == just_before_ns, "no age is negative"
+        assert source.find_latest_position(just_before_ns - 1) is None
+        assert source.find_latest_position(0) is None
 
 
 def test_a_hanging_servo_does_not_delay_frames_and_its_position_ages() -> None:
