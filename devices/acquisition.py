@@ -36,6 +36,11 @@ STALL_SLOTS = 3
 The loop may also be ahead of its slots by as many periods, which makes up for longer frames.
 """
 
+SAMPLE_OFFSET_MAX_NS = 1_000_000_000
+"""Distance from the frame's instant, beyond the time of a frame, from which a tile's sample is not
+of this frame: the node was stopped meanwhile. A server accepts a minute (`storage.frame_rules`)."""
+_OFFSET_END_NS = 60_000_000_000
+
 _BATCH_FRAMES_MAX = 64  # rows allocated for a batch; more than any schedule takes in `BATCH_NS`
 _AGE_MAX_US = 2**31 - 1  # the limit of int32
 
@@ -125,6 +130,8 @@ class Acquisition:
         self._anchor = anchor
         self._period_ns = round(1e9 / rate_hz) if rate_hz else 0
         self._expected_period_ns = round(1e9 / expected_rate_hz) if expected_rate_hz else 0
+        frame_ns = max(self._period_ns, array.frame_ns)
+        self._offset_max_ns = min(SAMPLE_OFFSET_MAX_NS + frame_ns, _OFFSET_END_NS)
         self._servo = servo
         self._is_reidentified = is_reidentified
         self._frame_sink = frame_sink
@@ -210,6 +217,9 @@ class Acquisition:
                     frame_flags |= FrameFlag.SERVO_TURN_UNKNOWN
             if reading is None or age_ns > self._servo.stale_after_ns:
                 frame_flags |= FrameFlag.SERVO_STALE
+        offsets_ns = [sample_ns - t_mono_ns for sample_ns in samples_ns]
+        if max(offsets_ns) > self._offset_max_ns or min(offsets_ns) < -self._offset_max_ns:
+            self._discard_far_samples(scan, offsets_ns)
         # Positional for speed: this runs for every frame.
         frame = AcquiredFrame(
             self._next_seq,
@@ -221,7 +231,7 @@ class Acquisition:
             frame_flags,
             scan.pressure_raw,
             scan.temperature_raw,
-            [(sample_ns - t_mono_ns) // 1000 for sample_ns in samples_ns],
+            [offset_ns // 1000 for offset_ns in offsets_ns],
             scan.tile_flags,
         )
         for name, value in zip(AcquiredFrame._fields, frame, strict=True):
@@ -229,6 +239,15 @@ class Acquisition:
         if self._frame_sink is not None:
             self._frame_sink.write_frame(frame)
         self._next_seq += 1
+
+    def _discard_far_samples(self, scan: Scan, offsets_ns: list[int]) -> None:
+        """Discard samples far from the frame's instant, and set their offsets to zero."""
+        for tile, offset_ns in enumerate(offsets_ns):
+            if abs(offset_ns) > self._offset_max_ns:
+                offsets_ns[tile] = 0
+                if scan.pressure_raw[tile] != NOT_READ:
+                    scan.discard_reading(tile)
+                    self._array.health[tile].count_faults(TileFlag.NOT_CONVERTED)
 
     def _make_batch(self, columns: dict[str, np.ndarray], rows: int) -> FrameBatch:
         batch = FrameBatch(**{name: column[:rows] for name, column in columns.items()})

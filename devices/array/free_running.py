@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from devices.array.schedules import ADDRESS_BITS, STORED_MAX, BusTiming, count_read_bits
-from devices.array.tile import Scan, TileIo
+from devices.array.tile import HELD_UP_NS, Scan, TileIo
 from devices.chips.pressure_chip import Counts
 from devices.clock import Clock
 from devices.frames import NOT_READ
@@ -154,7 +154,14 @@ class FreeRunningTiles:
         for at_ns in (0, *(end_ns + after_end_ns for end_ns in ends_ns), until_ns):
             if not 0 < at_ns <= self._clock.now_ns():
                 self._clock.sleep_until_ns(at_ns)
-                self._reference_readings.append((self._clock.now_ns(), read_n()))
+                begin_ns = self._clock.now_ns()
+                force_n = read_n()
+                if self._clock.now_ns() - begin_ns < HELD_UP_NS:
+                    self._reference_readings.append((begin_ns, force_n))
+
+    def is_held_up(self, since_ns: int) -> bool:
+        """Return whether a read since an instant took so long that its sample has no instant."""
+        return self._clock.now_ns() - since_ns > self._pause_ns
 
     def read_last_counts(self, scan: Scan, tile: int, with_temperature: bool) -> Counts:
         """Read a tile's last conversion, with its instant; `NOT_READ` if none has ended."""
@@ -179,7 +186,8 @@ class FreeRunningTiles:
         if tile == 0 and self._reference_readings:
             scan.reference_ns = scan.convert_stop_ns[0] + self._sample_delay_ns[0]
             at_ns, forces_n = zip(*self._reference_readings, strict=True)
-            scan.reference_n = float(np.interp(scan.reference_ns, at_ns, forces_n))
+            if min(abs(scan.reference_ns - each_ns) for each_ns in at_ns) < self._pause_ns:
+                scan.reference_n = float(np.interp(scan.reference_ns, at_ns, forces_n))
         temperature_raw = self._tile_io.read_temperature(tile) if with_temperature else NOT_READ
         return pressures[-1], temperature_raw
 

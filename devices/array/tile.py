@@ -132,6 +132,10 @@ class TileIo:
         return self._masks[tiles]
 
 
+HELD_UP_NS = 100_000_000
+"""Length of a transfer from which the instants in it are not known: more than a hesitation of a
+busy machine. A node may be stopped in it, or its driver may hang."""
+
 _BUS_FAULTS_MAX = 2  # each may cost the adapter's timeout, 30 ms
 
 
@@ -191,6 +195,16 @@ class Scan:
         except BusFaultError:
             self.count_bus_fault()
         self.budget_ns -= clock.now_ns() - begin_ns
+
+    def discard_reading(self, tile: int) -> None:
+        """Discard a reading that is not of this frame, or of an unknown instant.
+
+        The reference force is that of the first tile's instant.
+        """
+        self.pressure_raw[tile] = self.temperature_raw[tile] = NOT_READ
+        if tile == 0:
+            self.reference_n = float("nan")
+        self.add_flag(tile, TileFlag.NOT_CONVERTED)
 
     def add_flag(self, tile: int, status: TileFlag | int) -> None:
         """Add a flag to a tile."""

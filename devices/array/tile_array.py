@@ -23,7 +23,7 @@ from devices.array.schedules import (
     compute_frame_s,
     compute_turns_s,
 )
-from devices.array.tile import Scan, TileHealth, TileIo
+from devices.array.tile import HELD_UP_NS, Scan, TileHealth, TileIo
 from devices.buses.i2c import I2cBus
 from devices.clock import Clock
 from devices.errors import BusFaultError, NoAcknowledgeError, TileSetupError
@@ -163,21 +163,22 @@ class TileArray:
         self._waits_for_slow_tiles = schedule != "pipelined" or len(tiles) == 1
         self._temperature_every = temperature_every
         self._read_reference_n = read_reference_n
-        self._frame_ns = round(compute_frame_s(schedule, timing) * 1e9)
+        self.frame_ns = round(compute_frame_s(schedule, timing) * 1e9)
+        """Frame period of the schedule."""
         # A tile that restarts right after its read has no finished conversion to re-read.
         self._reread_interval_frames = 0
         if schedule != "pipelined" and len(tiles) > 1:
             look_ns = (timing.select_s + timing.read_s) * 1e9
             self._reread_interval_frames = max(
-                _REREAD_FRAMES_MIN, round(look_ns / (_REREAD_TIME_PART * self._frame_ns))
+                _REREAD_FRAMES_MIN, round(look_ns / (_REREAD_TIME_PART * self.frame_ns))
             )
-        self._budget_ns = max(_BUDGET_MIN_NS, self._frame_ns // _BUDGET_PART)
+        self._budget_ns = max(_BUDGET_MIN_NS, self.frame_ns // _BUDGET_PART)
         self._started_ns = [clock.now_ns()] * len(tiles)
         self._is_converting = [False] * len(tiles)
         self._last_counts = [(NOT_READ, NOT_READ)] * len(tiles)
         self._repeat_counts = [0] * len(tiles)
         self._free_running = FreeRunningTiles(
-            self._tile_io, clock, timing, self.sample_delay_ns, self._frame_ns
+            self._tile_io, clock, timing, self.sample_delay_ns, self.frame_ns
         )
         self._busy_since_ns = 0
         self._frame_index = 0
@@ -241,7 +242,7 @@ class TileArray:
             self._update_turns()
         if all(pressure_raw == NOT_READ for pressure_raw in scan.pressure_raw):
             # Without any answer a frame takes no time: keep the frame rate.
-            self._clock.sleep_until_ns(begin_ns + self._frame_ns)
+            self._clock.sleep_until_ns(begin_ns + self.frame_ns)
         self._frame_index += 1
         return scan
 
@@ -273,12 +274,16 @@ class TileArray:
                 self.health[i].mark_lost(self._clock.now_ns())
             called = () if scan.is_abandoned else tuple(i for i in called if i not in gone)
         now_ns = self._clock.now_ns()
+        is_held_up = now_ns - self._busy_since_ns > HELD_UP_NS
         for i in tiles:
-            # The next conversion of a free-running part ends a conversion's time after its read.
-            is_free = self._tile_io.are_free_running[i]
-            self._started_ns[i] = self._free_running.read_ns[i] if is_free else now_ns
             # A lost tile may have missed the broadcast.
             self._is_converting[i] = i in called and self.health[i].is_present
+            self._started_ns[i] = now_ns
+            if not self._tile_io.are_free_running[i]:
+                self._is_converting[i] &= not is_held_up
+            elif self.health[i].is_present:
+                # The next conversion of such a part ends a conversion's time after its read.
+                self._started_ns[i] = self._free_running.read_ns[i]
 
     def _reachable_tiles(self, tiles: Sequence[int]) -> tuple[int, ...]:
         """Return the tiles whose mux has a tile present: a broadcast addresses muxes."""
@@ -358,10 +363,14 @@ class TileArray:
             self._plausibility.check_reading(
                 scan, tile, counts, with_temperature=with_temperature, may_retry=may_ask
             )
-            if self._tile_io.are_free_running[tile] and scan.pressure_raw[tile] != counts[0]:
-                # A later conversion was read in its place: it has an instant of its own.
-                with scan.charge_retry(self._clock), suppress(NoAcknowledgeError):
-                    self._free_running.read_last_counts(scan, tile, with_temperature=False)
+            if self._tile_io.are_free_running[tile]:
+                if scan.pressure_raw[tile] != counts[0]:
+                    # A later conversion was read in its place: it has an instant of its own.
+                    with scan.charge_retry(self._clock), suppress(NoAcknowledgeError):
+                        self._free_running.read_last_counts(scan, tile, with_temperature=False)
+                if self._free_running.is_held_up(self._busy_since_ns):
+                    scan.discard_reading(tile)
+                    self._free_running.forget_phase(tile)
         else:
             scan.add_flag(tile, TileFlag.NO_ANSWER)
             health.mark_lost(self._clock.now_ns())
@@ -409,7 +418,9 @@ class TileArray:
                 self._free_running.follow_reference(self._read_reference_n, ready_ns)
             else:
                 self._clock.sleep_until_ns(scan.reference_ns)
-                scan.reference_n = self._read_reference_n()
+                force_n = self._read_reference_n()
+                if self._clock.now_ns() - scan.reference_ns < HELD_UP_NS:
+                    scan.reference_n = force_n
         self._clock.sleep_until_ns(ready_ns)
         self._busy_since_ns = self._clock.now_ns()  # waiting is not charged to the budget
 

@@ -8,10 +8,13 @@ import os
 import signal
 import subprocess
 import threading
+import time
 from contextlib import ExitStack
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import service.node.acquisition_process
@@ -69,6 +72,37 @@ def test_acquisition_that_is_held_up_is_said_everywhere_and_goes_on_in_the_same_
     after = running.node("leg")
     assert after["stream_id"] == before["stream_id"]
     assert after["missed_slots"] > before["missed_slots"], "what was missed is counted"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stopped_s", [1.0, pytest.param(61.0, marks=pytest.mark.soak)])
+def test_a_session_in_which_the_node_was_stopped_is_complete_and_verifies(
+    running: Running, foottile: Start, tmp_path: Path, stopped_s: float
+) -> None:
+    """Tiles that are read one after another: nearly every stop is within a frame."""
+    scene = tmp_path / "in_turn.toml"
+    text = (resources.files("devices.scene") / "builtin" / "standing.toml").read_text()
+    scene.write_text(text.replace("[array]", '[array]\nschedule = "sequential"'))
+    node = foottile("node", "--scene", scene, "--server", running.url, "--name", "leg")
+    node.said("connected to")
+    until(lambda: (running.node("leg")["last_seq"] or 0) > 20)
+    session = running.record("leg", name="trial")
+    processes = (node.pid, acquisition_of(node))
+    for _ in range(3 if stopped_s < 5.0 else 1):
+        begin_seq = running.node("leg")["last_seq"]
+        for pid in processes:
+            os.kill(pid, signal.SIGSTOP)
+        time.sleep(stopped_s)
+        for pid in processes:
+            os.kill(pid, signal.SIGCONT)
+        until(lambda seq=begin_seq: running.node("leg")["last_seq"] > seq + 50)  # type: ignore[misc]
+    session.stop()
+    found = session.sealed()
+    assert (found["complete"], found["problem"]) == (True, None)
+    frames = session.frames()
+    assert np.diff(frames.t_mono_ns).max() > 0.8e9 * stopped_s, "the time of the stop has no frame"
+    assert np.abs(frames.sample_offset_us).max() < 1_100_000
+    assert foottile("verify", session.folder).ended(30.0) == 0
 
 
 @pytest.mark.slow
