@@ -119,6 +119,16 @@ class Machine:
             return [int(word) for word in text.split() if _does(int(word), "spawn_main")]
         return []
 
+    def stop_for(self, length_s: float) -> None:
+        """SIGSTOP to all its processes, and SIGCONT after a while."""
+        if self._process is None:
+            return
+        os.killpg(self._process.pid, signal.SIGSTOP)
+        try:
+            time.sleep(length_s)
+        finally:
+            os.killpg(self._process.pid, signal.SIGCONT)
+
     def kill(self) -> None:
         """SIGKILL to all its processes; return when they are gone."""
         if self._process is None:

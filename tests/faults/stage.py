@@ -130,6 +130,13 @@ class Stage(Players):
         time.sleep(0.3 + 2.5 * fault.amount)
         self._start_again(self._end_node("killed", self.node.kill) or stream_id, self.node)
 
+    def _hold_up_node(self, fault: Fault) -> None:
+        self.node.stop_for(fault.length_s)
+
+    def _hold_up_server(self, fault: Fault) -> None:
+        self.server.stop_for(fault.length_s)
+        self.wait_back()
+
     # --- the link ---------------------------------------------------------------------------------
 
     def _cut_link(self, fault: Fault) -> None:

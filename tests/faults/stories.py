@@ -28,6 +28,8 @@ ANYTIME = {
     "slow_fsync": 2,
     "clock_of_node": 1,
     "clock_of_server": 1,
+    "hold_up_node": 2,
+    "hold_up_server": 1,
 }
 """Faults that may come in any number and order, and how often each is drawn."""
 
@@ -47,6 +49,7 @@ ALONE = {
     "restart_node_twice": 2,
     "slow_fsync": 1,
     "clock_of_node": 1,
+    "hold_up_node": 1,
 }
 """Faults of a node that has no server."""
 
@@ -145,7 +148,7 @@ def _drawn(rng: random.Random, kinds: dict[str, int]) -> str:
 
 
 def _length_s(rng: random.Random, kind: str) -> float:
-    if kind in ("cut_link", "black_hole"):
+    if kind in ("cut_link", "black_hole", "hold_up_node", "hold_up_server"):
         return rng.choice((rng.uniform(0.5, 2.0), rng.uniform(2.0, 5.0)))
     if kind in ("kill_server", "power_server", "kill_both", "power_both"):
         return rng.uniform(0.0, 0.8)

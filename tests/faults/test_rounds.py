@@ -46,6 +46,7 @@ STORIES = {
     "link": ("cut_link", "throttle_link", "delay_link", "stop_while_away"),
     "flipped bits": ("corrupt_link",),
     "times": ("clock_of_node", "clock_of_server", "slow_fsync", "black_hole"),
+    "held up": ("hold_up_node", "hold_up_server"),
     "full": ("full_disk_of_server",),
     "full node": ("full_disk_of_node",),
     "away": ("black_hole", "stop_while_away_and_kill_node"),
@@ -54,6 +55,7 @@ IN_EVERY_RUN = ("kills", "power")
 STORIES_ALONE = {
     "alone, kills": ("kill_node", "kill_acquisition", "kill_node_parent", "restart_node_twice"),
     "alone, power": ("power_node", "clock_of_node", "slow_fsync"),
+    "alone, held up": ("hold_up_node",),
     "alone, killed at the end": ("kill_and_recover",),
     "alone, no power at the end": ("power_and_recover",),
 }
