@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -167,7 +166,9 @@ def run_jobs_with_report(
     if results is not None:
         results.prepare_folder()
     with ExitStack() as stack:
-        report = stack.enter_context(_open_report(results, command))
+        report: IO[str] | None = None
+        if results is not None:
+            report = stack.enter_context(results.open_text(f"{command}.report.jsonl"))
         show_outcome = stack.enter_context(_show_progress(command, list_again))
         for outcome in run_jobs(chain([first], jobs), job_mapper):
             counts.add_outcome(outcome)
@@ -185,25 +186,6 @@ def run_jobs_with_report(
         results.remove_work_folder()
     _print_summary(counts, command, out, as_json=as_json)
     return counts
-
-
-@contextmanager
-def _open_report(results: Any, command: str) -> Iterator[IO[str] | None]:
-    """Open the report, a line for each outcome; a remote store receives it at the end."""
-    if results is None:
-        yield None
-        return
-    name = f"{command}.report.jsonl"
-    if not results.is_remote:
-        with open(f"{results.out}/{name}", "w", encoding="utf-8") as file:
-            yield file
-        return
-    with tempfile.NamedTemporaryFile("w", encoding="utf-8", suffix=".jsonl") as file:
-        try:
-            yield file
-        finally:
-            file.flush()
-            results.put_file(name, Path(file.name))
 
 
 @contextmanager

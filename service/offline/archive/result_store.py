@@ -12,11 +12,12 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from devices.errors import FileFormatError
 from service.offline.archive.local_copies import (
@@ -61,10 +62,12 @@ class ChunkStore:
 
     @contextmanager
     def open_folder(self, suffixes: Sequence[str] | None = None) -> Iterator[Path]:
-        """Open the folder of the chunks; files added to it are published when the block succeeds.
+        """Open the folder of the chunks; of a remote store, a copy.
+
+        New files of a copy are uploaded at the end, unless the block fails; local ones stay.
 
         Args:
-            suffixes: suffixes of the files to load; None: all.
+            suffixes: suffixes of the files to load from a store; None: all.
 
         Raises:
             StorageError: chunks cannot be read or written.
@@ -185,7 +188,7 @@ class ResultStore:
             temporary.replace(where)
 
     def prepare_folder(self) -> None:
-        """Create the folder, and delete work folders left by killed workers of this machine.
+        """Create a local folder, and delete work folders left by killed workers of this machine.
 
         Raises:
             StorageError: it cannot be made.
@@ -197,17 +200,33 @@ class ResultStore:
             remove_stale_workspaces(Path(self.out) / _WORK_FOLDER_NAME)
 
     def remove_work_folder(self) -> None:
-        """Delete the folder for work in progress, after all workers have ended."""
+        """Delete a local folder for work in progress, after all workers have ended."""
         if not self.is_remote:
             remove_stale_workspaces(Path(self.out) / _WORK_FOLDER_NAME)
             for name in (_WORK_FOLDER_NAME, CHUNKS_NAME):
                 with suppress(OSError):
                     (Path(self.out) / name).rmdir()
 
-    def put_file(self, name: str, path: Path) -> None:
-        """Write a file beside the results."""
-        if self.is_remote:
-            upload(f"{self.out}/{name}", path)
+    @contextmanager
+    def open_text(self, name: str) -> Iterator[IO[str]]:
+        """Open a text file beside the results, to write; a remote store receives it at the end.
+
+        Raises:
+            StorageError: it cannot be written.
+        """
+        where = f"{self.out}/{name}"
+        if not self.is_remote:
+            with translate_storage_errors(Path(where)):
+                made = open(where, "w", encoding="utf-8")  # noqa: SIM115  # closed below
+            with made as file:
+                yield file
+            return
+        with tempfile.NamedTemporaryFile("w", encoding="utf-8") as file:
+            try:
+                yield file
+            finally:
+                file.flush()
+                upload(where, Path(file.name))
 
     def _read_note(self, name: str, command: str) -> ResultNote | None:
         where = f"{self.out}/{name}/{_note_name(command)}"

@@ -15,6 +15,7 @@ from service.offline.archive import locations
 from service.offline.archive.jobs import Job, run_job, run_jobs
 from service.offline.archive.locations import find_session_locations
 from service.offline.archive.query import find_sessions, run_query
+from service.offline.archive.result_store import ResultStore
 from service.offline.archive.tasks import VerifyTask
 from service.offline.worker_pool import Unfinished, map_in_processes
 from tests.service.offline.archive.stores import BUCKET, BadWay, Store
@@ -75,6 +76,18 @@ def test_pieces_of_a_long_session_are_in_the_store_until_it_is_there(
     assert there["frames.parquet"] == (tmp_path / "out" / "long" / "frames.parquet").read_bytes()
     with pytest.raises(FileNotFoundError):
         store.content("estimated/.pieces/long")
+
+
+@pytest.mark.parametrize("is_remote", [False, True])
+def test_a_text_beside_the_results_is_written_wherever_they_are(
+    store: Store, tmp_path: Path, is_remote: bool
+) -> None:
+    results = ResultStore(f"s3://{BUCKET}/out" if is_remote else str(tmp_path))
+    with results.open_text("report.jsonl") as file:
+        file.write("one\n")
+    here = tmp_path / "report.jsonl"
+    written = store.content("out")[here.name] if is_remote else here.read_bytes()
+    assert written == b"one\n"
 
 
 def test_a_result_in_a_store_of_which_an_object_is_gone_is_made_again(store: Store) -> None:
