@@ -281,10 +281,21 @@ def close_unfinished(session: Session, node: NodeFacts) -> Session:
 
 
 def close_part(session: Session, part: Part, seq_last: int, max_lost_tail: int = 0) -> Session:
-    """Return the session with a part closed; up to `max_lost_tail` lost frames may follow."""
+    """Return the session with one of its parts closed.
+
+    Args:
+        session: the session.
+        part: equal to one of its parts.
+        seq_last: number of the last frame; below the first one for a part without frames.
+        max_lost_tail: lost frames that may follow.
+
+    Raises:
+        ValueError: the session has no such part.
+    """
+    parts = list(session.parts)
     closed = part.model_copy(update={"seq_last": max(seq_last, part.seq_first - 1)})
-    parts = tuple(closed if each is part else each for each in session.parts)
-    update: dict[str, object] = {"parts": parts}
+    parts[parts.index(part)] = closed
+    update: dict[str, object] = {"parts": tuple(parts)}
     if max_lost_tail:
         update["max_lost_tail_frames"] = {
             **session.max_lost_tail_frames,

@@ -28,7 +28,14 @@ from service.sessions.lifecycle import (
     compute_present_ledger,
     iterate_needed_parts,
 )
-from service.sessions.parts import FramesToCome, NodeFacts, NodeReport, SeqsAround, SessionStream
+from service.sessions.parts import (
+    FramesToCome,
+    NodeFacts,
+    NodeReport,
+    SeqsAround,
+    SessionStream,
+    close_part,
+)
 from storage.intervals import NO_END, Intervals, Losses
 from storage.sessions.folder import Part, Session, SessionState
 from storage.sessions.ledger import group_numbers_by_stream
@@ -64,6 +71,15 @@ def session(state: SessionState, **content: Any) -> Session:
         "scene": "test",
     }
     return Session(**facts | content)
+
+
+def test_a_part_is_closed_by_its_value_and_no_other_session_s_part_is() -> None:
+    recording = session("recording")
+    (part,) = recording.parts
+    closed = close_part(recording, Part(**part.model_dump()), 4)
+    assert [each.seq_last for each in closed.parts] == [4]
+    with pytest.raises(ValueError, match="not in list"):
+        close_part(closed, part, 5)
 
 
 def table_cells() -> Iterator[tuple[str, SessionState, str]]:
