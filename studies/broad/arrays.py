@@ -67,7 +67,6 @@ EFFECT_PERCENTILE = 95
 def evaluate_estimates(
     columns: Mapping[str, npt.NDArray[Any]],
     find_unsaturated: Callable[[], Bools],
-    lag_ms: float,
 ) -> CaseResult:
     """Compute errors, coverage and flag counts.
 
@@ -75,9 +74,8 @@ def evaluate_estimates(
         columns: `EVALUATED_COLUMNS` of every frame of the recording.
         find_unsaturated: returns `surely_below_end`, (n, tiles); called only if needed,
             because it takes as long as the recording.
-        lag_ms: look-ahead of the estimates.
     """
-    accuracy = compute_accuracy({name: columns[name] for name in ACCURACY_COLUMNS}, lag_ms=lag_ms)
+    accuracy = compute_accuracy({name: columns[name] for name in ACCURACY_COLUMNS})
     status = columns["estimate_flags"]
     error_n = columns["grf_n"] - columns["true_grf_n"]
     sigma_n = columns["grf_sigma_n"]
@@ -369,9 +367,7 @@ def _evaluate_case(
     found = {}
     for mode, lag_ms in LAGS_MS.items():
         columns = compute_estimates(recording, scene.models, lag_ms, EVALUATED_COLUMNS)
-        found[make_case_key(scene.name, condition, mode)] = evaluate_estimates(
-            columns, below_end, lag_ms
-        )
+        found[make_case_key(scene.name, condition, mode)] = evaluate_estimates(columns, below_end)
     is_reference = scene.name == "poppy" and condition == CLEAN
     return found, describe_tiles(recording, world) if is_reference else ()
 

@@ -95,7 +95,6 @@ def test_a_tile_called_saturated_below_its_end_is_counted_and_so_is_a_bound_that
     found = evaluate_estimates(
         columns(force_sigma_n=sigma_n, force_n=force_n, estimate_flags=status),
         lambda: below_end,
-        10.0,
     )
     assert (found.saturated_frames, found.saturated_tile_frames) == (10, 10)
     assert (found.wrongly, found.held) == (4, 8)
@@ -104,9 +103,7 @@ def test_a_tile_called_saturated_below_its_end_is_counted_and_so_is_a_bound_that
 
 def test_sums_of_squares_are_of_the_frames_that_count() -> None:
     error_n = np.where(np.arange(20) < 10, 0.3, 0.0)
-    found = evaluate_estimates(
-        columns(grf_n=10.0 + error_n), lambda: np.ones((20, 2), dtype=bool), 10.0
-    )
+    found = evaluate_estimates(columns(grf_n=10.0 + error_n), lambda: np.ones((20, 2), dtype=bool))
     phase = found.phases["mid_stance"]
     assert (phase.frames, phase.within) == (20, 10)
     assert phase.error2 == pytest.approx(10 * 0.09)
@@ -121,9 +118,7 @@ def test_each_time_that_a_tile_is_said_to_be_wrong_is_an_alarm() -> None:
     status[5:9] = EstimateFlag.BASELINE_LOST | EstimateFlag.SATURATED
     status[7:12] |= np.uint16(EstimateFlag.CLIPPED)
     status[15:] |= np.uint16(EstimateFlag.CLIPPED)
-    found = evaluate_estimates(
-        columns(estimate_flags=status), lambda: np.ones((20, 2), dtype=bool), 10.0
-    )
+    found = evaluate_estimates(columns(estimate_flags=status), lambda: np.ones((20, 2), dtype=bool))
     assert found.alarms == 4
     assert found.seconds == pytest.approx(0.19)
 
@@ -132,10 +127,7 @@ def test_a_missing_tile_is_no_bound() -> None:
     nothing = np.full((20, 2), np.nan)
     missing = columns(force_n=nothing, force_sigma_n=nothing)
     assert (
-        evaluate_estimates(
-            missing, lambda: np.ones((20, 2), dtype=bool), 10.0
-        ).saturated_tile_frames
-        == 0
+        evaluate_estimates(missing, lambda: np.ones((20, 2), dtype=bool)).saturated_tile_frames == 0
     )
 
 
