@@ -61,7 +61,7 @@ class CoverageCount:
         return CoverageCount(self.frames + other.frames, self.within + other.within)
 
     def as_dict(self) -> dict[str, float]:
-        """Return the JSON representation."""
+        """Return the content that `service.json_output.to_json_value` converts."""
         return {"frames": self.frames, "within": self.within, "coverage_95": self.share}
 
 

@@ -113,7 +113,7 @@ class Comparison:
     options: CompareOptions
 
     def as_dict(self) -> dict[str, object]:
-        """Return the JSON representation."""
+        """Return the content that `service.json_output.to_json_value` converts."""
         alignment, pairs = self.alignment, self.pairs
         return {
             "session": self.session,

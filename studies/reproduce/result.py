@@ -113,7 +113,7 @@ class TrialResult:
         return {name: over.mean for name, over in self.comparison.errors.figures.items()}
 
     def as_dict(self) -> dict[str, object]:
-        """Return the JSON representation."""
+        """Return the content that `service.json_output.to_json_value` converts."""
         return {
             "name": self.name,
             "frames": self.frames,
@@ -279,7 +279,7 @@ class Reproduction:
         )
 
     def as_dict(self) -> dict[str, object]:
-        """Return the JSON representation."""
+        """Return the content that `service.json_output.to_json_value` converts."""
         return {
             "software": self.software,
             "made": self.run_at,

@@ -384,7 +384,7 @@ class ClockLag:
     error_bound_s: float
 
     def as_dict(self) -> dict[str, object]:
-        """Return the JSON representation."""
+        """Return the content that `service.json_output.to_json_value` converts."""
         return {
             "value": self.lag_s,
             "within": (self.lag_s - self.error_bound_s, self.lag_s + self.error_bound_s),

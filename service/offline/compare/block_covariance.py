@@ -68,7 +68,7 @@ class UncertainValue:
         )
 
     def as_dict(self) -> dict[str, object]:
-        """Return the JSON representation."""
+        """Return the content that `service.json_output.to_json_value` converts."""
         return {
             "value": self.value,
             "sigma": self.sigma,
