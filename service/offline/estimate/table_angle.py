@@ -19,7 +19,7 @@ import numpy.typing as npt
 from devices.arrays import Columns, Floats, Times
 from devices.errors import FileFormatError, UsageError
 from devices.flags import FrameFlag
-from devices.frames import NO_SERVO_COUNTS, ArrayInfo, FrameBatch, ServoInfo
+from devices.frames import NO_SERVO_COUNTS, ArrayInfo, ServoInfo
 from devices.scene.scene_file import Scene
 from service.estimation.foot import compute_segment_rad_per_count
 from service.offline.estimate.preparation import BatchWithColumns
@@ -216,7 +216,6 @@ class TableServo:
         for frames, columns in pieces:
             t_ns = self._axis.shift_to_axis(frames.t_ns, columns.get("part"))
             angle_rad, sigma_rad, source = self._track.interpolate(t_ns)
-            self._count(frames, angle_rad)
             counts = np.rint(angle_rad * (_COUNTS_PER_TURN / (2.0 * math.pi)))
             given = replace(
                 frames,
@@ -227,14 +226,14 @@ class TableServo:
             kept = {name: getattr(frames, name) for name in _REPLACED}
             yield given, {**columns, **kept, "angle_source": source, "angle_sigma_rad": sigma_rad}
 
-    def _count(self, frames: FrameBatch, angle_rad: Floats) -> None:
-        self._frame_count += len(frames)
+    def _count(self, angle_rad: Floats, own: Columns) -> None:
+        self._frame_count += len(angle_rad)
         self._known_count += int((~np.isnan(angle_rad)).sum())
         if self._own is None:
             return
-        is_read = (frames.servo_counts != NO_SERVO_COUNTS) & (frames.frame_flags & _UNKNOWN == 0)
-        rad_per_count = compute_segment_rad_per_count(self._own)
-        own_rad = (frames.servo_counts - self._own.zero_counts) * rad_per_count
+        counts = own["servo_counts"]
+        is_read = (counts != NO_SERVO_COUNTS) & (own["frame_flags"] & _UNKNOWN == 0)
+        own_rad = (counts - self._own.zero_counts) * compute_segment_rad_per_count(self._own)
         apart_rad = (angle_rad - own_rad)[is_read & ~np.isnan(angle_rad)]
         self._compared_count += len(apart_rad)
         self._apart_rad2 += float(apart_rad @ apart_rad)
@@ -254,6 +253,7 @@ class TableServo:
         """Yield estimated frames with their own servo, and the uncertainty on the ground."""
         for frames, columns in pieces:
             own = {name: columns[name] for name in _REPLACED}
+            self._count(columns["angle_rad"], own)
             others = {name: values for name, values in columns.items() if name not in own}
             others["cop_ground_sigma_x_m"] = self._compute_ground_sigma_m(columns)
             yield replace(frames, **own), others

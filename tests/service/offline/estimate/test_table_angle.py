@@ -129,6 +129,11 @@ def test_how_far_the_table_reaches_and_agrees_with_the_servo_is_said(tmp_path: P
         "the table has an angle in 25 % of the frames; it differs from the servo's by 5.7 degrees "
         "(RMS)"
     )
+    # Of a part its own frames count, not those that the estimator needs before it and after it.
+    for part, share in ((Slice(1.6, 3.0), 0), (Slice(0.5, 1.0), 100)):
+        in_part = replace(request, part=part)
+        estimate_session(source, tmp_path / "out", in_part, on_remark=said.append, angle=track)
+        assert said[-1].startswith(f"the table has an angle in {share} % of the frames"), part
 
 
 def test_a_film_of_another_session_is_refused(raw: Path, tmp_path: Path) -> None:
