@@ -164,12 +164,14 @@ def _check_instants(instants_s: Floats, times_s: Floats, path: Path) -> None:
         FileFormatError: they are not.
     """
     edges_s = (times_s[1:] + times_s[:-1]) / 2
-    off_s = np.abs(instants_s - times_s[np.searchsorted(edges_s, instants_s)])
+    pictures = np.searchsorted(edges_s, instants_s)
+    off_s = np.abs(instants_s - times_s[pictures])
     film_interval_s, interval_s = (
         float(np.median(np.diff(each_s))) if len(each_s) > 1 else 0.0
         for each_s in (times_s, instants_s)
     )
     is_off = off_s > max(film_interval_s * _PICTURE_WITHIN, _PICTURE_WITHIN_S)
+    is_off[1:] |= np.diff(pictures) == 0  # of two rows one is of a picture that was dropped
     if abs(interval_s - film_interval_s) > _INTERVAL_TOLERANCE * film_interval_s:
         what = f"its rows are {interval_s:g} s apart"
     elif is_off.any():

@@ -29,6 +29,7 @@ from service.video.worker import run_film_task
 from storage.sessions.folder import FRAMES_NAME
 from storage.sessions.time_axis import PartSpan
 from storage.sessions.videos import (
+    LONE_PICTURE_S,
     Alignment,
     AlignmentMethod,
     Video,
@@ -109,7 +110,7 @@ class _Film:
                 expected=f"numbers from 0 to {count - 1}",
             )
         times_s = read_picture_times(self.path.parent)
-        intervals_s = np.diff(times_s) if count > 1 else np.ones(1)
+        intervals_s = np.diff(times_s) if count > 1 else np.array([LONE_PICTURE_S])
         rows = np.array(pictures)
         return times_s[rows], intervals_s[np.maximum(rows - 1, 0)]
 
@@ -298,6 +299,12 @@ def _pair_by_contact(film: _Film, time: SessionTime, options: AlignmentOptions) 
         at_s, sigma_s = np.array(found, dtype=np.float64).reshape(-1, 2).T
     else:
         shown_s, interval_s = film.find_pictures(sorted(set(options.pictures)))
+        if 0 in options.pictures:
+            raise UsageError(
+                "picture 0 shows no touchdown: it may have been before the film",
+                where=film.video.name,
+                expected="the first picture of a contact, behind one of the foot in the air",
+            )
         # The foot was put down between the picture before and the first one.
         at_s, sigma_s = shown_s - interval_s / 2.0, interval_s * PICK_SIGMA
     near_s = (-math.inf, math.inf)

@@ -64,6 +64,9 @@ AlignmentMethod = Literal["light", "clock", "contact", "hand"]
 
 DRIFT_SIGMA, CAPTURE_RATE_SIGMA = 50e-6, 1e-3
 """Standard deviations of a camera's drift beforehand: by its crystal; by a stated capture rate."""
+LONE_PICTURE_S = 1.0
+"""Interval of a film with one picture, whose rate is unknown: longer than any exposure of a foot's
+film."""
 
 
 class FilmInfo(StrictModel):
@@ -156,7 +159,8 @@ class Video(StrictModel):
         if self.alignment is None:
             return None, None
         t_ns, sigma_ns = self.alignment.place(film_s)
-        return t_ns, np.hypot(sigma_ns, 1e9 / (self.film.rate_hz * math.sqrt(12.0)))
+        interval_s = 1.0 / self.film.rate_hz if self.film.rate_hz else LONE_PICTURE_S
+        return t_ns, np.hypot(sigma_ns, 1e9 * interval_s / math.sqrt(12.0))
 
 
 def find_video_folders(session_folder: Path) -> dict[str, Path]:

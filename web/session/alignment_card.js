@@ -45,6 +45,7 @@ export class AlignmentCard {
     if (!film.times.length) return notice("this browser does not show the film.", { bad: true });
     if (!film.isStill) return notice("the film is moving: pause it.", { bad: true });
     if (cursorS === null) return notice(`put the cursor ${method === "hand" ? "on the instant" : "near the contact"} first.`, { bad: true });
+    if (method === "contact" && film.wanted === 0) return notice("no picture before this one shows the foot in the air.", { bad: true });
     if (method === "contact" && !contacts.length) return notice("the session has no contact that begins in it.", { bad: true });
     const timeS = method === "hand" ? cursorS : contacts.reduce((best, one) => (Math.abs(one - cursorS) < Math.abs(best - cursorS) ? one : best));
     const resolutionS = method === "hand" ? (view.to - view.from) / plots.plotWidth : 1 / plots.whole.rateHz;

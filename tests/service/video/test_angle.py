@@ -42,6 +42,8 @@ def test_rows_of_no_picture_are_refused_by_the_first(tmp_path: Path) -> None:
         (film_s + 10.0, "row 1 is at 10 s"),
         (1000.0 * film_s, "rows are 33.3333 s apart"),
         (film_s[:9:2], "rows are 0.0666667 s apart"),
+        # Both rows are within a third of an interval of the picture before the gap.
+        (np.insert(film_s, 10, film_s[9] + 0.3 / 30.0), "row 11 is at 0.31 s"),
         (1e-3 * film_s, "rows are 3.3333e-05 s apart"),
     ):
         options = write_kinovea(tmp_path / "k.csv", times_s)

@@ -152,6 +152,15 @@ def test_picked_touchdowns_are_aligned_with_contacts_within_a_picture(session: P
     assert abs(off_ns) < 4.0 * sigma_ns
 
 
+def test_the_first_picture_of_a_film_is_no_touchdown(session: Path) -> None:
+    """It shows a foot that may have stood for long; nothing says when it was put down."""
+    added = add_film(session, SMALL, DARK)
+    for pictures in ((0,), (0, 40, 75)):
+        with pytest.raises(UsageError, match=r"film\.mp4: picture 0 shows no touchdown"):
+            align_video(session, added.id, "contact", AlignmentOptions(pictures=pictures))
+    assert read_video(find_video_folder(session, added.id)).alignment is None
+
+
 def test_a_picture_after_dropped_ones_is_as_uncertain_as_they_are(session: Path) -> None:
     times_s = [*np.arange(20) / SMALL.rate_hz, *(0.8 + np.arange(20) / SMALL.rate_hz)]
     path = session.parent / "gap.mp4"

@@ -11,12 +11,14 @@ import sys
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from devices.errors import FileFormatError, FootTileError, StorageError, UnknownError
 from storage.durable_files import remove_dead_process_temporaries
 from storage.sessions import videos
 from storage.sessions.videos import (
+    Alignment,
     FilmInfo,
     IncomingVideo,
     Video,
@@ -236,6 +238,29 @@ def test_verification_names_each_damage(folder: Path) -> None:
 def test_a_description_cannot_name_another_file(folder: Path) -> None:
     with pytest.raises(ValueError, match="suffix"):
         Video(**add(folder).model_dump() | {"suffix": "/../../../etc/passwd"})
+
+
+def test_the_instant_of_a_lone_picture_is_known_to_a_second(folder: Path) -> None:
+    """It has no interval, by which the exposure of others is bounded."""
+    lone = INFO.model_copy(
+        update={"picture_count": 1, "duration_s": 0.0, "rate_hz": 0.0, "play_rate_hz": 0.0}
+    )
+    alignment = Alignment(
+        method="hand",
+        film_s=0.0,
+        t_ns=5,
+        drift=0.0,
+        sigma_ns=3e6,
+        sigma_drift=0.0,
+        pair_count=1,
+        rejected_count=0,
+    )
+    video = add(folder).model_copy(update={"film": lone, "alignment": alignment})
+    t_ns, sigma_ns = video.place_pictures(np.zeros(1))
+    assert t_ns is not None
+    assert sigma_ns is not None
+    assert t_ns.tolist() == [5]
+    np.testing.assert_allclose(sigma_ns, np.hypot(3e6, 1e9 / np.sqrt(12.0)))
 
 
 def test_a_file_in_place_of_a_video_is_damage(folder: Path) -> None:
