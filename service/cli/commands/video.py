@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
@@ -39,6 +38,7 @@ _CHUNK_BYTES = 4 << 20
 _DRIFT_KNOWN = 0.9
 """Greatest uncertainty of a drift, of that before any measurement, that says something."""
 _TAG_MAX = 49
+NEAR_WITHIN_S = 5.0
 
 
 def video_add_command(
@@ -48,8 +48,7 @@ def video_add_command(
         float | None,
         typer.Option(
             min=0.0,
-            help="Pictures per second when it was taken, if it plays slower and the file does not "
-            "say so.",
+            help="Pictures per second when it was taken, if it plays at another rate.",
         ),
     ] = None,
     data: DataOption = None,
@@ -136,19 +135,24 @@ class MarkerOptions:
         str, typer.Option(metavar="COLUMNSxROWS", help="Inner corners of the checkerboard.")
     ] = "9x6"
 
+    @property
+    def has_more(self) -> bool:
+        """True if there are options beside the two that name markers."""
+        return replace(self, tags=None, dots=None) != MarkerOptions()
+
     def to_values(self) -> dict[str, Any]:
         """Return them as arguments of `TrackOptions`.
 
         Raises:
-            UsageError: a text is no pair of sensible numbers.
+            UsageError: a text is no list of sensible numbers.
         """
-        tags = self._parse("tags", "3,7")
+        tags = _parse_numbers(self.tags, "--tags", "3,7")
         if tags is not None and (max(tags) > _TAG_MAX or tags[0] == tags[1]):
             raise UsageError(f"--tags {self.tags}", expected=f"two numbers from 0 to {_TAG_MAX}")
-        area_px = self._parse("area", "400,0,600,1080")
+        area_px = _parse_numbers(self.area, "--area", "400,0,600,1080")
         if area_px is not None and not min(area_px[2:]) > 0:
             raise UsageError(f"--area {self.area}", expected="a width and a height above 0")
-        board = self._parse("board", "9x6")
+        board = _parse_numbers(self.board, "--board", "9x6")
         if board is None or not min(board) >= 3 or not max(board) <= 100:
             raise UsageError(f"--board {self.board}", expected="3 to 100 inner corners")
         return {
@@ -158,16 +162,6 @@ class MarkerOptions:
             "lens": self.lens,
             "board": board,
         }
-
-    def _parse(self, option: str, example: str) -> tuple[int, ...] | None:
-        """Return the numbers of an option, as many and separated as in an example."""
-        text = getattr(self, option)
-        if text is None:
-            return None
-        pattern = re.sub(r"\d+", r"\\d{1,5}", re.escape(example))
-        if not re.fullmatch(pattern, text, re.ASCII):
-            raise UsageError(f"--{option} {text!r}", expected=f"numbers, such as {example}")
-        return tuple(map(int, re.findall(r"\d+", text)))
 
 
 @add_options
@@ -188,7 +182,7 @@ def video_align_command(
     ] = None,
     within: Annotated[
         float, typer.Option(min=0.0, max=SECONDS_MAX, help="Largest error of --near, seconds.")
-    ] = 5.0,
+    ] = NEAR_WITHIN_S,
     picture: Annotated[
         list[int] | None,
         typer.Option(
@@ -205,7 +199,7 @@ def video_align_command(
             "after the first frame (repeat for several).",
         ),
     ] = None,
-    replace: Annotated[
+    replaces: Annotated[
         bool, typer.Option("--replace", help="Replace an alignment that says otherwise.")
     ] = False,
     data: DataOption = None,
@@ -222,14 +216,17 @@ def video_align_command(
     methods: dict[str, AlignmentMethod] = {each: each for each in get_args(AlignmentMethod)}
     if by not in methods:
         raise UsageError(f"--by {by}", expected=", ".join(methods))
-    for option, is_used, method in (
-        ("--picture", bool(picture), "contact"),
-        ("--pair", bool(pair), "hand"),
-        ("--tags and --dots", markers != MarkerOptions(), "contact"),
-    ):
-        if is_used and by != method:
-            raise UsageError(f"{option} is for --by {method}")
     has_markers = markers.tags is not None or markers.dots is not None
+    for option, is_used, is_right in (
+        ("--picture is for --by contact", picture, by == "contact"),
+        ("--pair is for --by hand", pair, by == "hand"),
+        ("--near is for --by light and contact", near is not None, by in ("light", "contact")),
+        ("--within is for --near", within != NEAR_WITHIN_S, near is not None),
+        ("--tags and --dots are for --by contact", has_markers, by == "contact"),
+        ("--area, --lens and --board are for --tags and --dots", markers.has_more, has_markers),
+    ):
+        if is_used and not is_right:
+            raise UsageError(option)
     if by == "contact" and bool(picture) == has_markers:
         raise UsageError(
             "touchdowns are not named, or twice",
@@ -242,7 +239,7 @@ def video_align_command(
         pictures=tuple(picture or [number for number, _ in pairs]),
         instants_s=tuple(instant_s for _, instant_s in pairs),
         track=TrackOptions(**markers.to_values()).make_task_options() if has_markers else None,
-        replaces=replace,
+        replaces=replaces,
     )
     folder = _find_session_folder(session, data)
     facts = read_video(find_video_folder(folder, video))
@@ -253,7 +250,10 @@ def video_align_command(
     else:
         _report_alignment(folder, aligned)
     if any(path.suffix in SUFFIXES for path in find_video_folder(folder, video).iterdir()):
-        remark("tables that were tracked before have the times of before: track again")
+        remark(
+            "t_ns and sigma_ns in tables of this video are by the alignment before; `foottile "
+            "estimate --angle` takes the new one"
+        )
 
 
 @add_options
@@ -300,12 +300,14 @@ def video_track_command(
     """Write the foot's angle in each picture as a table, for `foottile estimate --angle`."""
     from service.video.angle import TrackOptions, read_points_from, track_video
     from storage.formats.angle_table import ANGLE_NAME, SUFFIXES, check_suffix
-    from storage.sessions.videos import find_video_folder, read_video
+    from storage.sessions.videos import find_video_folder, find_video_folders, read_video
 
     if [markers.tags, markers.dots, points_file].count(None) != 2:
         raise UsageError(
             "what to track is not clear", expected="one of --tags, --dots and --points-file"
         )
+    if points_file is not None and markers.has_more:
+        raise UsageError("--area, --lens and --board are for --tags and --dots")
     if (points is None) != (points_file is None):
         raise UsageError("--points are names in --points-file", expected="both or none")
     names = (points or ",").split(",")
@@ -325,9 +327,12 @@ def video_track_command(
     )
     folder = _find_session_folder(session, data)
     inputs = [path for path in (points_file, markers.lens) if path is not None]
-    # Only tables beside a film may be written over.
+    # Of the session's files only tables beside a film may be written over.
+    beside = find_video_folders(folder).values()
     inputs += [
-        path for path in folder.rglob("*") if path.parent == folder or path.suffix not in SUFFIXES
+        path
+        for path in folder.rglob("*")
+        if path.suffix not in SUFFIXES or path.parent not in beside
     ]
     if video is None:
         if points_file is None or out is None or begin_s is None:
@@ -384,7 +389,6 @@ def _report_alignment(session_folder: Path, video: Video) -> None:
     import numpy as np
 
     from service.video.session_time import read_session_time
-    from storage.sessions.folder import FRAMES_NAME
 
     alignment = video.alignment
     assert alignment is not None  # noqa: S101
@@ -445,3 +449,16 @@ def _parse_pair(text: str) -> tuple[int, float]:
     if not abs(instant_s) <= SECONDS_MAX:
         raise UsageError(f"--pair {text!r}", expected="a picture and its instant, as 120=3.52")
     return number, instant_s
+
+
+def _parse_numbers(text: str | None, option: str, example: str) -> tuple[int, ...] | None:
+    """Return as many whole numbers as an example has, with its separator; None for None."""
+    if text is None:
+        return None
+    separator = "x" if "x" in example else ","
+    parts = text.split(separator)
+    if len(parts) != len(example.split(separator)) or not all(
+        part.isascii() and part.isdecimal() and len(part) < 6 for part in parts
+    ):
+        raise UsageError(f"{option} {text!r}", expected=f"numbers, such as {example}")
+    return tuple(map(int, parts))

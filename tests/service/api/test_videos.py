@@ -112,6 +112,8 @@ def test_a_film_is_kept_and_given_back_unchanged(session: Recording) -> None:
     slowed = content_of(upload(session, capture_rate_hz=1000), 201)
     times_s = content_of(http.get(f"{session.url}/videos/{slowed['id']}/times"))["film_s"]
     assert times_s[-1] == pytest.approx((PICTURES - 1) / 1000)
+    lapse = content_of(upload(session, capture_rate_hz=0.5), 201)
+    assert lapse["film"]["duration_s"] == pytest.approx((PICTURES - 1) / 0.5)
     zipped = http.get("/sessions/zip", params={"ids": session.id}).content
     assert b"film.mp4" not in zipped
     assert http.delete(url).status_code == 204

@@ -134,10 +134,9 @@ async def add_video(
     capture_rate_hz: Annotated[
         float | None,
         Query(
-            ge=1,
+            ge=1e-3,
             le=1e6,
-            description="Pictures per second when it was taken, if it plays slower and the file "
-            "does not say so.",
+            description="Pictures per second when it was taken, if it plays at another rate.",
         ),
     ] = None,
 ) -> Video:

@@ -138,6 +138,12 @@ def test_a_film_aligned_by_hand_says_where_it_begins_and_how_surely(
         (("--by", "hand", "--pair", "12=0.1"), "from 0 to 11"),
         (("--by", "hand", "--pair", "x"), "as 120=3.52"),
         (("--by", "hand", "--pair", "1=inf"), "as 120=3.52"),
-        (("--by", "hand", "--pair", "1=0.1", "--tags", "3,7"), "is for --by contact"),
+        (("--by", "hand", "--pair", "1=0.1", "--tags", "3,7"), "are for --by contact"),
+        (("--by", "hand", "--pair", "1=0.1", "--area", "1,2,3,4"), "are for --tags and --dots"),
+        (("--by", "contact", "--picture", 3, "--board", "8x6"), "are for --tags and --dots"),
+        (("--by", "contact", "--picture", 3, "--lens", "b.mp4"), "are for --tags and --dots"),
+        (("--by", "hand", "--pair", "1=0.1", "--near", 2), "--near is for --by light and contact"),
+        (("--by", "clock", "--near", 2), "--near is for --by light and contact"),
+        (("--by", "light", "--within", 2), "--within is for --near"),
     ):
         run(*align, *options).fails(2, words)

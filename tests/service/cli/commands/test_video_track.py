@@ -143,12 +143,17 @@ REFUSED: tuple[tuple[tuple[str, ...], str], ...] = (
     (("--dots", "red", "-o", "nowhere/t.csv"), "no folder"),
     (("--points", "a,b"), "--tags"),
     (("--points-file", "x.csv"), "both or none"),
+    (("--points-file", "x.csv", "--points", "a,b", "--area", "1,2,3,4"), "are for --tags and"),
+    (("--points-file", "x.csv", "--points", "a,b", "--lens", "b.mp4"), "are for --tags and"),
+    (("--dots", "red", "-o", "session/notes/t.csv"), "is an input and would be lost"),
     (("--points-file", "x.csv", "--points", "a"), "LOWER,UPPER"),
 )
 
 
 def test_options_that_do_not_fit_are_refused(run: Run, folder: Path, film: Path) -> None:
     video_id = run("video", "add", folder, film, "--json").printed()["id"]
+    (folder / "notes").mkdir()
+    (folder / "notes" / "t.csv").write_text("mine")
     for options, problem in REFUSED:
         run("video", "track", folder, video_id, *options).fails(2, problem)
     swapped = "--tags", f"{UPPER_TAG},{LOWER_TAG}"
