@@ -20,7 +20,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from service.video.container import iterate_pictures
+from service.video.container import iterate_pictures, read_film
 from service.video.tracking import make_dot_finder, make_tag_finder, track_markers
 from studies.reproduce.leg_film import LOWER_TAG, UPPER_TAG, Camera, film_leg, write_film
 
@@ -47,9 +47,8 @@ def main() -> None:
     cv2.setNumThreads(1)
     camera = Camera(width=1920, height=1080)
     begin_s = [i / camera.rate_hz for i in range(count)]
-    finders = {"tags": make_tag_finder(LOWER_TAG, UPPER_TAG), "dots": make_dot_finder("bright")}
     with tempfile.TemporaryDirectory() as work:
-        for marks, find in finders.items():
+        for marks in ("tags", "dots"):
             pictures = film_leg(
                 camera,
                 begin_s,
@@ -59,7 +58,13 @@ def main() -> None:
             )
             path = write_film(Path(work) / f"{marks}.mp4", camera, pictures, begin_s)
             show_speed("decoding", count, partial(decode, path))
-            track = partial(track_markers, path, count, find, is_grey=True)
+            film, _ = read_film(path)
+            find = (
+                make_tag_finder(LOWER_TAG, UPPER_TAG)
+                if marks == "tags"
+                else make_dot_finder("bright", film)
+            )
+            track = partial(track_markers, path, film, find, is_grey=True)
             show_speed(f"with {marks}", count, track)
 
 

@@ -40,6 +40,8 @@ _NORMAL_RATIO = 1.5
 
 Normal films of phones have the tag, too.
 """
+_FASTEST_PART, _DROPPED_MAX = 0.02, 0.1
+"""Part of the intervals that tells a film's fastest rate; greatest part that drops make longer."""
 _CAPTURE_RATES_HZ = (1e-3, 1e6)
 _GAP_BEYOND = 0.5
 """Intervals that differ by more than this part of their median do not count for the rate."""
@@ -85,7 +87,7 @@ def read_film(path: Path, capture_rate_hz: float | None = None) -> tuple[FilmInf
         width, height = _compute_shown_size_px(stream)
         codec = stream.codec_context.name
     play_rate_hz = _compute_rate_hz(times_s)
-    if tagged is not None and 1 / _NORMAL_RATIO < tagged / (play_rate_hz or tagged) < _NORMAL_RATIO:
+    if tagged is not None and _plays_as_taken(times_s, play_rate_hz, tagged):
         tagged = None
     captured_hz = tagged if capture_rate_hz is None else capture_rate_hz
     if captured_hz is not None:
@@ -98,7 +100,6 @@ def read_film(path: Path, capture_rate_hz: float | None = None) -> tuple[FilmInf
             )
         times_s = times_s * (play_rate_hz / captured_hz)
     rate_hz = _compute_rate_hz(times_s)
-    uneven = np.abs(np.diff(times_s) * rate_hz - 1.0) > _VARIABLE_BEYOND
     return FilmInfo(
         codec=codec,
         width_px=height if sideways else width,
@@ -108,9 +109,30 @@ def read_film(path: Path, capture_rate_hz: float | None = None) -> tuple[FilmInf
         duration_s=float(times_s[-1]),
         rate_hz=rate_hz,
         play_rate_hz=play_rate_hz,
-        is_variable=bool(uneven.any()),
+        is_variable=bool(_find_uneven(times_s, rate_hz).any()),
         capture_rate_hz=captured_hz,
     ), times_s
+
+
+def _find_uneven(times_s: Floats, rate_hz: float) -> npt.NDArray[np.bool_]:
+    """Return True for intervals that differ from the rate's."""
+    return np.asarray(np.abs(np.diff(times_s) * rate_hz - 1.0) > _VARIABLE_BEYOND)
+
+
+def _plays_as_taken(times_s: Floats, play_rate_hz: float, tagged_hz: float) -> bool:
+    """Return True if a film with a tagged rate is no slow motion, and no time-lapse film.
+
+    It has that rate, if only where there was light, or it has none, as by long exposures. Slow
+    motion has its own, but for a few pictures that were dropped.
+    """
+    if not play_rate_hz:
+        return True
+    fastest_hz = 1.0 / float(np.quantile(np.diff(times_s), _FASTEST_PART))
+    is_varying = _find_uneven(times_s, play_rate_hz).mean() > _DROPPED_MAX
+    return bool(is_varying) or any(
+        1 / _NORMAL_RATIO < tagged_hz / rate_hz < _NORMAL_RATIO
+        for rate_hz in (play_rate_hz, fastest_hz)
+    )
 
 
 def _compute_rate_hz(times_s: Floats) -> float:
@@ -192,9 +214,10 @@ def _open_container(path: Path, **options: str) -> Iterator[tuple[InputContainer
             assert isinstance(stream, av.VideoStream)  # noqa: S101
             if stream.codec_context is None:  # a drawing, or a codec that is not there
                 raise FileFormatError("its pictures cannot be decoded", where=str(path))
-            if math.prod(_compute_shown_size_px(stream)) > _PIXELS_MAX:
-                raise FileFormatError("its pictures are too large", where=str(path))
             codec = stream.codec_context
+            shown_px = math.prod(_compute_shown_size_px(stream))
+            if max(shown_px, codec.width * codec.height) > _PIXELS_MAX:
+                raise FileFormatError("its pictures are too large", where=str(path))
             if container.format.name == "avi" and codec.name in _UNORDERED and codec.has_b_frames:
                 raise FileFormatError(
                     f"the order of its pictures is unknown: AVI with B-frames of {codec.name}",

@@ -28,8 +28,8 @@ from storage.sessions.videos import FilmInfo
 
 _TAG_SEARCH = 4.0
 """Where a tag is looked for: its last place, and this many times its size around it."""
-_DOT_AREA_PX = (6.0, 0.02)
-"""Area of a dot: at least so many pixels, at most this part of the picture."""
+_DOT_AREA_MIN_PX, _DOT_AREA_MAX = 6.0, 0.02
+"""Least area of a dot; its largest one, as a part of the film's pictures."""
 _DOT_ROUNDNESS = 0.6
 """Least ratio of a dot's area to that of the circle around it."""
 _LENGTH_TOLERANCE = 0.1
@@ -60,6 +60,21 @@ FindMarkers = Callable[[Picture], Floats | None]
 """Finds both markers in a picture: (2, 2), the lower one first; None if not both are seen."""
 
 
+def check_area(area_px: tuple[int, int, int, int], film: FilmInfo, path: Path) -> None:
+    """Check that an area is a part of a film's pictures.
+
+    Raises:
+        UsageError: it reaches beyond them.
+    """
+    left, top, width, height = area_px
+    if left + width > film.width_px or top + height > film.height_px:
+        raise UsageError(
+            f"the area reaches to {left + width}, {top + height}",
+            where=str(path),
+            expected=f"a part of {film.width_px} x {film.height_px} pixels",
+        )
+
+
 def track_markers(
     path: Path,
     film: FilmInfo,
@@ -78,7 +93,7 @@ def track_markers(
         find_markers: finds them in a picture.
         is_grey: whether it takes grey pictures.
         area_px: left, top, width and height of the part of the pictures in which markers are
-            looked for; None: all.
+            looked for, see `check_area`; None: all.
         lens: of the camera, by a checkerboard.
         on_picture: called with the number of each picture.
 
@@ -88,16 +103,9 @@ def track_markers(
 
     Raises:
         FileFormatError: the film is damaged, or no picture shows both markers, and only these.
-        UsageError: the area reaches beyond the pictures.
     """
     places_px = np.full((film.picture_count, 2, 2), math.nan)
     left, top, width, height = area_px or (0, 0, film.width_px, film.height_px)
-    if left + width > film.width_px or top + height > film.height_px:
-        raise UsageError(
-            f"the area reaches to {left + width}, {top + height}",
-            where=str(path),
-            expected=f"a part of {film.width_px} x {film.height_px} pixels",
-        )
     for index, picture in iterate_pictures(path, is_grey=is_grey):
         found = find_markers(picture[top : top + height, left : left + width])
         if found is not None and index < film.picture_count:
@@ -213,11 +221,12 @@ def _intersect_diagonals(corners: Floats) -> Floats:
     return np.asarray(corners[0] + part[0] * first)
 
 
-def make_dot_finder(colour: str) -> FindMarkers:
+def make_dot_finder(colour: str, film: FilmInfo) -> FindMarkers:
     """Make a finder of two dots, the lower one first; of three it is not known which are meant.
 
     Args:
         colour: `bright`, or a name of `_COLOURS_HUE`.
+        film: facts of the film.
 
     Raises:
         UsageError: no such colour.
@@ -229,6 +238,7 @@ def make_dot_finder(colour: str) -> FindMarkers:
             f"no dots of the colour {colour!r}", expected=", ".join(("bright", *_COLOURS_HUE))
         )
 
+    area_max_px = _DOT_AREA_MAX * film.width_px * film.height_px
     away = np.abs((np.arange(256) - _COLOURS_HUE.get(colour, 0) + 90) % 180 - 90)
     is_hue = np.where(away <= _HUE_WITHIN, 255, 0).astype(np.uint8)
 
@@ -251,8 +261,7 @@ def make_dot_finder(colour: str) -> FindMarkers:
         _, labels, stats, _ = cv2.connectedComponentsWithStats(weights)
         areas = stats[1:, cv2.CC_STAT_AREA].astype(np.float64)
         sizes = stats[1:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)
-        least, most = _DOT_AREA_PX
-        is_dot = (areas >= least) & (areas <= most * whole.size)
+        is_dot = (areas >= _DOT_AREA_MIN_PX) & (areas <= area_max_px)
         is_dot &= areas >= _DOT_ROUNDNESS * math.pi / 4 * sizes**2
         dots = np.flatnonzero(is_dot) + 1
         if len(dots) != 2:

@@ -34,7 +34,7 @@ _MEMORY_BYTES_MAX = 4 << 30
 _SILENT_S_MAX = 60.0
 """Longest time without a line: a film of 4K shows several pictures a second."""
 _READ_BYTES_PER_S_MIN = 10e6
-"""Rate of a slow disk, in two passes: a film's time stamps are all over its file."""
+"""Rate of a slow disk, in up to three passes: a film's time stamps are all over its file."""
 _PROGRESS_PICTURES = 50
 _PART_PX = 16
 """Least size of the parts of a picture in which a lamp is looked for."""
@@ -43,7 +43,7 @@ _PARTS_BYTES_MAX = 1 << 30
 _CLOCK_LOOK_S = 0.1
 """Interval of pictures in which a clock page is looked for."""
 _ERRORS: dict[str, type[FootTileError]] = {
-    kind.__name__: kind for kind in (FileFormatError, UsageError, StateError)
+    kind.__name__: kind for kind in (FileFormatError, UsageError, StateError, FootTileError)
 }
 
 
@@ -74,11 +74,12 @@ def describe_film(
     Raises:
         FileFormatError: it is no film, or broken.
         UsageError: the rate is impossible.
+        FootTileError: reading it failed by a bug.
     """
     try:
         found = run_film_task("read", path, capture_rate_hz=capture_rate_hz)
         return FilmInfo(**found["film"]), found["times_json"].encode()
-    except (FileFormatError, StateError, UsageError) as error:
+    except FootTileError as error:
         error.what = error.what.replace(str(path), name)
         error.where = name
         raise
@@ -165,7 +166,7 @@ def main() -> None:
     try:
         _print({"result": _TASKS[request["task"]](Path(request["path"]), **request["options"])})
     except FootTileError as error:
-        kind = next((name for name, k in _ERRORS.items() if isinstance(error, k)), "StateError")
+        kind = next(name for name, k in _ERRORS.items() if isinstance(error, k))
         facts = {"where": error.where, "expected": error.expected, "remedy": error.remedy}
         known = {name: value for name, value in facts.items() if value}
         _print({"error": {"kind": kind, "what": error.what, **known}})
@@ -174,7 +175,7 @@ def main() -> None:
         _print({"error": {"kind": "FileFormatError", "what": text, "where": request["path"]}})
     except Exception as error:  # a bug: the parent has no other way to know
         text = f"the task {request['task']} failed, which is a bug: {error!r}"
-        _print({"error": {"kind": "StateError", "what": text, "where": request["path"]}})
+        _print({"error": {"kind": "FootTileError", "what": text, "where": request["path"]}})
 
 
 def _print(message: dict[str, Any]) -> None:
@@ -263,19 +264,26 @@ def _track(
     from service.video.container import read_film
     from service.video.tracking import (
         calibrate_lens,
+        check_area,
         make_dot_finder,
         make_tag_finder,
         track_markers,
     )
 
     film, times_s = read_film(path, capture_rate_hz)
+    if area_px is not None:
+        check_area(area_px, film, path)
+
+    def report_lens(_: int) -> None:
+        _print({"picture": 0})  # the bar is that of the film
+
     places_px = track_markers(
         path,
         film,
-        make_tag_finder(*tags) if tags is not None else make_dot_finder(dots or ""),
+        make_tag_finder(*tags) if tags is not None else make_dot_finder(dots or "", film),
         is_grey=tags is not None or dots == "bright",
         area_px=area_px,
-        lens=None if lens is None else calibrate_lens(Path(lens), *board, film, _report),
+        lens=None if lens is None else calibrate_lens(Path(lens), *board, film, report_lens),
         on_picture=_report,
     )
     return {"film_s": times_s.tolist(), "places_px": places_px.tolist()}

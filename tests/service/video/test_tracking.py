@@ -14,10 +14,12 @@ import pytest
 
 from devices.arrays import Floats
 from devices.errors import FileFormatError, UsageError
+from service.video import container
 from service.video.container import Picture, _compute_rate_hz, iterate_pictures, read_film
 from service.video.tracking import (
     Lens,
     calibrate_lens,
+    check_area,
     compute_angle,
     make_dot_finder,
     make_tag_finder,
@@ -25,6 +27,7 @@ from service.video.tracking import (
     undistort,
 )
 from studies.reproduce.leg_film import LOWER_TAG, UPPER_TAG, Camera, film_leg, write_film
+from tests.storage.sessions.test_videos import INFO
 
 
 def swing(t_s: float) -> float:
@@ -61,7 +64,11 @@ def test_the_angle_of_each_picture_is_right_within_what_it_says(
     assert film.picture_count == PICTURES
     assert film.is_variable
     np.testing.assert_allclose(times_s, begin_s, atol=1e-3)
-    find = make_tag_finder(LOWER_TAG, UPPER_TAG) if marks == "tags" else make_dot_finder("bright")
+    find = (
+        make_tag_finder(LOWER_TAG, UPPER_TAG)
+        if marks == "tags"
+        else make_dot_finder("bright", film)
+    )
     places_px = track_markers(path, film, find, is_grey=True)
     angle_rad, sigma_rad = compute_angle(places_px * (1.0, -1.0), zero_rad=0.0)
     # The upper marker, which turns, is at 0.3 of the height: so late is its row.
@@ -213,6 +220,22 @@ def test_pictures_have_square_pixels_as_a_player_shows_them(
     assert edge == pytest.approx(width_px / 2, abs=2)
 
 
+def tag_film(film: Path, rate: str) -> Path:
+    """A copy of a film with a phone's tag of the rate at which it was taken."""
+    tagged = film.with_name("tagged.mp4")
+    with (
+        av.open(str(film), "r") as source,
+        av.open(str(tagged), "w", options={"movflags": "use_metadata_tags"}) as target,
+    ):
+        target.metadata["com.android.capture.fps"] = rate
+        stream = target.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(source.streams.video[0]):
+            if packet.size:
+                packet.stream = stream
+                target.mux(packet)
+    return tagged
+
+
 @pytest.mark.parametrize(
     ("play_hz", "tag", "factor"),
     [(24.0, "30.0", 1.0), (30.0, "240.0", 0.125), (30.0, "24.0", 1.0), (30.0, "0.5", 60.0)],
@@ -223,17 +246,7 @@ def test_a_tagged_rate_counts_only_if_the_film_plays_much_slower_or_faster(
     greys = [np.full((64, 96), 20 + 18 * i, np.uint8) for i in range(12)]
     times_s = [i / play_hz for i in range(12)]
     film = write_film(tmp_path / "film.mp4", Camera(width=96, height=64), greys, times_s)
-    tagged = tmp_path / "tagged.mp4"
-    with (
-        av.open(str(film), "r") as source,
-        av.open(str(tagged), "w", options={"movflags": "use_metadata_tags"}) as target,
-    ):
-        target.metadata["com.android.capture.fps"] = tag
-        stream = target.add_stream_from_template(source.streams.video[0])
-        for packet in source.demux(source.streams.video[0]):
-            if packet.size:
-                packet.stream = stream
-                target.mux(packet)
+    tagged = tag_film(film, tag)
     info, found_s = read_film(tagged)
     assert info.play_rate_hz == pytest.approx(play_hz, rel=0.01)
     np.testing.assert_allclose(found_s, factor * np.array(times_s), atol=1e-3 * factor)
@@ -242,8 +255,51 @@ def test_a_tagged_rate_counts_only_if_the_film_plays_much_slower_or_faster(
     np.testing.assert_allclose(stated_s, times_s, atol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("intervals_s", "tag", "factor"),
+    [
+        ([1 / 30] * 12 + [1 / 15] * 28, "30.0", 1.0),  # a phone's, where it became dark
+        ([1 / 15] * 38 + [1 / 30] * 2, "30.0", 1.0),
+        ([1 / 12, 1 / 17, 1 / 19, 1 / 13] * 10, "30.0", 1.0),
+        ([1 / 30] * 20 + [2 / 30] + [1 / 30] * 19, "240.0", 0.125),  # slow motion, one dropped
+    ],
+    ids=["darker", "dark", "uneven", "dropped"],
+)
+def test_an_uneven_film_is_slow_motion_only_if_it_has_a_rate_of_its_own(
+    tmp_path: Path, intervals_s: list[float], tag: str, factor: float
+) -> None:
+    times_s = np.cumsum([0.0, *intervals_s])
+    greys = [np.full((64, 96), 20 + 5 * i, np.uint8) for i in range(len(times_s))]
+    camera = Camera(width=96, height=64)
+    film = tag_film(write_film(tmp_path / "film.mp4", camera, greys, times_s.tolist()), tag)
+    info, found_s = read_film(film)
+    assert info.is_variable
+    np.testing.assert_allclose(found_s, factor * times_s, atol=1e-3 * factor)
+
+
+def test_the_size_of_pictures_as_they_are_decoded_is_limited(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are shown with a quarter of it: decoding takes the memory of all."""
+    path = tmp_path / "film.mp4"
+    with av.open(str(path), "w") as target:
+        stream = target.add_stream("libx264", rate=50)
+        stream.width, stream.height, stream.pix_fmt = 128, 64, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = Fraction(1, 4)
+        grey = np.full((64, 128), 90, np.uint8)
+        target.mux(stream.encode(av.VideoFrame.from_ndarray(grey, format="gray")))
+        target.mux(stream.encode(None))
+    assert read_film(path)[0].width_px == 32
+    monkeypatch.setattr(container, "_PIXELS_MAX", 128 * 64 - 1)
+    with pytest.raises(FileFormatError, match="pictures are too large"):
+        read_film(path)
+
+
 def test_a_film_of_three_pictures_and_a_gap_has_a_rate() -> None:
     assert 0.0 < _compute_rate_hz(np.array([0.0, 1.0, 101.0])) <= 1.0
+
+
+DRAWN = INFO.model_copy(update={"width_px": 160, "height_px": 120})
 
 
 def draw_dots(*dots: tuple[int, int, int], colour: tuple[int, int, int]) -> Picture:
@@ -255,7 +311,7 @@ def draw_dots(*dots: tuple[int, int, int], colour: tuple[int, int, int]) -> Pict
 
 def test_two_dots_of_a_colour_are_found_and_of_three_none() -> None:
     red, blue = (30, 30, 220), (220, 60, 30)
-    find = make_dot_finder("red")
+    find = make_dot_finder("red", DRAWN)
     picture = draw_dots((40, 100, 6), (70, 20, 6), (120, 60, 1), colour=red)
     cv2.circle(picture, (130, 100), 12, blue, -1)
     found = find(picture)
@@ -271,6 +327,19 @@ def test_two_dots_of_a_colour_are_found_and_of_three_none() -> None:
     np.testing.assert_allclose(found, [[40, 100], [70, 20]], atol=0.3)
 
 
+def test_a_dot_is_as_large_as_before_in_a_part_of_the_picture() -> None:
+    """A fiftieth of the film's pictures, not of the part in which dots are looked for."""
+    red = (30, 30, 220)
+    find = make_dot_finder("red", DRAWN)
+    picture = draw_dots((40, 100, 9), (70, 20, 9), colour=red)
+    whole = find(picture)
+    assert whole is not None
+    part = find(picture[:, 20:90])
+    assert part is not None
+    np.testing.assert_allclose(part, whole - np.array([20.0, 0.0]))
+    assert find(draw_dots((40, 100, 9), (70, 20, 12), colour=red)) is None
+
+
 def test_a_lamp_is_no_dot_but_in_the_area_of_the_dots(tmp_path: Path) -> None:
     camera = Camera()
     begin_s = (np.arange(PICTURES) / camera.rate_hz).tolist()
@@ -280,7 +349,7 @@ def test_a_lamp_is_no_dot_but_in_the_area_of_the_dots(tmp_path: Path) -> None:
     )
     path = write_film(tmp_path / "film.mp4", camera, pictures, begin_s)
     film, _ = read_film(path)
-    find = make_dot_finder("bright")
+    find = make_dot_finder("bright", film)
     whole = track_markers(path, film, find, is_grey=True)
     assert np.flatnonzero(~np.isnan(whole[:, 0, 0])).tolist() == [*range(8)]
     area_px = 40, 0, camera.width - 40, camera.height
@@ -288,8 +357,9 @@ def test_a_lamp_is_no_dot_but_in_the_area_of_the_dots(tmp_path: Path) -> None:
     assert np.isfinite(beside).all()
     np.testing.assert_allclose(beside[:8], whole[:8])
     beyond_px = 41, *area_px[1:]
+    check_area(area_px, film, path)
     with pytest.raises(UsageError, match=f"reaches to {camera.width + 1}, {camera.height}"):
-        track_markers(path, film, find, is_grey=True, area_px=beyond_px)
+        check_area(beyond_px, film, path)
 
 
 def test_a_checkerboard_gives_the_lens_and_its_distortion_is_removed(tmp_path: Path) -> None:
@@ -375,7 +445,7 @@ def test_a_film_without_markers_and_one_that_breaks_off_are_refused(tmp_path: Pa
     with pytest.raises(FileFormatError, match="no picture shows both markers"):
         track_markers(path, read_film(path)[0], make_tag_finder(1, 2), is_grey=True)
     with pytest.raises(UsageError, match="beige"):
-        make_dot_finder("beige")
+        make_dot_finder("beige", DRAWN)
     cut = tmp_path / "cut.mp4"
     whole = write_film(tmp_path / "whole.mp4", camera, blank, begin_s).read_bytes()
     cut.write_bytes(whole[: len(whole) // 2])

@@ -13,7 +13,7 @@ import av
 import psutil
 import pytest
 
-from devices.errors import FileFormatError, MissingExtraError, StateError
+from devices.errors import FileFormatError, FootTileError, MissingExtraError
 from service.video import worker
 from service.video.worker import check_extra_installed, describe_film
 from tests.service.video.short_film import PICTURES, RATE_HZ, short_film
@@ -89,23 +89,29 @@ def test_a_text_that_names_other_files_or_addresses_is_no_film(film: Path, text:
 
 
 @pytest.mark.parametrize(
-    ("act", "said"),
+    ("act", "said", "kind"),
     [
-        ("os.kill(os.getpid(), 11)", "ended with signal 11"),
-        ("os._exit(3)", "ended with code 3"),
-        ("bytearray(8 << 30)", "needs more than 4 GiB"),
+        ("os.kill(os.getpid(), 11)", "ended with signal 11", FileFormatError),
+        ("os._exit(3)", "ended with code 3", FileFormatError),
+        ("bytearray(8 << 30)", "needs more than 4 GiB", FileFormatError),
         (
             "open('/dev/null', 'wb') and open(path, 'ab').write(b'x' * 9999)",
             "a bug: .*File too large",
+            FootTileError,  # no fault of the film, nor of a state
         ),
     ],
 )
 def test_a_decoder_that_crashes_is_an_error_that_names_the_film(
-    film: Path, monkeypatch: pytest.MonkeyPatch, act: str, said: str
+    film: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    act: str,
+    said: str,
+    kind: type[FootTileError],
 ) -> None:
     monkeypatch.setattr(worker, "_CODE", _TASK.format(act))
-    with pytest.raises((FileFormatError, StateError), match=said) as caught:
+    with pytest.raises(FootTileError, match=said) as caught:
         describe_film(film, "walk.mp4")
+    assert type(caught.value) is kind
     assert caught.value.where == "walk.mp4"
     assert film.read_bytes() == short_film()
 
