@@ -119,7 +119,8 @@ class Client(Closeable):
             take: id of the take, `RemoteSession.take`.
             path: file to write, atomically.
             format: format for several sessions: `c3d`, `opensim`, `mcap`, `mat`, `xdf`.
-            start_s: first instant, seconds after each session's first frame; None: the beginning.
+            start_s: first instant, seconds after the first frame of all sessions, by the server's
+                clock; None: the beginning.
             end_s: end, exclusive; None: the end.
 
         Raises:

@@ -129,7 +129,8 @@ def pull_export(
     its pages' checksums, and its metadata state the session.
 
     Returns:
-        The session's metadata, with `path` and `bytes`.
+        The session's metadata, with `path`, `bytes` and `remarks`: what the format filled or left
+        out; empty: nothing.
 
     Raises:
         foottile.DamagedError: the download cannot be read.
@@ -139,10 +140,10 @@ def pull_export(
     """
     session = _get_session_metadata(server, session_id)
     url = f"/sessions/{session_id}/data"
-    path = _download_export(
+    downloaded = _download_export(
         server, url, session_id, out_folder, selection, export_format, options, clock
     )
-    return {**session, "path": str(path), "bytes": path.stat().st_size}
+    return {**session, **downloaded}
 
 
 def pull_take_export(
@@ -156,7 +157,7 @@ def pull_take_export(
     """Download all sessions of a take, or a slice of each, as one file in the folder `out`.
 
     Returns:
-        The take's metadata, with `complete`, `path` and `bytes`.
+        The take's metadata, with `complete`, and `path`, `bytes` and `remarks` as for a session.
 
     Raises:
         foottile.ClientError: the server does not answer, or refuses.
@@ -166,10 +167,10 @@ def pull_take_export(
     url = f"/takes/{quote(take_id, safe='')}"
     take = server.http.get(url)
     complete = "lossy" if any(s["complete"] == "lossy" for s in take["sessions"]) else True
-    path = _download_export(
+    downloaded = _download_export(
         server, f"{url}/data", f"take-{take['id']}", out_folder, selection, export_format, options
     )
-    return {**take, "complete": complete, "path": str(path), "bytes": path.stat().st_size}
+    return {**take, "complete": complete, **downloaded}
 
 
 def _download_export(
@@ -181,7 +182,8 @@ def _download_export(
     export_format: ExportFormat,
     options: FormatOptions,
     clock: ClockName | None = None,
-) -> Path:
+) -> dict[str, Any]:
+    """Download an export; return its `path`, `bytes` and `remarks`."""
     refuse_data_folder(out_folder)
     with translate_storage_errors(out_folder):
         out_folder.mkdir(parents=True, exist_ok=True)
@@ -203,6 +205,7 @@ def _download_export(
             translate_storage_errors(partial),
             partial.open("xb") as file,
         ):
+            remarks = answer.headers.get("Foottile-Remarks", "")
             _write_response(answer, file)
         # For other formats, only the connection detects truncation.
         report = (
@@ -220,7 +223,7 @@ def _download_export(
             sync_folder(path.parent)
     finally:
         partial.unlink(missing_ok=True)
-    return path
+    return {"path": str(path), "bytes": path.stat().st_size, "remarks": remarks}
 
 
 def _get_session_metadata(server: foottile.Client, session_id: str) -> Mapping[str, Any]:

@@ -9,7 +9,12 @@ from pathlib import Path
 
 from devices.errors import UsageError
 from storage.durable_files import open_for_atomic_write
-from storage.formats.export import ClockName, Export, make_sealed_export
+from storage.formats.export import (
+    ClockName,
+    Export,
+    compute_take_offsets_s,
+    make_sealed_export,
+)
 from storage.formats.markers import PlacedMarker, place_session_markers
 from storage.formats.slice import NO_OPTIONS, FormatOptions, Slice
 from storage.formats.writers.registry import get_format, get_multi_session_format
@@ -42,7 +47,7 @@ class ExportResult:
     is_markers_file_missing: bool
     """True if a markers file was expected beside the frames but is missing."""
     remarks: tuple[str, ...]
-    """Remarks on the time axes for the user."""
+    """Remarks for the user on time axes and filled gaps."""
 
 
 def export_session(source: Path, out: Path, options: ExportOptions) -> ExportResult:
@@ -70,7 +75,7 @@ def export_merged(sources: Sequence[Path], out: Path, options: ExportOptions) ->
     Args:
         sources: the sessions' frames files.
         out: the file to write.
-        options: options of the export; a slice counts from each session's own first frame.
+        options: options of the export; a slice counts from the first frame of all sessions.
 
     Raises:
         UsageError: as for `export_session`; or the format supports one session only.
@@ -85,13 +90,18 @@ def export_merged(sources: Sequence[Path], out: Path, options: ExportOptions) ->
             )
             for source in sources
         ]
-        found = [_prepare_export(reader, options) for reader in readers]
+        found = [
+            _prepare_export(reader, options, offset_s)
+            for reader, offset_s in zip(readers, compute_take_offsets_s(readers), strict=True)
+        ]
         exports = [export for export, _ in found]
         lacks_marks = any(lacks for _, lacks in found)
         return _write_export(out, to.encode_together_on_server_clock(exports), exports, lacks_marks)
 
 
-def _prepare_export(reader: SealedFileReader, options: ExportOptions) -> tuple[Export, bool]:
+def _prepare_export(
+    reader: SealedFileReader, options: ExportOptions, take_offset_s: float = 0.0
+) -> tuple[Export, bool]:
     """Prepare an export; also return True if an expected markers file is missing."""
     beside = reader.path.with_name(MARKERS_NAME)
     stored = (
@@ -103,9 +113,15 @@ def _prepare_export(reader: SealedFileReader, options: ExportOptions) -> tuple[E
             where=str(reader.path.parent),
             expected="a session's folder as a server sealed it or `foottile pull` fetched it",
         )
-    placed = None if stored is None else place_session_markers(reader, stored, options.part)
+    part = options.part.shift(-take_offset_s)
+    placed = None if stored is None else place_session_markers(reader, stored, part)
     export = make_sealed_export(
-        reader, options.part, clock=options.clock, markers=placed, options=options.options
+        reader,
+        part,
+        clock=options.clock,
+        markers=placed,
+        options=options.options,
+        take_offset_s=take_offset_s,
     )
     return export, options.markers is None and stored is None and "session" in reader.notes
 
@@ -124,4 +140,5 @@ def _write_export(
         for export in exports
         if (remark := export.frame_source.axis.explain_shift_or_empty())
     ]
+    remarks += [remark for export in exports for remark in export.remarks]
     return ExportResult(out.stat().st_size, tuple(left_out), lacks_marks, tuple(remarks))

@@ -29,6 +29,7 @@ from storage.schema import (
     MEASURED_COLUMNS,
     SERVER_TIME_COLUMNS,
     TIME_COLUMNS,
+    UNKNOWN_T_NS,
     Array,
     to_flat_column,
 )
@@ -150,6 +151,9 @@ class Export:
         markers: placed markers; adds `marker`, and each marker to the notes; None: none.
         provenance: session and its hashes.
         options: options of the format.
+        take_offset_s: time of the session's first frame after the first of all sessions in the
+            file, by the server's clock.
+        remarks: remarks of the format for the user, complete with the file's first chunk.
     """
 
     frame_source: FrameSource
@@ -160,6 +164,8 @@ class Export:
     markers: PlacedMarkers | None = None
     provenance: Mapping[str, object] = field(default_factory=dict)
     options: FormatOptions = NO_OPTIONS
+    take_offset_s: float = 0.0
+    remarks: list[str] = field(default_factory=list, compare=False)
 
     @property
     def session_and_node_text(self) -> str:
@@ -379,8 +385,17 @@ def make_sealed_export(
     clock: ClockName = "node",
     markers: PlacedMarkers | None = None,
     options: FormatOptions = NO_OPTIONS,
+    take_offset_s: float = 0.0,
 ) -> Export:
     """Return the export of a sealed file, which reads only the data that the slice needs.
+
+    Args:
+        reader: the file.
+        selection: rows and columns; seconds count from the session's first frame.
+        clock: clock whose time is added.
+        markers: placed markers; None: none.
+        options: options of the format.
+        take_offset_s: as for `Export`.
 
     Raises:
         UsageError: the server's time is requested, and the clock table is missing.
@@ -408,7 +423,33 @@ def make_sealed_export(
         markers,
         reader.session_id_and_hashes,
         options,
+        take_offset_s,
     )
+
+
+def compute_take_offsets_s(readers: Sequence[SealedFileReader]) -> list[float]:
+    """Return the time of each session's first frame after the first of all, by the server's clock.
+
+    Raises:
+        UsageError: the clock of a session's first frame was never compared, or its table is
+            missing.
+        FileFormatError: a file or its clock table is damaged.
+    """
+    begins_ns = []
+    for reader in readers:
+        first = reader.read_part_spans()[0]
+        times = load_clock_table(reader).compute_server_time_columns_or_unknown(
+            np.array(first.t_mono_ns[:1]), np.array(first.t_ns[:1]), np.array([first.number])
+        )
+        begin_ns = int(times["t_server_ns"][0])
+        if begin_ns == UNKNOWN_T_NS:
+            raise UsageError(
+                "the server's time is not known for its first frame",
+                where=f"session {reader.session_id_and_hashes.get('session')}",
+                remedy="Export each session by itself, by the node's clock",
+            )
+        begins_ns.append(begin_ns)
+    return [(begin_ns - min(begins_ns)) * 1e-9 for begin_ns in begins_ns]
 
 
 def _flatten_frames(frames: FrameBatch, extra: Mapping[str, Array]) -> dict[str, Array]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -68,6 +68,23 @@ class Slice:
         )
         return start, end
 
+    def shift(self, by_s: float) -> Slice:
+        """Return the slice with its bounds later by some seconds, from 0 on.
+
+        Raises:
+            UsageError: it then ends at 0 or before.
+        """
+        if self.end_s is not None and self.end_s + by_s <= 0.0:
+            raise UsageError(
+                f"the slice ends at {self.end_s:g} s, and one of the sessions begins at "
+                f"{-by_s:.3f} s",
+                expected="a slice with frames of each session",
+            )
+        start_s, end_s = (
+            None if seconds is None else seconds + by_s for seconds in (self.start_s, self.end_s)
+        )
+        return replace(self, start_s=start_s and max(start_s, 0.0), end_s=end_s)
+
     def compute_row_mask(self, t_ns: Array, begin_t_ns: int) -> Array:
         """Return the mask of the frames in the slice, bool[n].
 
@@ -116,7 +133,12 @@ class FormatOptions(BaseModel):
         description="OpenSim: the model's body that the ground acts on, such as `calcn_r`. "
         "Default: `foot`. For several sessions, one body each, in their order: `calcn_l,calcn_r`.",
     )
-
+    long_gap: Literal["refuse", "end"] | None = Field(
+        default=None,
+        description="OpenSim has no value for an unknown force. A gap too long for a straight line "
+        "(50 ms, 20 ms at a begin or end of contact), or with a saturated tile: refuse the file "
+        "(default), or end it before the gap.",
+    )
     messages: Literal["foxglove", "ros2"] | None = Field(
         default=None,
         description="Messages of MCAP: Foxglove's, with every column of every frame, or ROS 2's.",

@@ -11,7 +11,7 @@ import hashlib
 import time
 import zipfile
 from collections.abc import Generator, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -82,7 +82,8 @@ async def get_data(
     Parquet without slice, columns, server's clock or markers is the stored file: with ranges, a
     strong ETag that is its SHA-256, and a digest. Any other file is made on request and streamed;
     while a session is recorded it has the present frames. `Foottile-Complete` states whether frames
-    are missing, `Foottile-Markers` the number of markers in it and of markers left out.
+    are missing, `Foottile-Markers` the number of markers in it and of markers left out,
+    `Foottile-Remarks` the gaps that a format without unknown values filled, and rows left out.
     """
     session = require_frames(server.sessions.get_session(session_id))
     ledger = server.recorder.get_ledger(session_id)
@@ -96,7 +97,10 @@ async def get_data(
         return _stored_response(session, session.sha256, request, server, headers)
     return await respond_with_export(
         [session],
-        lambda markers: _write_export(session, query, server, markers[0] if markers else None),
+        [query.slice],
+        lambda markers, remarks: _write_export(
+            session, query, server, markers[0] if markers else None, remarks
+        ),
         query,
         request,
         server,
@@ -119,7 +123,11 @@ def _stored_response(
 
 
 def _write_export(
-    session: Session, query: DataQuery, server: Server, markers: PlacedMarkers | None
+    session: Session,
+    query: DataQuery,
+    server: Server,
+    markers: PlacedMarkers | None,
+    remarks: list[str],
 ) -> Chunks:
     if session.sha256 is None:
         sources = server.recorder.collect_inputs_from_journals(session.id)
@@ -144,6 +152,7 @@ def _write_export(
                 markers,
                 source,
                 query.options,
+                remarks=remarks,
             )
         )
         return
@@ -153,7 +162,7 @@ def _write_export(
         export = make_sealed_export(
             reader, query.slice, clock=query.clock, markers=markers, options=query.options
         )
-        yield from query.format_spec.encode(export)
+        yield from query.format_spec.encode(replace(export, remarks=remarks))
 
 
 _ZIP_CHUNK_BYTES = 1 << 20

@@ -27,7 +27,7 @@ from storage.formats.markers import (
     place_session_markers,
 )
 from storage.formats.slice import FormatOptions, Slice
-from storage.formats.writers.format import ExportFormat
+from storage.formats.writers.format import ExportFormat, to_ascii_line
 from storage.formats.writers.registry import (
     MULTI_SESSION_FORMATS,
     FormatName,
@@ -132,6 +132,8 @@ class TakeDataQuery(ExportQuery):
 
 
 Chunks = Generator[bytes, None, None]
+REMARKS_HEADER = "Foottile-Remarks"
+"""Header of what a format filled or left out; absent: nothing."""
 _NOT_IN_NAMES = re.compile(r"[^A-Za-z0-9.-]+")
 _NAME_LENGTH = 60
 
@@ -172,7 +174,8 @@ def make_file_stem(name: str, id_: str, part: Slice) -> str:
 
 async def respond_with_export(
     sessions: list[Session],
-    write: Callable[[list[PlacedMarkers] | None], Chunks],
+    slices: list[Slice],
+    write: Callable[[list[PlacedMarkers] | None, list[str]], Chunks],
     query: ExportQuery,
     request: Request,
     server: Server,
@@ -183,7 +186,9 @@ async def respond_with_export(
 
     Args:
         sessions: sessions in the file.
-        write: makes the chunks with the markers of each session; None: without markers.
+        slices: slice of each session, counted from its own first frame.
+        write: makes the chunks with the markers of each session, None: without markers; adds
+            remarks to the list before the first chunk.
         query: query of the request.
         request: the request.
         server: the server.
@@ -200,33 +205,37 @@ async def respond_with_export(
     markers = None
     if query.has_markers:
         markers = [
-            await run_in_threadpool(_place_markers, each, query, server) for each in sessions
+            await run_in_threadpool(_place_markers, session, part, server)
+            for session, part in zip(sessions, slices, strict=True)
         ]
         headers |= _marker_headers(markers)
-    chunks = write(markers)
+    remarks: list[str] = []
+    chunks = write(markers, remarks)
     # The first chunk now: an invalid query is then an answer, not a broken download.
     first = await run_in_threadpool(next, chunks, None)
     if first is None:
         raise UsageError("the session has no frames")
+    if remarks:
+        headers[REMARKS_HEADER] = to_ascii_line("; ".join(remarks))
     headers["Content-Disposition"] = f'attachment; filename="{stem}{query.format_spec.ending}"'
     return StreamingResponse(
         iterate_chunks(chunks, first), headers=headers, media_type=query.format_spec.media_type
     )
 
 
-def _place_markers(session: Session, query: ExportQuery, server: Server) -> PlacedMarkers:
+def _place_markers(session: Session, part: Slice, server: Server) -> PlacedMarkers:
     if not session.markers:
         return PlacedMarkers(())
     if session.sha256 is not None:
         with server.sessions.open_frames(session.id, only_slices=True) as reader:
-            return place_session_markers(reader, session.markers, query.slice)
+            return place_session_markers(reader, session.markers, part)
     sources = server.recorder.collect_inputs_from_journals(session.id)
     times = (
         {name: getattr(frames, name) for name in PLACEMENT_COLUMNS} | {"part": columns["part"]}
         for frames, columns in iterate_raw_frames_with_part(sources)
     )
     axis = sources.compute_time_axis()
-    return place_markers(session.markers, times, sources.make_clock_table(), query.slice, axis=axis)
+    return place_markers(session.markers, times, sources.make_clock_table(), part, axis=axis)
 
 
 async def iterate_chunks(chunks: Chunks, first: bytes = b"") -> AsyncIterator[bytes]:

@@ -59,7 +59,8 @@ def _make_options(**values: Any) -> FormatOptions:
         return FormatOptions(**values)
     except ValidationError as error:
         (name, *_), why = error.errors()[0]["loc"], error.errors()[0]["msg"]
-        raise UsageError(f"--{name} {values[str(name)]!r}: {why}") from error
+        option = f"--{str(name).replace('_', '-')}"
+        raise UsageError(f"{option} {values[str(name)]!r}: {why}") from error
 
 
 def _make_parameter(name: str, field: FieldInfo) -> inspect.Parameter:
@@ -235,6 +236,8 @@ def pull_command(
         echo(f"{pulled['path']}: {pulled['frames']} frames, {pulled['bytes']} bytes, hash verified")
         if pulled["resumed_bytes"]:
             remark(f"resumed after {pulled['resumed_bytes']} bytes")
+    if pulled.get("remarks"):
+        remark(pulled["remarks"])
     if pulled["complete"] == "lossy":
         remark("the session is lossy: frames are lost")
         raise typer.Exit(EXIT_INCOMPLETE)

@@ -135,7 +135,7 @@ def build_c3d_content(reactions: Sequence[GroundReaction], exports: Sequence[Exp
     analog = np.full((len(channels), samples + filling), np.nan)
     for row, (*_, values) in zip(analog, channels, strict=True):
         row[:samples] = values
-    rate_hz = reactions[0].resampling.rate_hz
+    rate_hz = reactions[0].resampling.axis.rate_hz
     groups: dict[str, dict[str, Any]] = {
         "POINT": {
             "RATE": [rate_hz / per_frame],
@@ -201,7 +201,7 @@ def _metadata_texts(
             "channel contact"
         )
     texts = {
-        **format_metadata(export, reaction.resampling.begin_ns),
+        **format_metadata(export, reaction.resampling.axis.begin_ns),
         "AXES": "the foot frame: x forward, y to the left, z up the segment, origin at the ankle; "
         "the platform moves with the foot",
         "RESAMPLED": reaction.resampling.describe(),

@@ -28,9 +28,16 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.csv as pacsv
 
-from devices.arrays import Bools, Floats
+from devices.arrays import Floats
 from devices.errors import UsageError
 from storage.formats.export import Export
+from storage.formats.writers.force_gaps import (
+    BridgedForce,
+    TrialRows,
+    bridge_force_gaps,
+    fill_point_gaps,
+    select_trial_rows,
+)
 from storage.formats.writers.format import (
     DrainedBuffer,
     ExportFormat,
@@ -42,9 +49,6 @@ from storage.formats.writers.format import (
 )
 from storage.formats.writers.resampling import COP, GroundReaction, read_reactions_on_common_axis
 from storage.formats.writers.tables import write_spreadsheet_safe_csv
-
-INTERPOLATED_MAX_S = 0.02
-"""Longest interpolated stretch of unknown GRF; longer stretches are 0."""
 
 LOAD_COLUMNS = (
     *(f"ground_force_v{axis}" for axis in "xyz"),
@@ -59,17 +63,15 @@ GROUND_X = "cop_ground_x_m"
 _FILL_REASONS = {
     1: (
         "force and point",
-        "force 0, point on a line between those before and behind",
+        "force 0, point as before and behind, on a line between",
         "no contact",
     ),
     2: ("force", "line between the forces before and behind", "GRF not known"),
-    3: ("force", "0", "GRF not known"),
-    4: ("force", "line between the forces before and behind", "no frame: lost or not taken"),
-    5: ("force", "0", "no frame: lost or not taken"),
-    6: ("point", "line between the points before and behind", "no centre of pressure stated"),
+    3: ("force", "line between the forces before and behind", "no frame: lost or not taken"),
+    4: ("point", "nearest of its stance, on a line between two", "no centre of pressure stated"),
 }
 _NOT_FILLED = 0
-_UNLOADED, _LINE, _ZERO, _LINE_EMPTY, _ZERO_EMPTY, _POINT = _FILL_REASONS
+_UNLOADED, _LINE, _LINE_EMPTY, _POINT = _FILL_REASONS
 
 
 @dataclass(frozen=True)
@@ -109,69 +111,57 @@ class FootLoads:
         return pa.table(columns, names=names)
 
 
-def _compute_gapless_foot_loads(
-    reaction: GroundReaction, export: Export, *, is_only_foot: bool
+def _compute_foot_loads(
+    reaction: GroundReaction,
+    force: BridgedForce,
+    export: Export,
+    rows: slice,
+    *,
+    is_only_foot: bool,
 ) -> FootLoads:
-    """Compute the loads on the foot at each sample, with unknown numbers filled.
+    """Compute the loads on the foot in rows with a known force, with unknown points filled.
 
     Args:
         reaction: ground reaction of the session.
+        force: its force.
         export: export of the session.
+        rows: rows of the file, of all samples.
         is_only_foot: True for a single foot; only then loads may be in the ground's frame.
 
     Raises:
-        UsageError: no sample has a centre of pressure.
+        UsageError: no frame has a centre of pressure.
     """
     places = [tile.z_m for tile in export.array_info.tiles if not tile.reference]
-    points = [reaction.resample_column(name) for name in COP]
+    points = [reaction.columns[name].astype(np.float64) for name in COP]
     is_ground = False
     if is_only_foot and GROUND_X in reaction.columns:
-        ground_x_m = reaction.resample_column(GROUND_X)
+        ground_x_m = reaction.columns[GROUND_X].astype(np.float64)
         is_ground = bool(np.isfinite(ground_x_m).any())
         points[0] = ground_x_m if is_ground else points[0]
-    stated = np.isfinite(points).all(axis=0)
-    if not stated.any():
+    if not np.isfinite(points).all(axis=0).any():
         raise UsageError(
             "no centre of pressure is stated in it, and a force without a point is no load",
             where=export.session_and_node_text,
             remedy="Ask for C3D, Parquet, Arrow or CSV",
         )
-    contact = reaction.resample_column("contact")
-    unloaded = contact == 0.0
-    known_n = reaction.resampling.interpolate(reaction.frame_contact_grf_n)
-    known_n[unloaded] = 0.0
-    known = np.isfinite(known_n)
-    empty = ~reaction.resampling.has_frames
-    time_s = reaction.resampling.elapsed_s
-    force_n, bridged = _fill_force_gaps(time_s, known_n, known)
-    at = np.flatnonzero(stated)
-    x_m, left_m = (np.interp(time_s, time_s[at], values[at]) for values in points)
-    code = np.zeros(len(time_s), dtype=np.uint8)
+    x_m, left_m = fill_point_gaps(reaction, points)
+    stated = np.isfinite([reaction.resampling.interpolate(values) for values in points]).all(axis=0)
+    code = np.zeros(len(reaction.resampling), dtype=np.uint8)
     code[~stated] = _POINT
-    code[~known] = np.where(bridged, _LINE, _ZERO)[~known]
-    code[empty] = np.where(bridged, _LINE_EMPTY, _ZERO_EMPTY)[empty]
-    code[unloaded] = _UNLOADED
-    nothing = np.zeros(len(time_s))
-    up_m = nothing if is_ground else np.full(len(time_s), float(np.mean(places)))
-    columns = [nothing, force_n, nothing, x_m, up_m, -left_m, nothing, nothing, nothing]
+    code[reaction.resample_column("contact") == 0.0] = _UNLOADED
+    code[force.is_bridged] = np.where(reaction.resampling.has_frames, _LINE, _LINE_EMPTY)[
+        force.is_bridged
+    ]
+    nothing = np.zeros(len(code))
+    up_m = nothing if is_ground else np.full(len(code), float(np.mean(places)))
+    columns = [nothing, force.force_n, nothing, x_m, up_m, -left_m, nothing, nothing, nothing]
     return FootLoads(
-        time_s,
-        np.stack(columns, axis=1),
-        code,
-        reaction.resample_column("estimate_flags"),
+        reaction.resampling.elapsed_s[rows],
+        np.stack(columns, axis=1)[rows],
+        code[rows],
+        reaction.resample_column("estimate_flags")[rows],
         "ground" if is_ground else "foot",
     )
-
-
-def _fill_force_gaps(time_s: Floats, force_n: Floats, known: Bools) -> tuple[Floats, Bools]:
-    """Return forces without NaN, and the mask of the interpolated samples."""
-    at = np.flatnonzero(known)
-    after = np.searchsorted(at, np.arange(len(time_s)))
-    inside = (after > 0) & (after < len(at)) & ~known
-    before_at, after_at = at[np.maximum(after - 1, 0)], at[np.minimum(after, len(at) - 1)]
-    bridged = inside & (time_s[after_at] - time_s[before_at] <= INTERPOLATED_MAX_S)
-    line_n = np.interp(time_s, time_s[at], force_n[at])
-    return np.where(known, force_n, np.where(bridged, line_n, 0.0)), bridged
 
 
 def _combined_flags(flags: Floats) -> int | None:
@@ -220,15 +210,17 @@ class ExportedFoot:
 
 
 def _encode(exports: Sequence[Export]) -> Iterator[bytes]:
-    feet = _make_feet(exports)
+    feet, trial = _make_feet(exports)
+    if trial.is_remarkable:
+        exports[0].remarks.append(trial.text)
     named = to_ascii_line(str(exports[0].provenance_and_slice_metadata.get("session") or "session"))
     stem = _INVALID_IN_NAMES.sub(
         "_", named if len(feet) == 1 else f"{named}-and-{len(feet) - 1}-more"
     )
     filled = [foot.loads.list_filled_stretches() for foot in feet]
-    foot_notes = [_make_notes(foot, table) for foot, table in zip(feet, filled, strict=True)]
-    events = [_make_event_table(foot.reaction) for foot in feet]
-    time_s = feet[0].reaction.resampling.elapsed_s
+    foot_notes = [_make_notes(foot, table, trial) for foot, table in zip(feet, filled, strict=True)]
+    events = [_make_event_table(foot) for foot in feet]
+    time_s = feet[0].loads.time_s
     table = np.concatenate([time_s[:, None], *(foot.loads.table for foot in feet)], axis=1)
     sink = DrainedBuffer()
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
@@ -243,14 +235,14 @@ def _encode(exports: Sequence[Export]) -> Iterator[bytes]:
             file.writestr(_make_zip_entry(stem + ending), content)
         with file.open(_make_zip_entry(f"{stem}.mot"), "w", force_zip64=True) as entry:
             names = ["time", *(foot.column_prefix + name for foot in feet for name in LOAD_COLUMNS)]
-            entry.write(_encode_mot_head(stem, len(table), names))
+            entry.write(_encode_mot_head(stem, len(table), names, trial.text))
             for begin in range(0, len(table), _CHUNK_ROWS):
                 entry.write(_encode_mot_rows(table[begin : begin + _CHUNK_ROWS], names))
                 yield sink.drain()
     yield sink.drain()
 
 
-def _make_feet(exports: Sequence[Export]) -> list[ExportedFoot]:
+def _make_feet(exports: Sequence[Export]) -> tuple[list[ExportedFoot], TrialRows]:
     is_alone = len(exports) == 1
     nodes = make_names_unique(
         [_INVALID_IN_NAMES.sub("_", to_ascii_line(each.array_info.node)) for each in exports]
@@ -266,13 +258,15 @@ def _make_feet(exports: Sequence[Export]) -> list[ExportedFoot]:
                 + ", ".join(each.session_and_node_text for each in exports),
             )
     found = read_reactions_on_common_axis(exports, [GROUND_X], FRAMES_MAX // len(exports))
+    forces = [bridge_force_gaps(reaction) for reaction in found]
+    trial = select_trial_rows(found, forces, exports)
     loads = [
-        _compute_gapless_foot_loads(each, export, is_only_foot=is_alone)
-        for each, export in zip(found, exports, strict=True)
+        _compute_foot_loads(*of_foot, trial.rows, is_only_foot=is_alone)
+        for of_foot in zip(found, forces, exports, strict=True)
     ]
     return [
         ExportedFoot(*of_foot) for of_foot in zip(exports, found, loads, names, bodies, strict=True)
-    ]
+    ], trial
 
 
 def make_external_loads_xml(mot_name: str, feet: Sequence[ExportedFoot]) -> str:
@@ -306,7 +300,7 @@ def _make_external_force_xml(foot: ExportedFoot) -> str:
     return f'\t\t\t<ExternalForce name="{name}">\n{inside}\t\t\t</ExternalForce>\n'
 
 
-def _make_notes(foot: ExportedFoot, filled: pa.Table) -> dict[str, object]:
+def _make_notes(foot: ExportedFoot, filled: pa.Table, trial: TrialRows) -> dict[str, object]:
     by_reason = Counter[str]()
     for row in filled.to_pylist():
         by_reason[row["because"]] += row["rows"]
@@ -319,23 +313,25 @@ def _make_notes(foot: ExportedFoot, filled: pa.Table) -> dict[str, object]:
     )
     steady = foot.reaction.resampling
     return {
-        **format_metadata(foot.export, steady.begin_ns),
+        **format_metadata(foot.export, steady.axis.begin_ns),
         "AXES": to_ascii_line(axes),
         "RESAMPLED": steady.describe(),
         "FILLED": "unknown numbers, as the format has no number for them: every stretch is in the "
         "table of filled stretches",
+        "GAPS": trial.text,
         "BODY": foot.body,
         "COLUMNS": f"{foot.column_prefix}ground_force_vx and the eight behind it",
         "NOT_MEASURED": "shear and free moment: 0",
         "ROWS": len(foot.loads.table),
         "FILLED_ROWS": dict(by_reason),
-        "MARKS": foot.reaction.marker_count,
+        "MARKS": _make_event_table(foot)["kind"].to_pylist().count("marker"),
         **format_largest_clock_bound(foot.reaction.server_time_bound_s),
     }
 
 
-def _encode_mot_head(name: str, rows: int, columns: Sequence[str]) -> bytes:
-    head = f"{name}\nversion=1\nnRows={rows}\nnColumns={len(columns)}\ninDegrees=no\nendheader\n"
+def _encode_mot_head(name: str, rows: int, columns: Sequence[str], gaps: str) -> bytes:
+    head = f"{name}\nversion=1\nnRows={rows}\nnColumns={len(columns)}\ninDegrees=no\n"
+    head += f"gaps={gaps}\nendheader\n"
     return (head + "\t".join(columns) + "\n").encode()
 
 
@@ -349,12 +345,21 @@ def _encode_mot_rows(rows: Floats, columns: Sequence[str]) -> bytes:
     return sink.getvalue()
 
 
-def _make_event_table(reaction: GroundReaction) -> pa.Table:
+def _make_event_table(foot: ExportedFoot) -> pa.Table:
+    """Return the events between the first row and the last."""
+    reaction, time_s = foot.reaction, foot.loads.time_s
+    period_s = reaction.resampling.axis.period_ns * 1e-9
     count = reaction.marker_count
     kinds = ["marker"] * count + ["contact"] * (len(reaction.events) - count)
-    times = pa.array([at_s for at_s, _ in reaction.events], pa.float64())
-    labels = pa.array([label for _, label in reaction.events], pa.string())
-    return pa.table([times, labels, pa.array(kinds, pa.string())], names=["time", "event", "kind"])
+    rows = [
+        (at_s, label, kind)
+        for (at_s, label), kind in zip(reaction.events, kinds, strict=True)
+        if time_s[0] - period_s < at_s < time_s[-1] + period_s
+    ]
+    types = {"time": pa.float64(), "event": pa.string(), "kind": pa.string()}
+    columns = zip(types.values(), range(len(types)), strict=True)
+    arrays = [pa.array([row[i] for row in rows], type_) for type_, i in columns]
+    return pa.table(arrays, names=list(types))
 
 
 def _join_tables(tables: Sequence[pa.Table], feet: Sequence[ExportedFoot]) -> pa.Table:
@@ -388,7 +393,7 @@ OPENSIM = ExportFormat(
     _encode,
     group_encoder=_encode,
     suffix="opensim.zip",
-    options=("body",),
+    options=("body", "long_gap"),
     takes_columns=False,
     needs_forces=True,
     frames_max=FRAMES_MAX,

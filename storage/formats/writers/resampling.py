@@ -12,6 +12,7 @@ along their axis only: shear and the free moment are unknown, and written as 0.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -22,7 +23,7 @@ from devices.errors import UsageError
 from devices.flags import EstimateFlag
 from devices.frames import ArrayInfo
 from storage.formats.export import Export
-from storage.formats.writers.format import get_instants_on_export_clock_ns
+from storage.formats.writers.format import get_instants_on_export_clock_ns, to_floats_with_nan
 from storage.schema import Array
 
 INTERPOLATED_PERIODS_MAX = 2.5
@@ -34,20 +35,38 @@ _NOMINAL_RATE_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
-class Resampling:
-    """Linear resampling of m frames to n samples at a constant rate.
+class SampleAxis:
+    """Time axis of samples at a constant rate.
 
     Attributes:
         rate_hz: rate, exact in float32 as C3D stores it.
         begin_ns: instant of the first sample.
+        count: number of samples.
+    """
+
+    rate_hz: float
+    begin_ns: int
+    count: int
+
+    @property
+    def period_ns(self) -> float:
+        """Time between two samples, in ns."""
+        return 1e9 / self.rate_hz
+
+
+@dataclass(frozen=True)
+class Resampling:
+    """Linear resampling of m frames to n samples at a constant rate.
+
+    Attributes:
+        axis: time axis of the samples.
         frame_before: (n,), index of the last frame not after the sample.
         frame_after: (n,), index of the next frame, or the same index at the end.
         fraction: (n,), fraction of the interval from `before` to `after`, 0 to 1.
         has_frames: (n,), bool; False: the sample is empty.
     """
 
-    rate_hz: float
-    begin_ns: int
+    axis: SampleAxis
     frame_before: Ints
     frame_after: Ints
     fraction: Floats
@@ -59,7 +78,7 @@ class Resampling:
     @property
     def elapsed_s(self) -> Floats:
         """Times of the samples (n,), in seconds since the first."""
-        return np.arange(len(self)) / self.rate_hz
+        return np.arange(len(self)) / self.axis.rate_hz
 
     @property
     def empty_count(self) -> int:
@@ -82,25 +101,10 @@ class Resampling:
     def describe(self) -> str:
         """Return a description of the resampling, for the file."""
         text = (
-            f"{len(self)} samples at {self.rate_hz:.9g} Hz, on straight lines between frames that "
-            "follow upon each other; flags are the nearer frame's"
+            f"{len(self)} samples at {self.axis.rate_hz:.9g} Hz, on straight lines between frames "
+            "that follow upon each other; flags are the nearer frame's"
         )
         return f"{text}; {self.empty_count} samples are empty: frames lost, or not taken"
-
-
-@dataclass(frozen=True)
-class SampleAxis:
-    """Time axis of samples at a constant rate.
-
-    Attributes:
-        rate_hz: rate, exact in float32 as C3D stores it.
-        begin_ns: instant of the first sample.
-        count: number of samples.
-    """
-
-    rate_hz: float
-    begin_ns: int
-    count: int
 
 
 def make_sample_axis(streams: Sequence[tuple[Times, float]], samples_max: int) -> SampleAxis:
@@ -130,8 +134,8 @@ def make_sample_axis(streams: Sequence[tuple[Times, float]], samples_max: int) -
     return SampleAxis(rate_hz, begin_ns, count)
 
 
-def make_resampling(axis: SampleAxis, t_ns: Times, seq: Array, part: Array | None) -> Resampling:
-    """Return the resampling of frames to a time axis.
+def find_consecutive_frames(axis: SampleAxis, t_ns: Times, seq: Array, part: Array | None) -> Bools:
+    """Return the mask (m - 1,) of the frames that the next one follows without a gap.
 
     Args:
         axis: time axis that covers the frames.
@@ -139,7 +143,22 @@ def make_resampling(axis: SampleAxis, t_ns: Times, seq: Array, part: Array | Non
         seq: (m,), numbers of the frames.
         part: (m,), parts of the session; None: a single part.
     """
-    period_ns = 1e9 / axis.rate_hz
+    steps_ns = np.diff(t_ns)
+    follows = (seq[1:] == seq[:-1] + 1) & (steps_ns <= INTERPOLATED_PERIODS_MAX * axis.period_ns)
+    if part is not None:
+        follows &= part[1:] == part[:-1]
+    return np.asarray(follows)
+
+
+def make_resampling(axis: SampleAxis, t_ns: Times, is_joined: Bools) -> Resampling:
+    """Return the resampling of frames to a time axis.
+
+    Args:
+        axis: time axis that covers the frames.
+        t_ns: (m,), instants of the frames, rising; m > 0.
+        is_joined: (m - 1,), True: samples between this frame and the next are interpolated.
+    """
+    period_ns = axis.period_ns
     since_ns = (t_ns - axis.begin_ns).astype(np.float64)
     due_ns = np.arange(axis.count) * period_ns
     before = np.maximum(np.searchsorted(since_ns, due_ns, side="right") - 1, 0)
@@ -150,12 +169,9 @@ def make_resampling(axis: SampleAxis, t_ns: Times, seq: Array, part: Array | Non
     is_after = np.abs(due_ns - since_ns[after]) <= COINCIDENCE_PERIODS * period_ns
     share[is_before] = 0.0
     share[is_after & (after > before)] = 1.0
-    joined = (seq[1:] == seq[:-1] + 1) & (np.diff(t_ns) <= INTERPOLATED_PERIODS_MAX * period_ns)
-    if part is not None:
-        joined &= part[1:] == part[:-1]
     is_within = (due_ns >= since_ns[0]) & (due_ns <= since_ns[-1])
-    is_there = (np.append(joined, False)[before] & is_within) | is_before | is_after
-    return Resampling(axis.rate_hz, axis.begin_ns, before, after, share, is_there)
+    is_there = (np.append(is_joined, False)[before] & is_within) | is_before | is_after
+    return Resampling(axis, before, after, share, is_there)
 
 
 def _check_rising_instants(t_ns: Times) -> None:
@@ -217,6 +233,8 @@ class GroundReaction:
     """Ground reaction of a session or slice: m frames, resampled to n samples.
 
     Attributes:
+        t_ns: (m,), instants of the frames on the export's clock.
+        is_consecutive: (m - 1,), frames that the next one follows without a gap.
         resampling: resampling of frames to samples.
         columns: flat columns of frames, (m,) each; the COP `fill_cop_across_tile_row`.
         events: time in seconds after the first sample, and label: first the markers, then begins
@@ -224,6 +242,8 @@ class GroundReaction:
         marker_count: number of markers among the events.
     """
 
+    t_ns: Times
+    is_consecutive: Bools
     resampling: Resampling
     columns: Mapping[str, Array]
     events: Sequence[tuple[float, str]]
@@ -231,10 +251,17 @@ class GroundReaction:
 
     def resample_column(self, column_name: str) -> Floats:
         """Return a column at the samples, (n,); NaN where it is unknown or the sample is empty."""
-        column = self.columns[column_name]
+        quantity_name = re.sub(r"_\d+$", "", column_name)
+        column = to_floats_with_nan(quantity_name, self.columns[column_name])
         if column_name in FLAG_COLUMNS:
             return self.resampling.resample_nearest(column)
-        return self.resampling.interpolate(column.astype(np.float64))
+        return self.resampling.interpolate(column)
+
+    def compute_slice_time_s(self, export: Export) -> float:
+        """Return the time of the first sample as slices of the file count it, in s."""
+        first_ns = int(export.to_session_axis_ns(self.columns)[0])
+        sample_ns = first_ns + self.resampling.axis.begin_ns - int(self.t_ns[0])
+        return (sample_ns - export.frame_source.begin_t_ns) * 1e-9 + export.take_offset_s
 
     @property
     def server_time_bound_s(self) -> Floats | None:
@@ -280,10 +307,11 @@ def read_reactions_on_common_axis(
     found = []
     for t_ns, columns in read:
         since_s = (t_ns - axis.begin_ns).astype(np.float64) * 1e-9
+        follows = find_consecutive_frames(axis, t_ns, columns["seq"], columns.get("part"))
         marked = _marker_events(columns, since_s)
-        events = [*marked, *_contact_events(columns, since_s)]
-        placed = make_resampling(axis, t_ns, columns["seq"], columns.get("part"))
-        found.append(GroundReaction(placed, columns, events, len(marked)))
+        events = [*marked, *_contact_events(columns["contact"], follows, since_s)]
+        placed = make_resampling(axis, t_ns, follows)
+        found.append(GroundReaction(t_ns, follows, placed, columns, events, len(marked)))
     return found
 
 
@@ -319,12 +347,8 @@ def _marker_events(columns: Mapping[str, Array], since_s: Floats) -> list[tuple[
     return [(float(since_s[i]), labels[i]) for i in range(len(labels)) if labels[i] is not None]
 
 
-def _contact_events(columns: Mapping[str, Array], since_s: Floats) -> list[tuple[float, str]]:
-    """Return begins and ends of contact; the previous frame has to exist with known contact."""
-    contact, seq = columns["contact"], columns["seq"]
-    follows = seq[1:] == seq[:-1] + 1
-    if "part" in columns:
-        follows &= columns["part"][1:] == columns["part"][:-1]
+def _contact_events(contact: Array, follows: Bools, since_s: Floats) -> list[tuple[float, str]]:
+    """Return begins and ends of contact; none in a gap, or beside a frame of unknown contact."""
     begins = np.flatnonzero(follows & (contact[:-1] == 0) & (contact[1:] == 1)) + 1
     ends = np.flatnonzero(follows & (contact[:-1] == 1) & (contact[1:] == 0)) + 1
     events = [(float(since_s[i]), FOOT_STRIKE) for i in begins]

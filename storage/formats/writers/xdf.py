@@ -29,7 +29,11 @@ from storage.formats.writers.format import (
     make_names_unique,
     to_floats_with_nan,
 )
-from storage.formats.writers.resampling import make_resampling, make_sample_axis
+from storage.formats.writers.resampling import (
+    find_consecutive_frames,
+    make_resampling,
+    make_sample_axis,
+)
 from storage.schema import COLUMNS_BY_NAME, SERVER_TIME_COLUMNS, UNKNOWN_T_NS, Array
 
 _MAGIC = b"XDF:"
@@ -165,7 +169,8 @@ class _SessionEncoder:
                 expected="a slice with frames, of which a rate can be told",
             )
         axis = make_sample_axis([(t_ns, export.array_info.nominal_rate_hz)], _SAMPLES_MAX)
-        placed = make_resampling(axis, t_ns, flat["seq"], flat.get("part"))
+        follows = find_consecutive_frames(axis, t_ns, flat["seq"], flat.get("part"))
+        placed = make_resampling(axis, t_ns, follows)
         self._rate_hz = axis.rate_hz
         samples: dict[str, Array] = {
             "t_ns": axis.begin_ns + np.rint(placed.elapsed_s * 1e9).astype(np.int64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,8 @@ from devices.errors import UsageError
 from service.offline.export import ExportOptions, export_merged, export_session
 from storage.clock.log import ClockOffset
 from storage.clock.table import CLOCK_NAME, StreamClockFacts, write_clock_file
+from storage.formats.slice import Slice
+from storage.schema import Array
 from storage.sessions.folder import FRAMES_NAME
 from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import UTC_NS
@@ -23,12 +26,14 @@ ezc3d = pytest.importorskip("ezc3d")
 TOGETHER = ExportOptions("c3d", clock="server")
 
 
-def sealed(folder: Path, node: str, later_ns: int) -> Path:
-    """A session of a node whose clock is behind the server's by so much."""
+def sealed(folder: Path, node: str, later_ns: int, keep: Array | None = None) -> Path:
+    """A session of a node whose clock is behind the server's by so much; None: all frames."""
     folder.mkdir()
     info = ARRAY.model_copy(update={"node": node, "stream_id": node.ljust(32, "0")})
     with SealedFileWriter(folder / FRAMES_NAME, info, {}) as writer:
-        writer.append_frames(make_frames(ROWS, len(info.tiles)), walk())
+        kept = np.arange(ROWS) if keep is None else keep
+        columns = {name: values[kept] for name, values in walk().items()}
+        writer.append_frames(make_frames(kept, len(info.tiles)), columns)
     row = ClockOffset(
         stream_id=info.stream_id, t_mono_ns=0, server_minus_node_ns=later_ns, uncertainty_ns=400_000
     )
@@ -71,3 +76,34 @@ def test_a_session_on_the_servers_axis_states_its_uncertainty(
     assert (bound_s >= 400e-6).all()
     (begin,) = read["parameters"]["FOOTTILE"]["BEGIN_T_NS"]["value"]
     assert int(begin) == UTC_NS + 300_000_000
+
+
+def test_a_slice_of_two_sessions_is_one_range_of_the_servers_clock(
+    feet: list[Path], tmp_path: Path
+) -> None:
+    part = Slice(0.5, 1.0)
+    export_merged(feet[::-1], tmp_path / "take.c3d", replace(TOGETHER, part=part))
+    read = ezc3d.c3d(str(tmp_path / "take.c3d"), extract_forceplat_data=True)
+    right_n, left_n = (-plate["force"][2] for plate in read["data"]["platform"])
+    grf_n = np.where(walk()["contact"] == 1, walk()["grf_n"], 0.0)
+    np.testing.assert_allclose(left_n, -grf_n[250:500], atol=1e-3)
+    np.testing.assert_allclose(right_n, -grf_n[100:350], atol=1e-3)
+    with pytest.raises(UsageError, match=r"ends at 0\.25 s.* begins at 0\.300 s"):
+        export_merged(feet, tmp_path / "take.c3d", replace(TOGETHER, part=Slice(0.0, 0.25)))
+
+
+@pytest.mark.parametrize("number", [0, 1], ids=["left", "right"])
+def test_a_refused_gap_names_a_slice_that_works(
+    number: int, feet: list[Path], tmp_path: Path
+) -> None:
+    folder = sealed(tmp_path / "gap", "left", 0, keep=np.delete(np.arange(ROWS), range(600, 640)))
+    both = [folder, feet[number]] if number else [folder]
+    write = export_merged if number else lambda sources, *rest: export_session(sources[0], *rest)
+    with pytest.raises(UsageError, match="too long for a line") as refused:
+        write(both, tmp_path / "x.zip", replace(TOGETHER, to="opensim"))
+    edges = re.search(r"from ([0-9.]+) s to ([0-9.]+) s", str(refused.value))
+    assert edges
+    part = Slice(float(edges[1]), float(edges[2]))
+    done = write(both, tmp_path / "x.zip", replace(TOGETHER, to="opensim", part=part))
+    assert done.size_bytes > 0
+    assert part.end_s == pytest.approx(599 / 500.0, abs=2e-3)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from http import HTTPStatus
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field
+from starlette.concurrency import run_in_threadpool
 
 from devices.errors import StateError
 from service.api.routes.common import (
@@ -27,7 +29,7 @@ from service.server.broadcast.views import make_session_view
 from service.server.server import Server
 from service.server.takes import Take
 from service.user_folders import PublicText
-from storage.formats.export import make_sealed_export
+from storage.formats.export import compute_take_offsets_s, make_sealed_export
 from storage.formats.markers import PlacedMarkers
 from storage.formats.writers.registry import FORMATS, MULTI_SESSION_FORMATS
 from storage.sessions.folder import Session
@@ -163,8 +165,9 @@ async def get_take_data(
 ) -> Response:
     """Return the sessions of a take on the server's time axis, each with its uncertainty.
 
-    They are in the order of their nodes, without those in the trash. Seconds count from each
-    session's first frame. `Foottile-Complete` is `lossy` if one of the sessions is.
+    They are in the order of their nodes, without those in the trash. Seconds count from the first
+    frame of all, by the server's clock. `Foottile-Complete` is `lossy` if one of the sessions is;
+    `Foottile-Remarks` as for one session.
     """
     to = query.format_spec
     sessions = [require_frames(session) for session in server.takes.get_take(take_id).sessions]
@@ -176,9 +179,11 @@ async def get_take_data(
                 remedy="Stop it, or ask for each session by itself",
             )
     is_lossy = any(server.recorder.get_ledger(session.id).lossy for session in sessions)
+    offsets_s = await run_in_threadpool(_compute_offsets_s, sessions, server)
     return await respond_with_export(
         sessions,
-        partial(_write_exports, sessions, query, server),
+        [query.slice.shift(-offset_s) for offset_s in offsets_s],
+        partial(_write_exports, sessions, offsets_s, query, server),
         query,
         request,
         server,
@@ -187,11 +192,23 @@ async def get_take_data(
     )
 
 
+def _compute_offsets_s(sessions: list[Session], server: Server) -> list[float]:
+    with ExitStack() as opened:
+        return compute_take_offsets_s(
+            [
+                opened.enter_context(server.sessions.open_frames(session.id, only_slices=True))
+                for session in sessions
+            ]
+        )
+
+
 def _write_exports(
     sessions: list[Session],
+    offsets_s: list[float],
     query: TakeDataQuery,
     server: Server,
     markers: list[PlacedMarkers] | None,
+    remarks: list[str],
 ) -> Chunks:
     part = query.slice
     with ExitStack() as opened:
@@ -202,11 +219,14 @@ def _write_exports(
                         session.id, only_slices=not part.has_all_rows_and_columns
                     )
                 ),
-                part,
+                part.shift(-offset_s),
                 clock=query.clock_name,
                 markers=None if markers is None else markers[number],
                 options=query.options,
+                take_offset_s=offset_s,
             )
-            for number, session in enumerate(sessions)
+            for number, (session, offset_s) in enumerate(zip(sessions, offsets_s, strict=True))
         ]
-        yield from query.format_spec.encode_together_on_server_clock(exports)
+        yield from query.format_spec.encode_together_on_server_clock(
+            [replace(export, remarks=remarks) for export in exports]
+        )

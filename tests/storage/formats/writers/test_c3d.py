@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from devices.errors import StorageError, UsageError, escape_control_chars
+from devices.flags import CONTACT_UNKNOWN
 from storage.formats.export import Export
 from storage.formats.markers import PlacedMarker, PlacedMarkers
 from storage.formats.reference import ReferenceOptions, read_reference
@@ -15,6 +16,7 @@ from storage.formats.slice import Slice
 from storage.formats.writers import c3d as written_c3d
 from storage.formats.writers.c3d import C3D
 from storage.sessions.folder import Marker
+from tests.builders.arrays import PERIOD_NS
 from tests.storage.formats.walks import (
     ARRAY,
     LATE_NS,
@@ -130,6 +132,21 @@ def test_contacts_are_events_of_their_usual_names(plain: Read) -> None:
     ]
     assert [label for label, _ in plain.events()] == [label for label, _ in expected]
     np.testing.assert_allclose([t for _, t in plain.events()], [t for _, t in expected], atol=1e-6)
+
+
+def test_a_contact_that_begins_in_slots_without_frames_is_no_event() -> None:
+    kept = np.delete(np.arange(ROWS), np.arange(95, 105))
+    columns = {name: values[kept] for name, values in walk().items()}
+    read = Read(export_of_walk(columns, times={"t_mono_ns": PERIOD_NS * kept}))
+    assert [label for label, _ in read.events()] == ["Foot Off", "Foot Strike", "Foot Off"]
+
+
+def test_an_unknown_contact_is_nan_and_no_number() -> None:
+    columns = walk()
+    columns["contact"][:50] = CONTACT_UNKNOWN
+    read = Read(export_of_walk(columns))
+    expected = np.where(columns["contact"] == CONTACT_UNKNOWN, np.nan, columns["contact"])
+    np.testing.assert_array_equal(read.channel("contact"), expected)
 
 
 LABELS = ("Foot Strike", "Foot Off")

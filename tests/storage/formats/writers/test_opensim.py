@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import io
-import json
 import math
 import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import pyarrow.csv as pacsv
@@ -17,7 +15,6 @@ import pytest
 from pydantic import ValidationError
 
 from devices.errors import UsageError
-from storage.formats.export import Export
 from storage.formats.markers import PlacedMarker, PlacedMarkers
 from storage.formats.slice import FormatOptions
 from storage.formats.writers.opensim import LOAD_COLUMNS, OPENSIM
@@ -33,10 +30,10 @@ from tests.storage.formats.walks import (
     export_of_walk,
     lines_of_documents,
     row_walk,
-    saturated,
     two_feet,
     walk,
 )
+from tests.storage.formats.writers.unpacked import Unpacked
 
 GRAVITY = 9.80665
 """Of OpenSim's models, m/s2."""
@@ -49,29 +46,6 @@ def on_the_ground() -> dict[str, Array]:
     return {**columns, **ground}
 
 
-class Unpacked:
-    """The files of an export, and the table of the `.mot` file."""
-
-    def __init__(self, export: Export, folder: Path) -> None:
-        with zipfile.ZipFile(io.BytesIO(b"".join(OPENSIM.encode(export)))) as file:
-            assert file.testzip() is None
-            file.extractall(folder)
-            self.names = file.namelist()
-        self.folder = folder
-        self.mot = next(folder.glob("*.mot"))
-        head, _, body = self.mot.read_text("ascii").partition("endheader\n")
-        self.head = head.splitlines()
-        names, *rows = body.splitlines()
-        self.table = np.array([row.split("\t") for row in rows], dtype=np.float64)
-        self.columns = dict(zip(names.split("\t"), self.table.T, strict=True))
-        self.loads = ElementTree.parse(next(folder.glob("*.xml"))).getroot()  # noqa: S314  # ours
-        self.filled = pacsv.read_csv(next(folder.glob("*_filled.csv"))).to_pylist()
-        self.notes = json.loads(next(folder.glob("*_notes.json")).read_text())
-
-    def tag(self, name: str) -> str | None:
-        return next(self.loads.iter(name)).text
-
-
 @pytest.fixture
 def ground(tmp_path: Path) -> Unpacked:
     return Unpacked(export_of_walk(on_the_ground()), tmp_path)
@@ -79,7 +53,8 @@ def ground(tmp_path: Path) -> Unpacked:
 
 def test_the_header_says_how_much_there_is(ground: Unpacked) -> None:
     counts = [f"nRows={ROWS}", f"nColumns={1 + len(LOAD_COLUMNS)}"]
-    assert ground.head == ["session", "version=1", *counts, "inDegrees=no"]
+    assert ground.head[:-1] == ["session", "version=1", *counts, "inDegrees=no"]
+    assert ground.head[-1].startswith("gaps=0 gaps of the force are straight lines (limit 50 ms")
     assert ground.table.shape == (ROWS, 1 + len(LOAD_COLUMNS))
     np.testing.assert_allclose(ground.columns["time"], np.arange(ROWS) / RATE_HZ, atol=1e-9)
 
@@ -142,31 +117,6 @@ def test_all_cells_are_numbers_and_filled_rows_are_listed(ground: Unpacked) -> N
     reasons = {row["because"] for row in ground.filled}
     assert reasons == {"no contact", "no centre of pressure stated"}
     assert ground.notes["FILLED_ROWS"] == {"no contact": 300, "no centre of pressure stated": 4}
-
-
-def test_a_short_gap_of_force_is_a_line_and_a_long_one_zero(tmp_path: Path) -> None:
-    columns = saturated(saturated(on_the_ground(), slice(700, 705)), slice(200, 250))
-    for name in ("cop_ground_x_m", "cop_ground_y_m"):
-        columns[name][200:250] = np.nan
-    found = Unpacked(export_of_walk(columns), tmp_path)
-    force_n = found.columns["ground_force_vy"]
-    np.testing.assert_array_equal(force_n[200:250], 0.0)
-    line_n = np.interp(np.arange(700, 705), [699, 705], columns["grf_n"][[699, 705]])
-    np.testing.assert_allclose(force_n[700:705], line_n, atol=1e-6)
-    said = {(row["because"], row["with"], row["rows"]): row for row in found.filled}
-    zero = said["GRF not known", "0", 50]
-    assert zero["from_s"] == pytest.approx(200 / RATE_HZ)
-    assert zero["to_s"] == pytest.approx(249 / RATE_HZ)
-    assert zero["estimate_flags"] & 1
-    assert ("GRF not known", "line between the forces before and behind", 5) in said
-
-
-def test_lost_frames_are_listed(tmp_path: Path) -> None:
-    kept = np.delete(np.arange(ROWS), np.arange(600, 640))
-    found = Unpacked(export_of_walk(on_the_ground(), keep=kept), tmp_path)
-    assert len(found.table) == ROWS
-    lost = next(row for row in found.filled if row["because"].startswith("no frame"))
-    assert (lost["rows"], lost["with"], lost["estimate_flags"]) == (40, "0", None)
 
 
 def test_a_foot_without_a_servo_is_a_body_of_the_model(tmp_path: Path) -> None:

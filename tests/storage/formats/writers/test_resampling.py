@@ -11,6 +11,7 @@ from devices.errors import UsageError
 from storage.formats.writers.resampling import (
     COINCIDENCE_PERIODS,
     Resampling,
+    find_consecutive_frames,
     make_resampling,
     make_sample_axis,
 )
@@ -24,7 +25,7 @@ NOMINAL_HZ = 500.0
 def at(t_ns: Array, seq: Array | None = None, part: Array | None = None, **more: int) -> Resampling:
     numbers = np.arange(len(t_ns), dtype=np.uint64) if seq is None else seq.astype(np.uint64)
     axis = make_sample_axis([(t_ns, NOMINAL_HZ)], more.get("samples_max", 10_000))
-    return make_resampling(axis, t_ns, numbers, part)
+    return make_resampling(axis, t_ns, find_consecutive_frames(axis, t_ns, numbers, part))
 
 
 def times(count: int) -> Array:
@@ -37,7 +38,7 @@ def test_frames_that_come_on_time_are_the_samples() -> None:
     np.testing.assert_array_equal(found.interpolate(values), values)
     np.testing.assert_array_equal(found.resample_nearest(np.arange(100)), np.arange(100))
     assert found.empty_count == 0
-    assert found.begin_ns == BEGIN_NS
+    assert found.axis.begin_ns == BEGIN_NS
 
 
 @settings(max_examples=50)
@@ -92,7 +93,7 @@ def test_a_number_that_is_not_known_makes_no_sample_beside_it() -> None:
 
 def test_frames_at_another_rate_than_the_nominal_keep_theirs() -> None:
     found = at(BEGIN_NS + 3_000_000 * np.arange(100))
-    assert found.rate_hz == pytest.approx(1000 / 3)
+    assert found.axis.rate_hz == pytest.approx(1000 / 3)
     assert found.empty_count == 0
 
 
@@ -120,7 +121,10 @@ def test_two_streams_on_one_axis_are_empty_where_they_have_no_frames() -> None:
     axis = make_sample_axis([(early, NOMINAL_HZ), (late, NOMINAL_HZ)], 100)
     assert (axis.begin_ns, axis.count) == (BEGIN_NS, 30)
     numbers = np.arange(20)
-    first, second = (make_resampling(axis, t_ns, numbers, None) for t_ns in (early, late))
+    first, second = (
+        make_resampling(axis, t_ns, find_consecutive_frames(axis, t_ns, numbers, None))
+        for t_ns in (early, late)
+    )
     np.testing.assert_array_equal(np.flatnonzero(first.has_frames), np.arange(20))
     np.testing.assert_array_equal(np.flatnonzero(second.has_frames), np.arange(11, 30))
     values = second.interpolate(numbers.astype(np.float64))[11:]
