@@ -113,11 +113,14 @@ def _prepare_export(
             where=str(reader.path.parent),
             expected="a session's folder as a server sealed it or `foottile pull` fetched it",
         )
-    part = options.part.shift(-take_offset_s)
-    placed = None if stored is None else place_session_markers(reader, stored, part)
+    placed = (
+        None
+        if stored is None
+        else place_session_markers(reader, stored, options.part, take_offset_s)
+    )
     export = make_sealed_export(
         reader,
-        part,
+        options.part,
         clock=options.clock,
         markers=placed,
         options=options.options,

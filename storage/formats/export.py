@@ -152,7 +152,7 @@ class Export:
         provenance: session and its hashes.
         options: options of the format.
         take_offset_s: time of the session's first frame after the first of all sessions in the
-            file, by the server's clock.
+            file, by the server's clock; seconds of the slice count from that one.
         remarks: remarks of the format for the user, complete with the file's first chunk.
     """
 
@@ -176,6 +176,11 @@ class Export:
             if session
             else f"session of {self.array_info.node}"
         )
+
+    @property
+    def slice_zero_ns(self) -> int:
+        """Instant on the session's time axis from which seconds of the slice count."""
+        return self.frame_source.begin_t_ns - round(self.take_offset_s * 1e9)
 
     @property
     def provenance_and_slice_metadata(self) -> dict[str, object]:
@@ -271,7 +276,7 @@ class Export:
             at_ns = self.to_session_axis_ns(flat)
             if content.end_t_ns is None:
                 end_t_ns = max(end_t_ns, int(at_ns.max()))
-            values = _select_rows(flat, self.selection.compute_row_mask(at_ns, content.begin_t_ns))
+            values = _select_rows(flat, self.selection.compute_row_mask(at_ns, self.slice_zero_ns))
             if self.clock is not None:
                 times = (values["t_mono_ns"], values["t_ns"], values.get("part"))
                 values |= self.clock.compute_server_time_columns_or_unknown(*times)
@@ -288,7 +293,7 @@ class Export:
                 yield piece
         if has_rows or header is None:
             return
-        end_s = (end_t_ns - content.begin_t_ns) * 1e-9
+        end_s = (end_t_ns - self.slice_zero_ns) * 1e-9
         start_s = self.selection.start_s
         if start_s is not None and start_s > end_s:
             raise UsageError(
@@ -332,7 +337,7 @@ class Export:
             left -= len(piece["t_ns"])
             pieces.append(piece)
             if left < 0:
-                fits_ns = int(self.to_session_axis_ns(piece)[left]) - self.frame_source.begin_t_ns
+                fits_ns = int(self.to_session_axis_ns(piece)[left]) - self.slice_zero_ns
                 start_s, end_s = self.selection.start_s or 0.0, np.floor(fits_ns * 1e-6) * 1e-3
                 raise UsageError(
                     f"there are more than {frames_max} frames, the limit of this format",
@@ -391,7 +396,7 @@ def make_sealed_export(
 
     Args:
         reader: the file.
-        selection: rows and columns; seconds count from the session's first frame.
+        selection: rows and columns.
         clock: clock whose time is added.
         markers: placed markers; None: none.
         options: options of the format.
@@ -406,7 +411,7 @@ def make_sealed_export(
     ]
     table = load_clock_table(reader) if clock == "server" else None
     begin_t_ns, end_t_ns = reader.read_span_on_axis_ns()
-    bounds_ns = selection.compute_bounds_ns(begin_t_ns)
+    bounds_ns = selection.compute_bounds_ns(begin_t_ns - round(take_offset_s * 1e9))
     names = [*(column.name for column in MEASURED_COLUMNS), *extra]
     return Export(
         FrameSource(

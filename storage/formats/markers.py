@@ -123,7 +123,7 @@ def place_markers(
             if it has parts. Frames further than `DISTANCE_MAX_NS` from every marker may be omitted.
         clock: clock table of the session.
         selection: the requested slice; a marker with a frame outside is left out.
-        begin_t_ns: instant of the session's first frame; None: of the first frame in
+        begin_t_ns: instant from which seconds of the slice count; None: of the first frame in
             `frame_chunks`.
         axis: time axis of the session.
     """
@@ -231,9 +231,18 @@ def _distance_ns(a_ns: Array, b_ns: Array) -> Array:
 
 
 def place_session_markers(
-    reader: SealedFileReader, markers: Sequence[Marker], selection: Slice
+    reader: SealedFileReader,
+    markers: Sequence[Marker],
+    selection: Slice,
+    take_offset_s: float = 0.0,
 ) -> PlacedMarkers:
     """Place markers at frames of a sealed file; at none if its clock table is missing or damaged.
+
+    Args:
+        reader: the file.
+        markers: markers in any order.
+        selection: the requested slice.
+        take_offset_s: as for `storage.formats.export.Export`.
 
     Raises:
         FileFormatError: the file is damaged.
@@ -250,9 +259,8 @@ def place_session_markers(
     pieces = reader.read_quantities(
         *names, row_groups=_row_groups_near_markers(reader, clock, markers)
     )
-    return place_markers(
-        markers, pieces, clock, selection, reader.read_span_on_axis_ns()[0], reader.time_axis
-    )
+    zero_ns = reader.read_span_on_axis_ns()[0] - round(take_offset_s * 1e9)
+    return place_markers(markers, pieces, clock, selection, zero_ns, reader.time_axis)
 
 
 def _row_groups_near_markers(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -60,7 +60,7 @@ class Slice:
         """Return the slice's first instant, and its end, exclusive; None: no bound.
 
         Args:
-            begin_t_ns: instant of the session's first frame.
+            begin_t_ns: instant from which seconds count, of the first frame.
         """
         start, end = (
             None if seconds is None else begin_t_ns + round(seconds * 1e9)
@@ -68,29 +68,12 @@ class Slice:
         )
         return start, end
 
-    def shift(self, by_s: float) -> Slice:
-        """Return the slice with its bounds later by some seconds, from 0 on.
-
-        Raises:
-            UsageError: it then ends at 0 or before.
-        """
-        if self.end_s is not None and self.end_s + by_s <= 0.0:
-            raise UsageError(
-                f"the slice ends at {self.end_s:g} s, and one of the sessions begins at "
-                f"{-by_s:.3f} s",
-                expected="a slice with frames of each session",
-            )
-        start_s, end_s = (
-            None if seconds is None else seconds + by_s for seconds in (self.start_s, self.end_s)
-        )
-        return replace(self, start_s=start_s and max(start_s, 0.0), end_s=end_s)
-
     def compute_row_mask(self, t_ns: Array, begin_t_ns: int) -> Array:
         """Return the mask of the frames in the slice, bool[n].
 
         Args:
             t_ns: int64[n], instants of frames on the session's time axis.
-            begin_t_ns: instant of the session's first frame.
+            begin_t_ns: instant from which seconds count, of the first frame.
         """
         start_ns, end_ns = self.compute_bounds_ns(begin_t_ns)
         rows = np.ones(len(t_ns), dtype=np.bool_)

@@ -97,7 +97,7 @@ async def get_data(
         return _stored_response(session, session.sha256, request, server, headers)
     return await respond_with_export(
         [session],
-        [query.slice],
+        [0.0],
         lambda markers, remarks: _write_export(
             session, query, server, markers[0] if markers else None, remarks
         ),

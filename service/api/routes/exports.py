@@ -174,7 +174,7 @@ def make_file_stem(name: str, id_: str, part: Slice) -> str:
 
 async def respond_with_export(
     sessions: list[Session],
-    slices: list[Slice],
+    take_offsets_s: list[float],
     write: Callable[[list[PlacedMarkers] | None, list[str]], Chunks],
     query: ExportQuery,
     request: Request,
@@ -186,7 +186,7 @@ async def respond_with_export(
 
     Args:
         sessions: sessions in the file.
-        slices: slice of each session, counted from its own first frame.
+        take_offsets_s: each session's, as for `storage.formats.export.Export`.
         write: makes the chunks with the markers of each session, None: without markers; adds
             remarks to the list before the first chunk.
         query: query of the request.
@@ -205,8 +205,8 @@ async def respond_with_export(
     markers = None
     if query.has_markers:
         markers = [
-            await run_in_threadpool(_place_markers, session, part, server)
-            for session, part in zip(sessions, slices, strict=True)
+            await run_in_threadpool(_place_markers, *each, query.slice, server)
+            for each in zip(sessions, take_offsets_s, strict=True)
         ]
         headers |= _marker_headers(markers)
     remarks: list[str] = []
@@ -223,12 +223,14 @@ async def respond_with_export(
     )
 
 
-def _place_markers(session: Session, part: Slice, server: Server) -> PlacedMarkers:
+def _place_markers(
+    session: Session, take_offset_s: float, part: Slice, server: Server
+) -> PlacedMarkers:
     if not session.markers:
         return PlacedMarkers(())
     if session.sha256 is not None:
         with server.sessions.open_frames(session.id, only_slices=True) as reader:
-            return place_session_markers(reader, session.markers, part)
+            return place_session_markers(reader, session.markers, part, take_offset_s)
     sources = server.recorder.collect_inputs_from_journals(session.id)
     times = (
         {name: getattr(frames, name) for name in PLACEMENT_COLUMNS} | {"part": columns["part"]}

@@ -261,7 +261,7 @@ class GroundReaction:
         """Return the time of the first sample as slices of the file count it, in s."""
         first_ns = int(export.to_session_axis_ns(self.columns)[0])
         sample_ns = first_ns + self.resampling.axis.begin_ns - int(self.t_ns[0])
-        return (sample_ns - export.frame_source.begin_t_ns) * 1e-9 + export.take_offset_s
+        return (sample_ns - export.slice_zero_ns) * 1e-9
 
     @property
     def server_time_bound_s(self) -> Floats | None:

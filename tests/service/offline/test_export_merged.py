@@ -88,7 +88,7 @@ def test_a_slice_of_two_sessions_is_one_range_of_the_servers_clock(
     grf_n = np.where(walk()["contact"] == 1, walk()["grf_n"], 0.0)
     np.testing.assert_allclose(left_n, -grf_n[250:500], atol=1e-3)
     np.testing.assert_allclose(right_n, -grf_n[100:350], atol=1e-3)
-    with pytest.raises(UsageError, match=r"ends at 0\.25 s.* begins at 0\.300 s"):
+    with pytest.raises(UsageError, match="no frame is in this slice"):
         export_merged(feet, tmp_path / "take.c3d", replace(TOGETHER, part=Slice(0.0, 0.25)))
 
 

@@ -182,7 +182,7 @@ async def get_take_data(
     offsets_s = await run_in_threadpool(_compute_offsets_s, sessions, server)
     return await respond_with_export(
         sessions,
-        [query.slice.shift(-offset_s) for offset_s in offsets_s],
+        offsets_s,
         partial(_write_exports, sessions, offsets_s, query, server),
         query,
         request,
@@ -219,7 +219,7 @@ def _write_exports(
                         session.id, only_slices=not part.has_all_rows_and_columns
                     )
                 ),
-                part.shift(-offset_s),
+                part,
                 clock=query.clock_name,
                 markers=None if markers is None else markers[number],
                 options=query.options,
