@@ -218,18 +218,31 @@ def test_the_neighbour_is_that_of_the_cursor_or_the_first_in_view(ask: Ask) -> N
     assert found == [[2, 1], [0, 1], [0, 2], [2, -1]]  # before it and after it; -1: there is none
 
 
-def test_sessions_are_aligned_at_whole_stances(ask: Ask) -> None:
-    shift_s = ask(
+def test_sessions_recorded_together_lie_by_the_clock_and_others_by_stances(ask: Ask) -> None:
+    """Begin and clock of the left foot; the right one's first frame is 125 ms later."""
+    found = ask(
         "session/align",
         """({ alignments }) => {
-          const own = { beginNs: 0, durationS: 9, markers: [], offset: () => null,
-            stances: [{ from: 0, is_whole: false }, { from: 2, is_whole: true }] };
-          const other = { beginNs: 0, durationS: 9, events: [], clock: null,
-            stances: [{ begin_t_ns: 5e8, is_whole: true }] };
-          return alignments(own, other)[0].shiftS;
+          const clockOf = (offset_ns) => ({ streams: [{ stretches: [
+            { begin_t_ns: 0, end_t_ns: 9e9, offset_ns, drift_ppm: null }] }] });
+          const of = ({ ownTake = null, take = null, offset = 3e9, clock = clockOf(5e9) }) => {
+            const own = { beginNs: 4e9, durationS: 9, markers: [], take: ownTake,
+              offset: () => offset,
+              stances: [{ from: 0, is_whole: false }, { from: 2, is_whole: true }] };
+            const other = { beginNs: 2.125e9, durationS: 9, events: [], clock, take,
+              stances: [{ begin_t_ns: 2.625e9, is_whole: true }] };
+            const [{ key, shiftS }, ...more] = alignments(own, other);
+            return [key, shiftS, more.map((each) => each.key).sort()];
+          };
+          const take = { ownTake: "t", take: "t" };
+          return [of(take), of({}), of({ ...take, clock: null }), of({ ...take, offset: null }),
+            of({ clock: null }), of({ clock: clockOf(5e12) }),
+            of({ ownTake: "t", take: "u", clock: null })];
         }""",
     )
-    assert shift_s == 1.5
+    by_clock = ["clock", 0.125, ["contact", "start"]]
+    by_start, by_stance = ["start", 0, ["contact"]], ["contact", 1.5, ["start"]]
+    assert found == [by_clock, by_clock, by_start, by_start, by_stance, by_stance, by_stance]
 
 
 def test_tiles_are_compared_by_serial_and_those_of_another_foot_in_their_order(ask: Ask) -> None:

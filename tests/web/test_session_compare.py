@@ -234,7 +234,9 @@ def test_another_session_is_told_by_its_node_and_has_its_stances_and_tiles(
     page = open_page(url_of(compared, **{"with": other.id}))
     beside(page)
     expect(page.locator("#legend [data-kind=own]")).to_have_text("hops, left")
-    expect(page.locator("#legend [data-kind=beside]")).to_have_text("others, right")
+    expect(page.locator("#legend [data-kind=beside]")).to_have_text(
+        "others, right: aligned at the first whole stance"
+    )
     page.locator("#overlay-card").scroll_into_view_if_needed()
     spread = page.locator("#overlay-legend [data-kind=beside]")
     expect(spread).to_contain_text("others, right: mean")

@@ -136,5 +136,16 @@ export const listFormats = () => call("GET", "/formats");
 /** Return the address of a download, with markers if there are any; Parquet without is the sealed file. */
 export const dataAddress = (session, format, part = "") =>
   `${PREFIX}/sessions/${id(session.id)}/data?format=${format}${session.marker_count ? "&markers=true" : ""}${part}`;
+/**
+ * Return the remarks on a download, such as filled gaps; reject with a Refusal if the server refuses it.
+ * @param {string} address
+ */
+export async function checkDownload(address) {
+  const limits = { timeoutS: 120 }; // an hour of frames
+  const { response } = await sendRequest(address, { method: "HEAD" }, limits);
+  if (response.ok) return response.headers.get("Foottile-Remarks") ?? "";
+  const refused = await sendRequest(address, { method: "GET" }, limits); // HEAD has no reason
+  return refused.response.ok ? "" : resultOf(refused.response, refused.text);
+}
 /** Return the address of a download of a take. */
 export const takeDataAddress = (take, format, part = "") => `${PREFIX}/takes/${id(take)}/data?format=${format}${part}`;

@@ -3,19 +3,24 @@
 import { offsetAt } from "./clock.js";
 
 /**
- * Return the possible alignments, the default first: first whole stance, else start.
- * @param {{beginNs: number, durationS: number, stances: {from: number, is_whole: boolean}[],
+ * Return the possible alignments, the default first: of sessions that were recorded together the server's clock, in a
+ * take without one the start; of others the first whole stance, else the start.
+ * @param {{beginNs: number, durationS: number, take: string | null, stances: {from: number, is_whole: boolean}[],
  *   markers: {label: string, timeS: number}[], offset: (tNs: number, ofServer: boolean) => number | null}} own
- * @param {{beginNs: number, durationS: number, stances: {begin_t_ns: number, is_whole: boolean}[],
+ * @param {{beginNs: number, durationS: number, take: string | null, stances: {begin_t_ns: number, is_whole: boolean}[],
  *   events: {label: string, t_ns: number}[], clock: ClockSummary | null}} other
  * @returns {{key: string, label: string, meaning: string, shiftS: number}[]}
  */
 export function alignments(own, other) {
-  const found = [{ key: "start", label: "start", meaning: "each from its own first frame", shiftS: 0 }];
+  const isTake = own.take !== null && own.take === other.take;
+  const found = [{
+    key: "start", label: "start", shiftS: 0,
+    meaning: isTake ? "each from its own first frame, which may be tenths of a second apart" : "each from its own first frame",
+  }];
   const mine = own.stances.find((stance) => stance.is_whole);
   const theirs = other.stances.find((stance) => stance.is_whole);
   if (mine && theirs) {
-    found.unshift({
+    found[isTake ? "push" : "unshift"]({
       key: "contact", label: "first whole stance", meaning: "aligned at the first whole stance",
       shiftS: mine.from - (theirs.begin_t_ns - other.beginNs) * 1e-9,
     });
@@ -36,7 +41,7 @@ export function alignments(own, other) {
   if (mineNs !== null && theirsNs !== null) {
     const shiftS = (other.beginNs + theirsNs - own.beginNs - mineNs) * 1e-9;
     if (shiftS < own.durationS && shiftS + other.durationS > 0) { // else they were not recorded together
-      found.push({ key: "clock", label: "clock", meaning: "aligned by the server's clock", shiftS });
+      found.unshift({ key: "clock", label: "clock", meaning: "aligned by the server's clock", shiftS });
     }
   }
   return found;

@@ -24,6 +24,7 @@ export class Beside {
     this.columns = columns;
     this.ask = ask;
     this.shiftS = 0; // this session's time minus its own
+    this.aligned = ""; // by which instants, for the legend; a reference has this session's times
     this.detail = null;
     this.hasTiles = false;
     this.loader = new Loader((query, stop) => this.request(query, stop), (bins) => {
@@ -31,6 +32,9 @@ export class Beside {
       onChange();
     }, onError);
   }
+
+  /** Return its name for the legend, and how it is aligned. */
+  get title() { return this.aligned ? `${this.name}: ${this.aligned}` : this.name; }
 
   /** Load the whole series. */
   async begin(widthPx) {

@@ -110,8 +110,8 @@ export class Compare {
     if (!Object.keys(beside.columns).length) return this.showText("The other session has no estimates.");
     const { plots } = this.page;
     this.ways = alignments(
-      { beginNs: plots.whole.beginNs, durationS: this.page.durationS, stances: plots.stances, markers: plots.markers, offset: this.offset },
-      { beginNs: beside.answer.begin_t_ns, durationS: beside.durationS,
+      { beginNs: plots.whole.beginNs, durationS: this.page.durationS, take: this.session.take, stances: plots.stances, markers: plots.markers, offset: this.offset },
+      { beginNs: beside.answer.begin_t_ns, durationS: beside.durationS, take: other.take,
         stances: moveStances(beside.answer.time_axis, stances ?? []), events: events?.items ?? [],
         clock: moveClock(beside.answer.time_axis, other.parts, clock) },
     );
@@ -139,6 +139,7 @@ export class Compare {
     const way = this.ways.find((one) => one.key === key);
     this.align.value = key;
     this.drawn.move(way.shiftS);
+    this.drawn.aligned = way.meaning;
     const shift = way.shiftS === 0 ? "" : ` (shifted by ${number(way.shiftS, 3)} s)`;
     const apart = `recorded ${roughly(Math.abs(this.apartS))} ${this.apartS < 0 ? "earlier" : "later"}`;
     this.showText(`${this.drawn.name} (${apart}): ${way.meaning}${shift}.`, way.shiftS);

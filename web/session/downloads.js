@@ -1,10 +1,15 @@
 // Downloads of the session, the visible range or a stance, in every format of the server; optionally of the whole take.
 
 import * as api from "../common/api.js";
+import { notice, quietly } from "../common/notices.js";
+import { unlessRefused } from "../common/request.js";
 import { byId, el, setText } from "../common/text.js";
+import { offsetAt } from "./clock.js";
 import { timeText } from "./overlay.js";
+import { moveClock } from "./time_axis.js";
 
 const EDGE_S = 1e-6; // includes first and last frame of a stance
+const BINS_MIN = 50; // of a request for a begin
 const BUILT_IN = ["parquet", "arrow", "csv"]; // links on the page; other formats are in a list
 
 /** Download links. */
@@ -14,12 +19,18 @@ export class Downloads {
     this.range = byId("download-range", HTMLSelectElement);
     this.selected = "view"; // preferred range
     this.wholeTake = byId("download-together", HTMLInputElement);
+    this.takeOffsetS = 0; // this session's first frame after the take's, by the server's clock
+    this.mayEnd = el("input", { type: "checkbox", id: "download-may-end" });
     this.links = new Map(BUILT_IN.map((name) => [name, byId(`download-${name}`, HTMLAnchorElement)]));
   }
 
   /** Load the formats of the server. `changed()` runs after a change of the selection. */
   async load(session, changed) {
-    this.wholeTake.addEventListener("change", changed);
+    this.wholeTake.addEventListener("change", () => quietly(async () => {
+      if (this.wholeTake.checked) this.takeOffsetS = await takeOffset(session);
+      changed();
+    }));
+    this.mayEnd.addEventListener("change", changed);
     this.range.addEventListener("change", () => { this.selected = this.range.value; changed(); });
     this.formats = (await api.listFormats()).items;
     const others = this.formats.filter((format) => !BUILT_IN.includes(format.name));
@@ -41,7 +52,22 @@ export class Downloads {
     }
     const link = el("a", { id: `download-${format.name}`, download: "", text: format.title });
     this.links.set(format.name, link);
-    return el("li", { "data-format": format.name }, link, el("span", { cls: "soft", text: format.opened_by }));
+    const item = el("li", { "data-format": format.name }, link, el("span", { cls: "soft", text: format.opened_by }));
+    if (!format.options.includes("long_gap")) return item;
+    link.addEventListener("click", (event) => {
+      event.preventDefault();
+      quietly(() => this.download(link));
+    });
+    item.append(el("label", { cls: "soft", title: "Else a file with a gap of the force that is too long to fill is refused" },
+      this.mayEnd, " may end before a long gap"));
+    return item;
+  }
+
+  /** Download a file that may be refused, or have gaps that were filled; say so. @param {HTMLAnchorElement} link */
+  async download(link) {
+    const remarks = await api.checkDownload(link.href);
+    if (remarks) notice(remarks, { stays: true });
+    el("a", { href: link.href, download: "" }).click();
   }
 
   /** Show the formats that this session has. */
@@ -79,10 +105,27 @@ export class Downloads {
     const chosen = [this.selected, "view", "all"].find((value) => options.has(value));
     this.range.value = chosen;
     const { from, to } = chosen === "stance" ? { from: Math.max(0, stance.from - EDGE_S), to: stance.to + EDGE_S } : view;
-    const part = chosen === "all" ? "" : `&start_s=${from.toFixed(6)}&end_s=${to.toFixed(6)}`;
     for (const [name, link] of this.links) {
       const ofTake = this.wholeTake.checked && !BUILT_IN.includes(name);
-      link.href = ofTake ? api.takeDataAddress(session.take, name, part) : api.dataAddress(session, name, part);
+      const laterS = ofTake ? this.takeOffsetS : 0;
+      const part = chosen === "all" ? "" : `&start_s=${(from + laterS).toFixed(6)}&end_s=${(to + laterS).toFixed(6)}`;
+      const option = this.mayEnd.checked && this.has(name, "long_gap") ? "&long_gap=end" : "";
+      link.href = (ofTake ? api.takeDataAddress(session.take, name, part) : api.dataAddress(session, name, part)) + option;
     }
   }
+
+  has(name, option) { return this.formats.some((format) => format.name === name && format.options.includes(option)); }
+}
+
+/** Return a session's first frame after the first of its take, by the server's clock, in s. @param {SessionView} session */
+async function takeOffset(session) {
+  const begins = await Promise.all((await api.getTake(session.take)).sessions.map(async ({ id, parts }) => {
+    const [clock, { begin_t_ns: beginNs, time_axis: axis }] = await Promise.all([
+      unlessRefused(api.clockOf(id)), api.overview(id, { points: BINS_MIN }),
+    ]);
+    const offset = clock && offsetAt(moveClock(axis, parts, clock), beginNs, false);
+    return { id, at: offset === null ? Infinity : beginNs + offset }; // a file of a take without the server's clock is refused
+  }));
+  const offsetS = (begins.find(({ id }) => id === session.id).at - Math.min(...begins.map(({ at }) => at))) * 1e-9;
+  return Number.isFinite(offsetS) ? offsetS : 0;
 }
