@@ -77,7 +77,9 @@ def test_two_feet_of_a_take_lie_by_the_servers_clock_and_the_picture_says_so(
     for own, other, shift_s in ((left, right, LATER_S), (right, left, -LATER_S)):
         page = open_page(f"{apart.running.url}/sessions/{own.id}?with={other.id}")
         says = page.locator("#beside-summary")
-        expect(says).to_contain_text("aligned by the server's clock (shifted by")
+        expect(says).to_contain_text(
+            "(of the same take): aligned by the server's clock (shifted by"
+        )
         moved_s = float(says.get_attribute("data-shift-s") or "nan")
         assert moved_s == pytest.approx(shift_s, abs=1e-4)
         expect(page.locator("#legend [data-kind=beside]")).to_contain_text(

@@ -118,6 +118,7 @@ export class Compare {
     this.align.replaceChildren(...this.ways.map((way) => el("option", { value: way.key, text: way.label })));
     byId("align-choice").hidden = false;
     this.drawn = beside;
+    this.sameTake = this.session.take !== null && this.session.take === other.take;
     this.apartS = (other.started_t_ns - this.session.started_t_ns) * 1e-9;
     const own = { name: shortNameOf(this.session, other), stances: plots.stances, tares: this.page.replay.array?.tares ?? [] };
     const theirs = { name: shortNameOf(other, this.session), stances: stances ?? [], tares: array?.tares ?? [] };
@@ -141,7 +142,7 @@ export class Compare {
     this.drawn.move(way.shiftS);
     this.drawn.aligned = way.meaning;
     const shift = way.shiftS === 0 ? "" : ` (shifted by ${number(way.shiftS, 3)} s)`;
-    const apart = `recorded ${roughly(Math.abs(this.apartS))} ${this.apartS < 0 ? "earlier" : "later"}`;
+    const apart = this.sameTake ? "of the same take" : `recorded ${roughly(Math.abs(this.apartS))} ${this.apartS < 0 ? "earlier" : "later"}`;
     this.showText(`${this.drawn.name} (${apart}): ${way.meaning}${shift}.`, way.shiftS);
     this.page.redraw();
   }

@@ -175,11 +175,10 @@ def _refuse_long_gaps(
     worst, best = int(np.argmax(gaps_s)), int(np.argmax(ends - begins))
     from_s, to_s = (zero_s + time_s[row] for row in (begins[best], ends[best] - 1))
     scale = 10**_SLICE_DIGITS
-    count = f"{len(gaps_s)} gaps are" if len(gaps_s) > 1 else "a gap is"
+    count = f"{len(gaps_s)} gaps of the force are" if len(gaps_s) > 1 else "a gap of the force is"
     return UsageError(
-        f"the force is not known throughout, and this format has no value for that: {count} too "
-        f"long for a line, the longest {gaps_s[worst]:.3f} s at "
-        f"{zero_s + time_s[ends[worst] - 1]:.3f} s",
+        f"{count} too long for a line, the longest {gaps_s[worst]:.3f} s at "
+        f"{zero_s + time_s[ends[worst] - 1]:.3f} s, and this format has no value for unknown",
         where=where,
         expected=f"a slice without, the longest from {np.ceil(from_s * scale) / scale:.3f} s to "
         f"{np.floor(to_s * scale) / scale:.3f} s",

@@ -48,7 +48,7 @@ def test_a_long_gap_is_refused_unless_it_may_end_the_file(
     for command, out, source in (("export", "x.zip", data), ("pull", "here", server)):
         refused = run(command, session.id, *wanted, out, *source)
         assert refused.code in (1, 2)
-        assert "a gap is too long for a line, the longest 0.202 s" in refused.err
+        assert "a gap of the force is too long for a line, the longest 0.202 s" in refused.err
         assert "--long-gap end" in refused.err
         slices |= set(re.findall(r"from ([0-9.]+) s to ([0-9.]+) s", refused.err))
         ended = run(command, session.id, *wanted, out, *source, "--long-gap", "end")

@@ -93,7 +93,7 @@ def test_a_short_gap_in_a_stance_is_a_listed_line(kind: str, tmp_path: Path) -> 
 def test_a_long_gap_is_refused_with_a_slice_that_has_none_or_ends_the_file(
     gap: slice, tmp_path: Path
 ) -> None:
-    with pytest.raises(UsageError, match=r"a gap is too long for a line") as refused:
+    with pytest.raises(UsageError, match=r"a gap of the force is too long for a line") as refused:
         Unpacked(export_of_walk(keep=without(gap)), tmp_path)
     edges = re.search(r"the longest from ([0-9.]+) s to ([0-9.]+) s", str(refused.value))
     assert edges
@@ -128,7 +128,9 @@ def test_short_gaps_beside_flight_fall_to_0_and_flight_stays_0(
 
 def test_no_line_is_drawn_over_a_saturated_tile(tmp_path: Path) -> None:
     columns = saturated(walk(), slice(MIDDLE, MIDDLE + 3))
-    with pytest.raises(UsageError, match=r"a gap is too long for a line, the longest 0\.008 s"):
+    with pytest.raises(
+        UsageError, match=r"a gap of the force is too long for a line, the longest 0\.008 s"
+    ):
         Unpacked(export_of_walk(columns), tmp_path)
     assert len(Unpacked(export_of_walk(columns, options=END), tmp_path).table) == MIDDLE
 
