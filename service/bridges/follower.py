@@ -56,15 +56,14 @@ class LiveFrames:
         stream_id: its stream.
         info: array of the stream.
         columns: flat columns, n rows each, with the server's time. What may be unknown is a float,
-            and NaN where it is; an unknown server's time is `UNKNOWN_T_NS`.
-        has_estimates: False: no calibration or tare, or still compiling; estimates are NaN.
+            and NaN where it is; an unknown server's time is `UNKNOWN_T_NS`. Without a calibration
+            or a tare, and while the estimator compiles, all of an estimate is unknown.
     """
 
     node: str
     stream_id: str
     info: ArrayInfo
     columns: Mapping[str, Array]
-    has_estimates: bool
 
 
 @dataclass(frozen=True)
@@ -375,11 +374,8 @@ class ServerFollower:
                         stream_id = stream.position and stream.position[0]
                         if info is None or info.stream_id != stream_id:
                             info = read_array_info(batch.schema, where=f"live feed of {name}")
-                            # Bits of an estimate are known if it is there.
                             may_be_unknown = [
-                                field.name
-                                for field in batch.schema
-                                if field.nullable and field.name != "estimate_flags"
+                                field.name for field in batch.schema if field.nullable
                             ]
                         if self._outlet.has_readers(name):
                             self._write_frames(name, info, may_be_unknown, batch)
@@ -407,8 +403,7 @@ class ServerFollower:
         if measured is not None:
             times = columns["t_ns"] + measured.offset_ns, measured.bound_ns
         columns |= zip(_SERVER_TIMES, times, strict=True)
-        has_estimates = not batch.column("estimate_flags").null_count
-        frames = LiveFrames(name, info.stream_id, info, columns, has_estimates)
+        frames = LiveFrames(name, info.stream_id, info, columns)
         self._outlet.write_frames(frames, self.server_clock)
 
 

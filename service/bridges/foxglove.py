@@ -12,6 +12,7 @@ import foxglove
 import numpy as np
 
 from devices.errors import UsageError
+from devices.frames import ArrayInfo
 from service.bridges.follower import Event, LiveClock, LiveFrames, Outlet
 from storage.clock.table import ClockTable
 from storage.formats.export import Export, FrameSource
@@ -31,45 +32,55 @@ _READINGS = (
     "tile_flags",
     "frame_flags",
 )
+_Schema = tuple[str, str, bytes]
+"""Schema: name, encoding, content."""
+_Topic = tuple[str, str, _Schema]
+"""Topic: name, encoding of its messages, schema."""
+UNKNOWN_FLAGS = 2**32 - 1
+"""Value of `estimate_flags` in a frame without an estimate: the field has no NaN."""
 
 
 class _NodeChannels:
-    """Channels of a node, for one stream with or without estimates, and their encoder."""
+    """Channels of a node and their encoder, across its streams.
 
-    def __init__(self, context: foxglove.Context, frames: LiveFrames, topic_prefix: str) -> None:
-        self.key = frames.stream_id, frames.has_estimates
+    A channel stays open as long as its topic has the same schema, so that no viewer loses it.
+    """
+
+    def __init__(self, context: foxglove.Context, topic_prefix: str) -> None:
+        self.topic_prefix = topic_prefix
         self._context = context
-        self._schemas: list[foxglove.Schema] = []
-        self._channels: list[foxglove.Channel] = []
+        self._stream_id = ""
         self._last_turn = -1
-        names = _READINGS + (_ESTIMATES if frames.has_estimates else ())
-        # A clock adds the columns of the server's time.
-        clock = ClockTable({}, (), ())
-        export = Export(FrameSource(names, lambda _: (), 0), frames.info, {}, Slice(), clock)
-        writer: Any = self  # two methods of an MCAP writer
-        self._encoder = FoxgloveEncoder(writer, export, topic_prefix)
+        self._schemas: list[_Schema] = []
+        self._topics: list[_Topic] = []
+        self._open: dict[_Topic, foxglove.Channel] = {}
+        self._encoder: FoxgloveEncoder
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Register a schema; return its number."""
-        self._schemas.append(foxglove.Schema(name=name, encoding=encoding, data=data))
+        """Note a schema; return its number."""
+        self._schemas.append((name, encoding, data))
         return len(self._schemas) - 1
 
     def register_channel(self, topic: str, encoding: str, schema: int, _: object) -> int:
-        """Open a channel; return its number."""
-        described: dict[str, Any] = {"schema": self._schemas[schema], "message_encoding": encoding}
-        self._channels.append(foxglove.Channel(topic, context=self._context, **described))
-        return len(self._channels) - 1
+        """Note a channel to open; return its number."""
+        self._topics.append((topic, encoding, self._schemas[schema]))
+        return len(self._topics) - 1
 
     def has_readers(self) -> bool:
         """Return whether a viewer reads a channel."""
-        return any(channel.has_sinks() for channel in self._channels)
+        return any(channel.has_sinks() for channel in self._open.values())
 
     def send_frames(self, frames: LiveFrames) -> None:
         """Send frames at the server's time; at the node's if it is unknown."""
+        if frames.stream_id != self._stream_id:
+            self._open_channels(frames.info)
+            self._stream_id = frames.stream_id
         server_ns = frames.columns["t_server_ns"]
         t_ns = np.where(server_ns == UNKNOWN_T_NS, frames.columns["t_ns"], server_ns)
         rows, self._last_turn = find_drawn_rows(t_ns, self._last_turn)
-        chunk = FrameChunk(t_ns, frames.columns, rows.tolist(), [], None)
+        flags = frames.columns["estimate_flags"].astype(np.float64)  # float32 has no such number
+        known = {"estimate_flags": np.nan_to_num(flags, nan=UNKNOWN_FLAGS).astype(np.uint32)}
+        chunk = FrameChunk(t_ns, {**frames.columns, **known}, rows.tolist(), [], None)
         for message in self._encoder.encode_messages(chunk):
             self._send(message)
 
@@ -77,14 +88,29 @@ class _NodeChannels:
         """Send an event as a marker."""
         self._send(self._encoder.encode_marker(event.t_ns, str(event)))
 
-    def close(self) -> None:
-        """Close all channels."""
-        for channel in self._channels:
-            channel.close()
+    def _open_channels(self, info: ArrayInfo) -> None:
+        """Open the channels of an array that are not open; close all others."""
+        self._schemas, self._topics = [], []
+        # A clock adds the columns of the server's time.
+        clock = ClockTable({}, (), ())
+        export = Export(
+            FrameSource(FoxgloveOutlet.columns, lambda _: (), 0), info, {}, Slice(), clock
+        )
+        writer: Any = self  # two methods of an MCAP writer
+        self._encoder = FoxgloveEncoder(writer, export, self.topic_prefix)
+        for topic in self._open.keys() - set(self._topics):
+            self._open.pop(topic).close()
+        for topic in self._topics:
+            if topic not in self._open:
+                name, message_encoding, (schema_name, encoding, data) = topic
+                schema = foxglove.Schema(name=schema_name, encoding=encoding, data=data)
+                self._open[topic] = foxglove.Channel(
+                    name, schema=schema, message_encoding=message_encoding, context=self._context
+                )
 
     def _send(self, message: Message) -> None:
         at_ns, number, content = message
-        self._channels[number].log(content, log_time=at_ns)
+        self._open[self._topics[number]].log(content, log_time=at_ns)
 
 
 class FoxgloveOutlet(Outlet):
@@ -112,7 +138,6 @@ class FoxgloveOutlet(Outlet):
             ) from error
         self.url = f"ws://{host}:{self._server.port}"
         """Address for viewers."""
-        self._prefixes: dict[str, str] = {}
         self._nodes: dict[str, _NodeChannels] = {}
 
     def has_readers(self, node: str) -> bool:
@@ -123,13 +148,10 @@ class FoxgloveOutlet(Outlet):
         """Send the messages of frames."""
         name = frames.node
         node = self._nodes.get(name)
-        if node is None or node.key != (frames.stream_id, frames.has_estimates):
-            if node is not None:
-                node.close()
-            if name not in self._prefixes:
-                names = [*self._prefixes.values(), f"/{make_ros2_name(name)}"]
-                self._prefixes[name] = make_names_unique(names)[-1]
-            node = self._nodes[name] = _NodeChannels(self._context, frames, self._prefixes[name])
+        if node is None:
+            names = [each.topic_prefix for each in self._nodes.values()]
+            prefix = make_names_unique([*names, f"/{make_ros2_name(name)}"])[-1]
+            node = self._nodes[name] = _NodeChannels(self._context, prefix)
         node.send_frames(frames)
 
     def write_event(self, event: Event, server_clock: LiveClock) -> None:

@@ -91,6 +91,8 @@ class Process:
             reader.join(5.0)
             assert stream is not None
             stream.close()
+        # pytest shows it beside a failure.
+        sys.stderr.write("".join(f"foottile: {line}\n" for line in (*self.out, *self.err)))
 
     def _read(self, stream: Any, lines: list[str]) -> None:
         with contextlib.suppress(ValueError):  # closed

@@ -27,24 +27,23 @@ from tests.waiting import PATIENCE_S
 def make_live_frames(
     t_server_ns: np.ndarray, node: str, *, tiles: int = 2, seq_first: int = 0
 ) -> LiveFrames:
-    """Frames in which every value differs, and every second row has unknown forces."""
+    """Frames in which every value differs, and every second row has no estimate."""
     info = make_array(tiles, node=node)
     n = len(t_server_ns)
     columns = {
         name: np.arange(n) + number
         for number, name in enumerate(map_flat_columns(tiles))
-        if name.startswith(
-            ("seq", "tile_flags", "frame_flags", "estimate_flags", "t_mono_ns", "t_ns")
-        )
+        if name.startswith(("seq", "tile_flags", "frame_flags", "t_mono_ns", "t_ns"))
     }
     for number, (name, column) in enumerate(map_flat_columns(tiles).items()):
         if name not in columns:
-            columns[name] = np.where(np.arange(n) % 2, np.nan, 100.0 + number)
+            values = np.where(np.arange(n) % 2, np.nan, 100.0 + number)
+            columns[name] = values.astype(np.float32)  # as of the live feed
             if column.name == "contact":
                 columns[name] = np.where(np.arange(n) % 2, 255, 1)
     columns["seq"] = columns["seq"] + seq_first
     columns |= {"t_server_ns": t_server_ns, "t_server_uncertainty_ns": np.full(n, 300)}
-    return LiveFrames(node, info.stream_id, info, columns, True)
+    return LiveFrames(node, info.stream_id, info, columns)
 
 
 _UNKNOWN_CHANNEL = re.compile(r"Unknown channel ID: (\d+)")
@@ -69,7 +68,7 @@ class Viewer:
         self.topics: dict[int, str] = {}
         self.schemas: dict[str, str] = {}
         self._decoders: dict[int, Callable[[bytes], Any]] = {}
-        self._closed: set[int] = set()
+        self.closed: set[int] = set()
         self._stack = ExitStack()
         self._socket = self._stack.enter_context(
             connect(
@@ -101,10 +100,10 @@ class Viewer:
                         self._read_schema(channel)
                         self._subscribe(channel["id"])
                 case "unadvertise":
-                    self._closed.update(content["channelIds"])
+                    self.closed.update(content["channelIds"])
                 case "status" if found := _UNKNOWN_CHANNEL.fullmatch(content["message"]):
                     # foxglove-sdk 0.30.3 advertises a channel before it knows it itself.
-                    if int(found[1]) not in self._closed:
+                    if int(found[1]) not in self.closed:
                         self._subscribe(int(found[1]))
 
     def skip_message(self, timeout_s: float) -> bool:

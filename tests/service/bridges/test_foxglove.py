@@ -7,6 +7,7 @@ import re
 import signal
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ import pytest
 import foottile as client
 from devices.flags import EstimateFlag
 from service.bridges.follower import LiveClock
-from service.bridges.foxglove import FoxgloveOutlet
+from service.bridges.foxglove import UNKNOWN_FLAGS, FoxgloveOutlet
 from tests.service.bridges.readers import Viewer, make_live_frames
 from tests.service.fake_node import FakeNode, Play
 from tests.service.process import Process, Start
@@ -96,7 +97,7 @@ def test_markers_recordings_and_the_foot_are_shown(
 
 
 @pytest.mark.slow
-def test_a_node_that_comes_back_with_more_tiles_has_new_topics_in_place_of_the_old(
+def test_a_node_that_comes_back_with_more_tiles_has_another_topic_of_frames_and_no_zero_forces(
     tared: FakeNode, viewer: Viewer
 ) -> None:
     with Play(tared, 20.0):
@@ -105,12 +106,31 @@ def test_a_node_that_comes_back_with_more_tiles_has_new_topics_in_place_of_the_o
     tared.tiles = 3
     tared.connect()
     with Play(tared, 0.0):
-        more = viewer.receive_of("/bench/frames", lambda frame: "tile_flags_2" in fields(frame))
-    assert "grf_n" not in fields(more.content)  # no tare yet: unknown, and no zero
+        more = viewer.receive_of("/bench/frames", lambda frame: hasattr(frame, "tile_flags_2"))
+    assert [viewer.topics[number] for number in viewer.closed] == ["/bench/frames"]
+    assert np.isnan(more.content.grf_n)  # no tare yet
 
 
-def fields(message: object) -> list[str]:
-    return [field.name for field in message.DESCRIPTOR.fields]  # type: ignore[attr-defined]  # of protobuf
+def test_topics_stay_open_when_estimates_begin_and_when_the_node_restarts() -> None:
+    outlet, clock = FoxgloveOutlet("127.0.0.1", 0), LiveClock()
+    frames = make_live_frames(10**18 + np.arange(2) * 10**8, "bench")  # estimate, none
+    restarted = replace(frames, stream_id="another")
+    with closing(outlet):
+        outlet.write_frames(frames, clock)
+        with closing(Viewer(outlet.url)) as viewer:
+            channels = outlet._nodes["bench"]._open
+            until(
+                lambda: viewer.skip_message(0.02) or all(c.has_sinks() for c in channels.values())
+            )
+            for each in (frames, restarted):
+                outlet.write_frames(each, clock)
+                seen = [viewer.receive_of("/bench/frames").content for _ in range(2)]
+                assert [frame.estimate_flags == UNKNOWN_FLAGS for frame in seen] == [False, True]
+                assert [np.isnan(frame.grf_n) for frame in seen] == [False, True]
+            assert sorted(viewer.topics.values()) == [
+                *("/bench/foot", "/bench/frames", "/bench/markers")
+            ]
+            assert not viewer.closed
 
 
 @pytest.mark.slow
