@@ -1,12 +1,13 @@
-"""Shared by all tests: a cache of the emulated rig, reproducible examples, and tests in turn."""
+"""Shared by all tests: a cache of the emulated rig, reproducible examples, tests in turn, hangs."""
 
 from __future__ import annotations
 
+import faulthandler
 import gc
 import hashlib
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
@@ -77,6 +78,35 @@ def is_of_this_run(item: pytest.Item) -> bool:
 def pytest_runtestloop() -> None:
     gc.freeze()  # what collection made stays, and each search of everything took 0.4 s
     gc.enable()
+
+
+STDERR = pytest.StashKey[int]()
+"""The standard error of the whole run: that of a test is captured."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.stash[STDERR] = os.dup(2)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item: pytest.Item) -> Generator[None]:
+    """Watch a test that failed, too: there pytest ends its own watch, and a fixture may hang."""
+    watch_for_hang(item.config)
+    try:
+        yield
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Watch the end of the process, which waits for threads that a test has left."""
+    watch_for_hang(config)
+
+
+def watch_for_hang(config: pytest.Config) -> None:
+    """Print all stacks and end the process, whatever it waits for, unless that is cancelled."""
+    seconds = float(config.getini("faulthandler_timeout"))
+    faulthandler.dump_traceback_later(seconds, file=config.stash[STDERR], exit=True)
 
 
 def pytest_report_header() -> str | None:
