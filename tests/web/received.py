@@ -24,8 +24,9 @@ class Received:
         devtools.send("Network.enable")
 
     @property
-    def bytes_in_all(self) -> int:
-        return sum(self.bytes_of.values())
+    def bytes_of_files(self) -> dict[str, int]:
+        """By address, without answers of the API: these grow with what has happened until then."""
+        return {url: size for url, size in self.bytes_of.items() if "/api/" not in url}
 
     def wait_for(self, part: str) -> None:
         """Until an answer from an address with this in it has come, and all others, too."""
