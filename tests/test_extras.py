@@ -68,7 +68,7 @@ def test_a_node_that_records_alone_seals_raw_frames_and_estimates_are_added_late
         with pytest.raises(subprocess.TimeoutExpired):  # some seconds of frames: lead and load
             node.process.wait(4.0)
         node.process.send_signal(signal.SIGINT)
-        assert node.ended(60.0) == 0, node.err
+        assert node.ended() == 0, node.err
     (session_id,) = folder.list_ids_newest_first()
     session = folder.load(session_id)
     assert session.problem is not None

@@ -66,9 +66,9 @@ def test_a_session_is_recorded_served_pulled_proven_exported_compared_and_asked_
                 assert api.get(route).json()["complete"] is True
             run(tmp_path, "pull", begun["id"], "--server", url, "--out", "pulled")
             node.process.send_signal(signal.SIGINT)
-            assert node.ended(PATIENCE_S) == 0, node.err
+            assert node.ended() == 0, node.err
         server.process.send_signal(signal.SIGINT)
-        assert server.ended(PATIENCE_S) == 0, server.err
+        assert server.ended() == 0, server.err
     assert "whole and complete" in run(tmp_path, "verify", "data")
     (frames,) = (tmp_path / "pulled").rglob("frames.parquet")
     for name in FORMATS:

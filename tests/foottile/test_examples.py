@@ -18,7 +18,7 @@ from tests.builders.arrays import PERIOD_NS
 from tests.service.fake_node import FakeNode, NodeOf, Play
 from tests.service.process import Start
 from tests.service.running import Running
-from tests.waiting import PATIENCE_S, until
+from tests.waiting import until
 
 PAGE = Path(__file__).parents[2] / "docs" / "client.md"
 README = PAGE.parents[1] / "README.md"
@@ -78,7 +78,7 @@ def test_the_readme_plots_what_was_pulled_over_seconds(
             until(lambda: session.refresh().frame_count > 100)
         session.wait_until_sealed()
     pulled = foottile("pull", session.id, "--out", tmp_path / "here", "--server", running.url)
-    assert pulled.ended(PATIENCE_S) == 0, pulled.err
+    assert pulled.ended() == 0, pulled.err
     (block,) = re.findall(r"```python\n(import pandas.*?)```", README.read_text(), re.DOTALL)
     names: dict[str, Any] = {}
     exec(compile(block.replace("SESSION", session.id), str(README), "exec"), names)  # noqa: S102  # our own page
@@ -100,7 +100,7 @@ def test_every_line_for_the_shell_runs(
         arguments = shlex.split(line.partition("|")[0].partition(">")[0])
         assert arguments[0] == "foottile"
         process = foottile(*arguments[1:], "--frames", 3, "--server", running.url)
-        assert process.ended(PATIENCE_S) == 0, process.err
+        assert process.ended() == 0, process.err
         assert len(process.out) == (3 if "jsonl" in line else 4)
         assert not process.err
 

@@ -74,21 +74,21 @@ class Process:
         assert line is not None
         return line
 
-    def ended(self, timeout_s: float) -> int:
+    def ended(self, timeout_s: float = PATIENCE_S) -> int:
         """Its exit code, once it has ended."""
         code = self.process.wait(timeout_s)
         for reader in self._readers:
-            reader.join(10.0)
+            reader.join(PATIENCE_S)
         return code
 
     def close(self) -> None:
         if self.process.poll() is None:
             self.process.kill()
-            self.process.wait(5.0)
+            self.process.wait(PATIENCE_S)
         for reader, stream in zip(
             self._readers, (self.process.stdout, self.process.stderr), strict=True
         ):
-            reader.join(5.0)
+            reader.join(PATIENCE_S)
             assert stream is not None
             stream.close()
         # pytest shows it beside a failure.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import json
 import shutil
 import ssl
@@ -25,6 +26,7 @@ from service.api.address import list_urls, open_listening_socket
 from service.api.app import make_app, serve_app
 from service.api.routes.login import add_ticket
 from service.api.settings import LimitSettings
+from service.estimation.compilation import compile_models
 from service.protocol.link import SUBPROTOCOL
 from service.protocol.live import PageMessage
 from service.server.server import Server
@@ -62,6 +64,12 @@ def receive_live(socket: Any, is_wanted: Callable[[dict[str, Any]], bool]) -> di
         PAGE_MESSAGES.validate_json(text, strict=True)
         if is_wanted(message):
             return message
+
+
+@functools.cache
+def _compile_once() -> None:
+    """Compile the models, which takes a busy machine minutes: then no test waits for forces."""
+    compile_models()
 
 
 class Running:
@@ -109,12 +117,13 @@ class Running:
 
     def start(self) -> None:
         assert self._thread is None
+        _compile_once()
         ready = threading.Event()
         self._thread = threading.Thread(target=self._run, args=(ready,), name="server")
         self._thread.start()
-        assert ready.wait(60.0)  # beside other tests on the same cores
+        assert ready.wait(PATIENCE_S)
         if self._problem is not None:
-            self._thread.join()
+            self._thread.join(PATIENCE_S)
             self._thread = None
             raise self._problem
         self.http = self.client()
@@ -134,7 +143,7 @@ class Running:
             return
         self.http.close()
         self._loop.call_soon_threadsafe(self._stop.set)
-        self._thread.join(15.0)
+        self._thread.join(PATIENCE_S)
         assert not self._thread.is_alive(), "the server does not end"
         self._thread = None
         assert not self._left_over, self._left_over
@@ -152,7 +161,7 @@ class Running:
         async def run() -> T:
             return function()
 
-        return asyncio.run_coroutine_threadsafe(run(), self._loop).result(10.0)
+        return asyncio.run_coroutine_threadsafe(run(), self._loop).result(PATIENCE_S)
 
     def link(self) -> str:
         """An address of the live page that logs a browser in, once."""
@@ -248,7 +257,7 @@ ServeWith = Callable[..., Running]
 
 async def _left_over() -> list[str]:
     """Tasks that go on although everything has ended."""
-    end_s = time.monotonic() + 3.0
+    end_s = time.monotonic() + PATIENCE_S / 2
     while True:
         tasks = asyncio.all_tasks() - {asyncio.current_task()}
         if not tasks or time.monotonic() > end_s:

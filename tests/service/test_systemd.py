@@ -34,4 +34,4 @@ def test_a_service_tells_begin_life_and_end(command: str, foottile: Start, tmp_p
         while (state := systemd.recv(100)) == b"WATCHDOG=1":
             pass
         assert state == b"STOPPING=1"
-        assert service.ended(PATIENCE_S) == 0
+        assert service.ended() == 0

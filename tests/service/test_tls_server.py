@@ -108,7 +108,7 @@ def test_a_server_with_tls_is_trusted_by_its_user_and_by_whoever_has_its_ca(
             assert phone.get("/x", headers={"a": "b" * 40000}).status_code == 431
 
         server.process.send_signal(signal.SIGINT)
-        assert server.ended(60.0) == 0, server.err
+        assert server.ended() == 0, server.err
     again = start(tmp_path, "serve", "--tls", "--port=0", "--data", data, name="again")
     with closing(again):
         assert again.said("compare there").endswith(stated)

@@ -147,7 +147,7 @@ def test_it_goes_on_after_a_restart_of_the_server_says_so_once_and_ends_with_ctr
         viewer.receive_of("/bench/frames", lambda frame: frame.seq >= first)
     assert len([line for line in bridge.err if "no connection" in line]) == 1
     bridge.process.send_signal(signal.SIGINT)
-    assert bridge.ended(20.0) == 0
+    assert bridge.ended() == 0
 
 
 def test_a_viewer_that_does_not_read_takes_nothing_from_another() -> None:
@@ -185,7 +185,7 @@ def test_a_private_server_is_republished_only_if_that_is_said(
     running = serve_with(is_private=True)
     words = ("bridge", "foxglove", "--port", 0, "--server", running.url)
     refused = foottile(*words)
-    assert refused.ended(60.0) == 2
+    assert refused.ended() == 2
     assert "is private" in refused.err[-1]
     assert "--public" in refused.err[-1]
     allowed = foottile(*words, "--public")

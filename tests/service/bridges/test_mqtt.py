@@ -75,7 +75,7 @@ def test_a_bridge_that_is_ended_is_offline(
     time.sleep(1.0)  # until no message waits for its acknowledgement
     bridge.process.send_signal(signal.SIGINT)
     assert broker.receive("foottile/bridge").content == "offline"
-    assert bridge.ended(PATIENCE_S) == 0
+    assert bridge.ended() == 0
 
 
 @pytest.mark.slow

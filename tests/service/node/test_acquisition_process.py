@@ -110,7 +110,7 @@ def test_acquisition_that_is_killed_ends_the_node_with_the_reason(
     running: Running, process: Process
 ) -> None:
     os.kill(acquisition_of(process), signal.SIGKILL)
-    assert process.ended(20.0) == 1
+    assert process.ended() == 1
     assert any("acquisition process was killed by SIGKILL" in line for line in process.err)
     assert any("Start the node again" in line for line in process.err)
     until(lambda: not running.node("leg")["connected"])
@@ -240,7 +240,7 @@ def test_a_node_waits_for_its_bus_says_so_once_and_stops_when_told(
         process.process.wait(2.5)
     assert sum("ENOENT" in line for line in process.err) == 1
     process.process.send_signal(signal.SIGTERM)
-    assert process.ended(20.0) == 0, process.err
+    assert process.ended() == 0, process.err
 
 
 def test_a_parent_that_has_died_is_no_bug(monkeypatch: pytest.MonkeyPatch) -> None:

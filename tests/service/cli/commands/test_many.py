@@ -107,7 +107,7 @@ def test_an_interrupted_and_then_killed_client_goes_on_and_leaves_the_same_files
         with closing(Process(*words, 2, "--out", out, folder=tmp_path / "run")) as client:
             until(partial(has_more_than, len(kept)))
             client.process.send_signal(number)
-            assert client.ended(60.0) == code
+            assert client.ended() == code
         before = kept
         kept = {path: path.stat().st_mtime_ns for path in out.glob("*/estimate.made.json")}
         assert before.items() <= kept.items()
