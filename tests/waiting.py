@@ -13,17 +13,17 @@ import pytest
 P = ParamSpec("P")
 T = TypeVar("T")
 
-PATIENCE_S = 60.0
+PATIENCE_S = 180.0
 """How long to wait for what has to happen in the end, on however slow a machine: no test's claim.
 Who claims a time measures it."""
 
 
 def in_a_loop(test: Callable[P, Coroutine[Any, Any, None]]) -> Callable[P, None]:
-    """A test that is a coroutine, run in an event loop of its own."""
+    """A test that is a coroutine, run in an event loop of its own; its waits end."""
 
     @functools.wraps(test)
     def run(*arguments: P.args, **options: P.kwargs) -> None:
-        asyncio.run(test(*arguments, **options))
+        asyncio.run(asyncio.wait_for(test(*arguments, **options), 4 * PATIENCE_S))
 
     return run
 
@@ -38,3 +38,15 @@ def until(
             pytest.fail(f"not true within {timeout_s} s; last: {found!r}", pytrace=True)
         time.sleep(every_s)
     return found
+
+
+def left_s(end_s: float) -> float:
+    """Seconds until this instant of `time.monotonic`: the timeout of a wait for one of many.
+
+    Raises:
+        TimeoutError: it is past, though others may come without end.
+    """
+    left = end_s - time.monotonic()
+    if left <= 0.0:
+        raise TimeoutError("what a test waits for did not come")
+    return left

@@ -43,7 +43,7 @@ from tests.builders.frames import make_frames
 from tests.builders.hello import make_hello
 from tests.service.recording import Recording
 from tests.service.running import Running
-from tests.waiting import PATIENCE_S, until
+from tests.waiting import PATIENCE_S, left_s, until
 
 LONG_AGO_NS = 20_000_000_000
 """A node's frames begin so long before now, so that `now=True` is a leap past what was asked."""
@@ -240,9 +240,7 @@ class FakeNode:
         """The next message of a kind; acknowledgements on the way are noted."""
         end_s = time.monotonic() + timeout_s
         while True:
-            message = SERVER_MESSAGES.validate_json(
-                self.socket.recv(timeout=max(0.0, end_s - time.monotonic()))
-            )
+            message = SERVER_MESSAGES.validate_json(self.socket.recv(timeout=left_s(end_s)))
             if message.type == "ack":
                 acked = self.acked_of.setdefault(message.stream_id, Intervals())
                 acked.add(message.seq_first, message.seq_last)
@@ -255,8 +253,9 @@ class FakeNode:
 
     def acknowledged(self, last: int, first: int = 0) -> None:
         """Wait until all of this was acknowledged."""
+        end_s = time.monotonic() + PATIENCE_S
         while self.acked.missing_in(first, last):
-            self.receive("ack")
+            self.receive("ack", left_s(end_s))
 
     def frames(
         self,

@@ -33,7 +33,7 @@ from service.server.server import Server
 from storage.journal.journal import Journal
 from tests.service.recording import Recording
 from tests.tokens import SHARED_BEARER, SHARED_TOKEN
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, left_s
 
 PAGE_MESSAGES: TypeAdapter[PageMessage] = TypeAdapter(PageMessage)
 T = TypeVar("T")
@@ -59,7 +59,7 @@ def receive_live(socket: Any, is_wanted: Callable[[dict[str, Any]], bool]) -> di
     """Return the next live message that is wanted; others come all the time."""
     end_s = time.monotonic() + PATIENCE_S
     while True:
-        text = socket.recv(timeout=max(0.0, end_s - time.monotonic()))
+        text = socket.recv(timeout=left_s(end_s))
         message: dict[str, Any] = json.loads(text)
         PAGE_MESSAGES.validate_json(text, strict=True)
         if is_wanted(message):
@@ -267,9 +267,10 @@ async def _left_over() -> list[str]:
 
 def closed(socket: Any, timeout_s: float = PATIENCE_S) -> tuple[int, str]:
     """Code and reason with which the server closes a websocket."""
+    end_s = time.monotonic() + timeout_s
     try:
         while True:
-            socket.recv(timeout=timeout_s)
+            socket.recv(timeout=left_s(end_s))
     except ConnectionClosed as end:
         if end.rcvd is None:
             pytest.fail("it was cut off without a close frame")

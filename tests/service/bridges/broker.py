@@ -12,13 +12,14 @@ import queue
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from paho.mqtt.client import Client, MQTTMessage
 from paho.mqtt.enums import CallbackAPIVersion
 
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, left_s
 
 
 class Received(NamedTuple):
@@ -66,8 +67,9 @@ class RunningBroker:
 
     def receive(self, topic: str, is_wanted: Callable[[Any], bool] = lambda _: True) -> Received:
         """The next message of a topic that is wanted; others are dropped."""
+        end_s = time.monotonic() + PATIENCE_S
         while True:
-            message = self.received.get(timeout=PATIENCE_S)
+            message = self.received.get(timeout=left_s(end_s))
             if message.topic == topic and is_wanted(message.content):
                 return message
 

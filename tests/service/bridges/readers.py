@@ -21,7 +21,7 @@ from websockets.typing import Subprotocol
 from service.bridges.follower import LiveFrames
 from storage.schema import map_flat_columns
 from tests.builders.arrays import make_array
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, left_s
 
 
 def make_live_frames(
@@ -87,7 +87,7 @@ class Viewer:
         """The next message of any topic."""
         end_s = time.monotonic() + timeout_s
         while True:
-            message = self._socket.recv(timeout=max(end_s - time.monotonic(), 0.0))
+            message = self._socket.recv(timeout=left_s(end_s))
             if isinstance(message, bytes):
                 kind, channel, log_time_ns = struct.unpack_from("<BIQ", message)
                 assert kind == 1
@@ -118,7 +118,7 @@ class Viewer:
         """The next message of a topic that is wanted."""
         end_s = time.monotonic() + PATIENCE_S
         while True:
-            seen = self.receive(end_s - time.monotonic())
+            seen = self.receive(left_s(end_s))
             if seen.topic == topic and is_wanted(seen.content):
                 return seen
 

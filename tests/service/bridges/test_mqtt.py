@@ -185,7 +185,7 @@ async def test_it_ends_although_the_broker_hangs(monkeypatch: pytest.MonkeyPatch
         while not outlet._is_connected:
             await asyncio.sleep(0.01)
         running.cancel()
-        done, _ = await asyncio.wait([running], timeout=8.0)
+        done, _ = await asyncio.wait([running], timeout=PATIENCE_S)
         running.cancel()  # of one that goes on
     assert done
     assert running.cancelled()
