@@ -5,7 +5,7 @@ is written, or the file ends before it. An unknown force is never 0; in flight i
 
 Limits: in simulated stances (walks, jumps, hops, mud) a line over 50 ms within a stance has an RMS
 error of 0.3 to 1.4 % of the peak, in the median of random places. Over a begin or end of contact
-it has 9 to 17 %, over 20 ms there 0.5 to 9 %.
+it has 2 to 17 %, over 20 ms there 0.5 to 9 %.
 """
 
 from __future__ import annotations
