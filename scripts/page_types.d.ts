@@ -56,6 +56,11 @@ type BinsView = {
   columns: Record<string, Array<number | null>>;
 };
 
+type BytesPatch = {
+  at: number;
+  hex: string;
+};
+
 type CalibrationSummaryView = {
   id: string;
   name: string;
@@ -148,6 +153,8 @@ type FilmInfo = {
   play_rate_hz: number;
   is_variable: boolean;
   capture_rate_hz: number | null;
+  hidden_count?: number | null;
+  patch?: BytesPatch | null;
 };
 
 type FitView = {
@@ -733,6 +740,7 @@ type TileView = {
 
 type TimesView = {
   film_s: Array<number>;
+  whole_s?: Array<number> | null;
 };
 
 type TrialList = {

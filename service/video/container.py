@@ -77,7 +77,7 @@ def read_film(path: Path, capture_rate_hz: float | None = None) -> tuple[FilmInf
         FileFormatError: the file is no film, has no pictures, or is shorter than it says.
         UsageError: the rate is impossible.
     """
-    with _open_container(path) as (container, stream):
+    with open_container(path) as (container, stream):
         stamps = _read_stamps(container, stream, path)
         times_s = np.asarray((stamps - stamps[0]) * float(stream.time_base or 1))
         _check_length(container, stream, times_s, path)
@@ -166,36 +166,53 @@ def iterate_pictures(
     """
     import av
 
-    with _open_container(path) as (container, stream):
+    with open_container(path) as (container, stream):
         stamps = _read_stamps(container, stream, path)
-        end = len(stamps) if end is None else min(end, len(stamps))
-        if begin >= end:
-            return
-        first, last = int(stamps[begin]), int(stamps[end - 1])
-        container.seek(first, stream=stream, backward=True)
-        pixel_format = "gray" if is_grey else "bgr24"
         width, height = _compute_shown_size_px(stream)
-        shown = begin - 1
-        try:
-            for frame in container.decode(stream):
-                if frame.pts is None or frame.pts < first:
-                    continue
-                if frame.pts > last:
-                    return
-                shown = int(np.searchsorted(stamps, frame.pts))
-                shown_frame = frame.reformat(width=width, height=height, format=pixel_format)
-                picture = np.asarray(shown_frame.to_ndarray(), dtype=np.uint8)
-                yield shown, np.rot90(picture, round(frame.rotation / 90) % 4)
-        except av.error.FFmpegError as error:
-            raise FileFormatError(
-                f"the film breaks off after picture {shown}: {error.strerror}",
-                where=str(path),
-                remedy="Copy the file from the camera again",
-            ) from error
+    end = len(stamps) if end is None else min(end, len(stamps))
+    if begin >= end:
+        return
+    first, last = int(stamps[begin]), int(stamps[end - 1])
+    pixel_format = "gray" if is_grey else "bgr24"
+    shown = begin - 1
+    # Before a cut of an edit list the library seeks too far: then all are decoded.
+    for is_sought in (True, False) if begin else (False,):
+        with open_container(path) as (container, stream):
+            if is_sought:
+                container.seek(first, stream=stream, backward=True)
+            try:
+                for frame in container.decode(stream):
+                    if frame.pts is None or frame.pts < first:
+                        continue
+                    if is_sought and shown < begin and frame.pts > first:
+                        break
+                    if frame.pts > last:
+                        return
+                    shown = int(np.searchsorted(stamps, frame.pts))
+                    shown_frame = frame.reformat(width=width, height=height, format=pixel_format)
+                    picture = np.asarray(shown_frame.to_ndarray(), dtype=np.uint8)
+                    yield shown, np.rot90(picture, round(frame.rotation / 90) % 4)
+            except av.error.FFmpegError as error:
+                raise FileFormatError(
+                    f"the film breaks off after picture {shown}: {error.strerror}",
+                    where=str(path),
+                    remedy="Copy the file from the camera again",
+                ) from error
+        if shown >= begin:
+            return
 
 
 @contextmanager
-def _open_container(path: Path, **options: str) -> Iterator[tuple[InputContainer, VideoStream]]:
+def open_container(path: Path, **options: str) -> Iterator[tuple[InputContainer, VideoStream]]:
+    """Open a film, and choose its pictures.
+
+    Args:
+        path: the film.
+        options: of the library.
+
+    Raises:
+        FileFormatError: the file is no film, or its pictures cannot be decoded.
+    """
     with require_extra("video", "a film"):
         import av
     if not path.is_file():
@@ -279,7 +296,7 @@ def _check_length(
     """
     if "mp4" in container.format.name and len(times_s) < stream.frames:
         # A trimmed film has pictures that are not shown, but are in the file.
-        with _open_container(path, advanced_editlist="0") as (whole, pictures):
+        with open_container(path, advanced_editlist="0") as (whole, pictures):
             packet_count = sum(packet.size > 0 for packet in whole.demux(pictures))
         if packet_count < stream.frames:
             raise FileFormatError(
@@ -315,7 +332,7 @@ def _find_capture_rate_hz(container: InputContainer, stream: VideoStream) -> flo
 
 def _decode_rotation_deg(path: Path) -> int:
     """Return the rotation of the first picture, which has to be decoded for it."""
-    with _open_container(path) as (container, stream):
+    with open_container(path) as (container, stream):
         for frame in container.decode(stream):
             return round(frame.rotation / 90) * 90 % 360
     raise FileFormatError("its first picture cannot be decoded", where=str(path))

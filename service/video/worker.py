@@ -34,7 +34,7 @@ _MEMORY_BYTES_MAX = 4 << 30
 _SILENT_S_MAX = 60.0
 """Longest time without a line: a film of 4K shows several pictures a second."""
 _READ_BYTES_PER_S_MIN = 10e6
-"""Rate of a slow disk, in up to three passes: a film's time stamps are all over its file."""
+"""Rate of a slow disk, three passes without a line: a film's time stamps are all over its file."""
 _PROGRESS_PICTURES = 50
 _PART_PX = 16
 """Least size of the parts of a picture in which a lamp is looked for."""
@@ -190,8 +190,12 @@ def _report(picture: int) -> None:
 
 def _read(path: Path, capture_rate_hz: float | None = None) -> dict[str, Any]:
     from service.video.container import iterate_pictures, read_film
+    from service.video.edit_list import read_edit_list
 
     film, times_s = read_film(path, capture_rate_hz)
+    _print({"picture": 0})
+    edits = read_edit_list(path)
+    _print({"picture": 0})
     last = film.picture_count - 1
     if last not in (index for index, _ in iterate_pictures(path, is_grey=True, begin=last)):
         raise FileFormatError(
@@ -199,7 +203,9 @@ def _read(path: Path, capture_rate_hz: float | None = None) -> dict[str, Any]:
             where=str(path),
             remedy="Copy the file from the camera again",
         )
-    _print({"film_s": times_s.tolist()})
+    whole = {} if edits.whole_s is None else {"whole_s": edits.whole_s.tolist()}
+    _print({"film_s": times_s.tolist(), **whole})
+    film = film.model_copy(update={"hidden_count": edits.hidden_count, "patch": edits.patch})
     return {"film": film.model_dump()}
 
 

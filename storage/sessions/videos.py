@@ -69,6 +69,14 @@ LONE_PICTURE_S = 1.0
 film."""
 
 
+class BytesPatch(StrictModel):
+    """Bytes that replace others of a file."""
+
+    at: Count
+    """Where they begin in the file."""
+    hex: Annotated[str, Field(pattern="^(?:[0-9a-f]{2})+$")]
+
+
 class FilmInfo(StrictModel):
     """Facts of a film."""
 
@@ -89,6 +97,11 @@ class FilmInfo(StrictModel):
     """True if intervals differ: a variable rate, or dropped pictures."""
     capture_rate_hz: float | None
     """Rate of taking, if the file plays at another rate: times are scaled to it."""
+    hidden_count: Count | None = None
+    """Pictures of the file that its edit list hides; null: which pictures browsers show is unknown,
+    by an edit list that is not replaced, or of a film that was added before this was noted."""
+    patch: BytesPatch | None = None
+    """Bytes with which every browser shows all pictures of the file; null: all are the film's."""
 
     @property
     def drift_sigma(self) -> float:

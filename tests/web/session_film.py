@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,39 @@ def make_film(path: Path, codec: str) -> Path:
     pictures = [numbered(number) for number in range(PICTURES)]
     times_s = [number / RATE_HZ for number in range(PICTURES)]
     return write_film(path, camera, pictures, times_s)
+
+
+TRIMMED: dict[str, tuple[list[tuple[int, int]], list[int]]] = {
+    "begin": ([(1200, 13)], [*range(13, 43)]),
+    "middle": ([(400, 0), (600, 23)], [*range(10), *range(23, 38)]),
+    "end": ([(400, 0)], [*range(10)]),
+    "later": ([(500, -1), (2400, 0)], [*range(PICTURES)]),
+}
+"""Edit lists, for `write_edits`, and the numbers of the pictures that they show."""
+
+
+def write_edits(path: Path, edits: list[tuple[int, int]]) -> Path:
+    """Replace the edit list of an MP4 film, whose index is at the end of the file.
+
+    Args:
+        path: the film.
+        edits: duration of each, in ms, and its first picture; -1: none, those after it are later.
+    """
+    content = path.read_bytes()
+    delay = struct.unpack_from(">i", content, content.index(b"elst") + 16)[0]  # by B-frames
+    ticks = struct.unpack_from(">I", content, content.index(b"mdhd") + 16)[0] / RATE_HZ
+    places = [content.index(name) - 4 for name in (b"moov", b"trak", b"edts", b"elst")]
+    sizes = [struct.unpack_from(">I", content, at)[0] for at in places]
+    new = struct.pack(">4sII", b"elst", 0, len(edits))
+    for duration_ms, picture in edits:
+        begin = -1 if picture < 0 else delay + round(ticks * picture)
+        new += struct.pack(">IiHH", duration_ms, begin, 1, 0)
+    after = content[places[-1] + sizes[-1] :]
+    head = bytearray(content[: places[-1]] + struct.pack(">I", 4 + len(new)))
+    for at, size in zip(places[:-1], sizes[:-1], strict=True):
+        struct.pack_into(">I", head, at, size + 4 + len(new) - sizes[-1])
+    path.write_bytes(bytes(head) + new + after)
+    return path
 
 
 def added(

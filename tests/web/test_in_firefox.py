@@ -14,7 +14,15 @@ from tests.tokens import SHARED_TOKEN
 from tests.waiting import until
 from tests.web.firefox import ENTER, ESCAPE, FIREFOX, RIGHT, Firefox
 from tests.web.scripted import Scripted
-from tests.web.session_film import SHOWN, align, make_film
+from tests.web.session_film import (
+    RATE_HZ,
+    SHOWN,
+    TRIMMED,
+    added,
+    align,
+    make_film,
+    write_edits,
+)
 
 pytestmark = [
     pytest.mark.real_time,
@@ -23,6 +31,10 @@ pytestmark = [
         FIREFOX is None, reason="no Firefox; on Debian: sudo apt-get install firefox-esr"
     ),
 ]
+
+
+STILL = "document.querySelector('#film-card[data-still=true]')?.dataset.picture === arguments[0]"
+"""An expression: the film stands at this picture."""
 
 
 @pytest.fixture(scope="module")
@@ -115,19 +127,50 @@ def test_a_film_is_added_moves_with_the_cursor_and_gives_stills(
     (video,) = session.running.http.get(f"{session.url}/videos").json()["items"]
     align(session, video, 0.0)
     firefox.open(f"{scripted.url}/sessions/{session.id}?at=0.0")
-    at = "document.querySelector('#film-card[data-still=true]')?.dataset.picture === arguments[0]"
     for number in range(3):
-        firefox.wait(at, str(number))
+        firefox.wait(STILL, str(number))
         assert firefox.run(f"return ({SHOWN})()") == number
         firefox.keys(".")
     cursor = "Number(document.getElementById('plots').getAttribute('aria-valuenow'))"
     firefox.wait(f"Math.abs({cursor} - 0.12) < 0.002")
     firefox.drag("#plots", (57, 200), (57, 200))
-    firefox.wait(at, "0")
+    firefox.wait(STILL, "0")
     firefox.click("#still-add")
     firefox.wait("document.getElementById('strip-canvas').dataset.stills === '1'")
     firefox.click("#strip-save")
     assert firefox.downloaded(".png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("kind", [*TRIMMED])
+def test_each_picture_of_a_trimmed_film_is_the_one_that_the_server_counts(
+    scripted: Scripted, firefox: Firefox, tmp_path: Path, kind: str
+) -> None:
+    session, (edits, shown) = scripted.recorded("walk"), TRIMMED[kind]
+    film = write_edits(make_film(tmp_path / f"{kind}.mp4", "libvpx-vp9"), edits)
+    video = added(session, film, begin_s=None)
+    firefox.open(f"{scripted.url}/sessions/{session.id}#token={SHARED_TOKEN}")
+    firefox.wait("document.querySelector('#plots')?.dataset.settled === 'true'")
+    for number in (*range(len(shown)), len(shown) // 2, 0):
+        firefox.run(
+            "const slider = document.getElementById('film-slider'); slider.value = arguments[0];"
+            "slider.dispatchEvent(new Event('input'))",
+            number,
+        )
+        firefox.wait(STILL, str(number))
+        assert firefox.run(f"return ({SHOWN})()") == shown[number]
+    firefox.click("#alignment summary")
+    firefox.keys(".", ".", ".", ".")
+    firefox.wait(STILL, "4")
+    firefox.drag("#plots", (157, 200), (157, 200))
+    firefox.wait("document.getElementById('readout').dataset.timeS > 0")
+    cursor_s = firefox.run("return Number(document.getElementById('readout').dataset.timeS)")
+    firefox.click("#pair-hand")
+    firefox.click("#align-pairs")
+    firefox.wait_for_text("#alignment-line", "Aligned by hand")
+    url = f"{session.url}/videos/{video['id']}"
+    found = session.running.http.get(url).json()["alignment"]
+    paired_s = 1e-9 * (found["t_ns"] - int(session.column("t_ns")[0]))
+    assert paired_s - found["film_s"] == pytest.approx(cursor_s - 4 / RATE_HZ, abs=1e-3)
 
 
 def test_on_a_phone_nothing_is_wider_than_the_screen(scripted: Scripted, firefox: Firefox) -> None:

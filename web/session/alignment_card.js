@@ -43,6 +43,7 @@ export class AlignmentCard {
     const { film } = this.card;
     const contacts = plots.stances.filter((stance) => stance.begun).map((stance) => stance.from);
     if (!film.times.length) return notice("this browser does not show the film.", { bad: true });
+    if (!this.card.isCertain) return notice("which picture this browser shows is not known: see below the film.", { bad: true });
     if (!film.isStill) return notice("the film is moving: pause it.", { bad: true });
     if (cursorS === null) return notice(`put the cursor ${method === "hand" ? "on the instant" : "near the contact"} first.`, { bad: true });
     if (method === "contact" && film.wanted === 0) return notice("no picture before this one shows the foot in the air.", { bad: true });

@@ -1,6 +1,6 @@
 // Film in a video element: shows a picture by its number, or follows an instant at a speed.
 
-import { intervalOf, pictureAt } from "./film_time.js";
+import { intervalOf, pictureAt, pictureBefore } from "./film_time.js";
 
 const RATES = [0.0625, 16]; // that browsers play
 const FIRST_MS = 1500; // some browsers load no picture before they are asked for one
@@ -46,10 +46,12 @@ export class Film {
    * Open a film at its first picture.
    * @param {string} address @param {number[]} times of its pictures, in s from the first
    * @param {number} slowness played time per its time: 33 if taken at 1000 pictures/s and played at 30
+   * @param {number[] | null} [playTimes] of a trimmed film: of the same pictures, played s from the file's first one
    */
-  open(address, times, slowness) {
+  open(address, times, slowness, playTimes = null) {
     this.close();
-    [this.times, this.slowness] = [times, slowness];
+    [this.times, this.slowness, this.isTrimmed] = [times, slowness, playTimes !== null];
+    this.playTimes = playTimes ?? times.map((timeS) => timeS * slowness);
     this.element.src = address;
   }
 
@@ -57,9 +59,10 @@ export class Film {
     clearTimeout(this.waiting);
     this.element.removeAttribute("src");
     this.element.load();
-    this.times = [];
+    this.times = this.playTimes = [];
     this.slowness = 1;
-    this.startS = null; // of the first picture by the element, in some files after 0; null: it is not there yet
+    this.isTrimmed = false; // the element shows pictures that are none of the film's
+    this.startS = null; // of the file's first picture by the element, in some files after 0; null: it is not there yet
     this.index = this.wanted = 0; // the picture shown; the one that it will be
     this.seeking = null;
   }
@@ -68,17 +71,32 @@ export class Film {
     if (this.startS !== null || !this.times.length) return;
     clearTimeout(this.waiting);
     this.startS = startS;
-    this.arrive();
+    if (this.playTimes[0] > 0) this.seek();
+    else this.arrive();
+  }
+
+  /** Return the element's time of an instant of the film. */
+  elementTimeOf(filmS) {
+    const before = pictureBefore(this.times, filmS);
+    return this.startS + this.playTimes[before] + (filmS - this.times[before]) * this.slowness;
   }
 
   /** True while the picture shown is the one that is wanted. */
   get isStill() { return this.startS !== null && this.element.paused && this.seeking === null && this.index === this.wanted; }
 
-  /** Note the picture of a playing film. */
+  /** Note the picture of a playing film; of a trimmed one hidden pictures are skipped. */
   note(mediaS) {
     if (this.startS === null || this.element.paused || this.element.seeking) return;
-    this.index = this.wanted = pictureAt(this.times, (mediaS - this.startS) / this.slowness);
-    this.onShown();
+    const playedS = mediaS - this.startS;
+    const before = pictureBefore(this.playTimes, playedS);
+    const isLast = before + 1 === this.times.length;
+    const isOver = this.isTrimmed && playedS - this.playTimes[before] > 1.5 * this.shownS(before);
+    if (isOver && isLast) this.show(before);
+    else if (isOver && this.playTimes[before + 1] - playedS > this.shownS(before)) this.jump(before + 1);
+    else {
+      this.index = this.wanted = pictureAt(this.playTimes, playedS);
+      this.onShown();
+    }
   }
 
   /** Show a picture; while one is sought, the latest wins. */
@@ -89,11 +107,16 @@ export class Film {
     if (this.startS !== null && this.seeking === null && (isMoving || this.index !== this.wanted)) this.seek();
   }
 
-  /** Seek the middle of a picture's interval: stamps are rounded. */
   seek() {
     this.seeking = this.wanted;
-    this.element.currentTime = this.startS + (this.times[this.wanted] + intervalOf(this.times, this.wanted) / 2) * this.slowness;
+    this.jump(this.wanted);
   }
+
+  /** Have the element go to the middle of a picture's interval: stamps are rounded. */
+  jump(index) { this.element.currentTime = this.startS + this.playTimes[index] + this.shownS(index) / 2; }
+
+  /** Return how long a picture is shown while the film plays; before a gap or a cut as long as the one before it. */
+  shownS(index) { return this.slowness * Math.min(intervalOf(this.times, index), intervalOf(this.times, Math.max(0, index - 1))); }
 
   arrive() {
     if (this.seeking !== null) this.index = this.seeking;
@@ -107,7 +130,7 @@ export class Film {
     const { element } = this;
     const rate = speed * this.slowness;
     if (this.startS === null || rate < RATES[0] || rate > RATES[1]) return this.show(pictureAt(this.times, filmS));
-    const lateS = this.startS + filmS * this.slowness - element.currentTime;
+    const lateS = this.elementTimeOf(filmS) - element.currentTime;
     if (Math.abs(lateS) > APART_S * Math.max(1, rate) && !element.seeking) element.currentTime += lateS;
     this.play(speed * (1 + Math.min(HURRY_MAX, Math.max(-HURRY_MAX, HURRY * lateS / rate))));
   }

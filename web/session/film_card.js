@@ -7,6 +7,8 @@ import { timeText } from "./overlay.js";
 import * as videoApi from "./video_api.js";
 
 const INSTANT_S = 1e-4; // last digit of a picture's instant
+export const UNCERTAIN = "Which pictures of this film a browser shows is not known: it has an edit list that browsers read differently, or was added before this was looked at. "
+  + "Add it again; if this stays, add a copy made by “ffmpeg -i FILM -c:v libx264 COPY.mp4”. Alignment by light or clock page works nevertheless.";
 
 /** Player of a film. */
 export class FilmCard {
@@ -40,14 +42,15 @@ export class FilmCard {
     if (isOther) {
       this.isOpen = false;
       this.film.close();
-      setText(byId("film-problem"), "");
+      setText(byId("film-problem"), video && !this.isCertain ? UNCERTAIN : "");
       this.draw();
       setText(byId("film-at"), "The server reads the times of its pictures …");
       const { id } = this.page.session;
-      const times = video && (await videoApi.filmTimes(id, video.id)).film_s;
+      const { film_s: times, whole_s: playTimes } = video ? await videoApi.filmTimes(id, video.id) : { film_s: [] };
       if (this.video?.id !== video?.id) return; // another one was asked for meanwhile
       this.isOpen = true;
-      if (video) this.film.open(videoApi.filmAddress(id, video.id), times, video.film.rate_hz / video.film.play_rate_hz || 1);
+      const address = playTimes ? videoApi.wholeFilmAddress : videoApi.filmAddress;
+      if (video) this.film.open(address(id, video.id), times, video.film.rate_hz / video.film.play_rate_hz || 1, playTimes);
     }
     this.update();
   }
@@ -66,7 +69,10 @@ export class FilmCard {
     this.draw();
   }
 
-  get inStep() { return this.line !== null && !this.isApart && this.film.times.length > 0; }
+  /** True if this page shows the pictures that the server counts. */
+  get isCertain() { return this.video?.film.hidden_count !== null; }
+
+  get inStep() { return this.line !== null && this.isCertain && !this.isApart && this.film.times.length > 0; }
 
   setApart(isApart) {
     this.isApart = isApart;
@@ -108,14 +114,14 @@ export class FilmCard {
     const { film, inStep } = this;
     const filmS = film.times[film.index] ?? 0;
     const [count, number] = [film.times.length, (film.index + 1).toLocaleString("en-GB")];
-    const where = this.line ? `${timeText(this.line.toSession(filmS), INSTANT_S)} ${halfWidthText(this.line.halfWidth(filmS))}` : `${timeText(filmS, 0.001)} of the film, not aligned`;
+    const where = !this.isCertain ? "its instant is not known" : this.line ? `${timeText(this.line.toSession(filmS), INSTANT_S)} ${halfWidthText(this.line.halfWidth(filmS))}` : `${timeText(filmS, 0.001)} of the film, not aligned`;
     setText(byId("film-at"), count ? `Picture ${number} of ${count.toLocaleString("en-GB")}: ${where}` : "");
     setData(this.box, "picture", String(film.index));
     setData(this.box, "still", String(film.isStill));
     byId("film-tools").hidden = byId("film-box").hidden = !count;
     byId("film-play").hidden = inStep; // the session's player plays both
     setText(byId("film-play"), film.element.paused ? "Play film" : "Pause film");
-    byId("still-add", HTMLButtonElement).disabled = !this.line;
+    byId("still-add", HTMLButtonElement).disabled = !this.line || !this.isCertain;
     this.slider.max = String(Math.max(0, count - 1));
     this.slider.value = String(film.wanted);
   }

@@ -11,6 +11,12 @@ export function pictureAt(times, filmS) {
   return next > 0 && filmS - times[next - 1] < times[next] - filmS ? next - 1 : next;
 }
 
+/** Return the index of the last picture that begins before an instant or at it; before all, the first. @param {number[]} times of all pictures, rising @param {number} filmS */
+export function pictureBefore(times, filmS) {
+  const next = lowerBound(times, filmS);
+  return times[next] === filmS ? next : Math.max(0, next - 1);
+}
+
 /** Return how long a picture is shown; the last as long as the one before it. */
 export function intervalOf(times, index) {
   const before = Math.min(index, times.length - 2);

@@ -10,6 +10,8 @@ export const videosAddress = (session, name, captureRateHz) =>
 const ofVideo = (session, video, part = "") => `/sessions/${id(session)}/videos/${id(video)}${part}`;
 export const removeVideo = (session, video) => call("DELETE", ofVideo(session, video));
 export const filmAddress = (session, video) => PREFIX + ofVideo(session, video, "/film");
+/** Return the address of a film with the pictures that its edit list hides. */
+export const wholeFilmAddress = (session, video) => `${filmAddress(session, video)}?whole=true`;
 /** @type {(session: string, video: string) => Promise<TimesView>} */
 export const filmTimes = (session, video) => call("GET", ofVideo(session, video, "/times"), { timeoutS: 120 });
 /** `replace`: also an alignment that it contradicts. @type {(session: string, video: string, pairs: object, replace: boolean) => Promise<Video>} */

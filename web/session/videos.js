@@ -12,7 +12,8 @@ import * as videoApi from "./video_api.js";
 /** Return what a film is, such as "1920 × 1080, 50.0 pictures/s, 12.4 s, h264, 34.0 MB". @param {Video} video */
 function factsOf({ film, size_bytes: size }) {
   const captured = film.capture_rate_hz === null ? "" : film.rate_hz > film.play_rate_hz ? ", slow motion" : ", time lapse";
-  return `${film.width_px} × ${film.height_px}, ${perSecond(film.rate_hz)} pictures/s${film.is_variable ? " (variable)" : ""}${captured}, ${duration(film.duration_s)}, ${film.codec}, ${bytes(size)}`;
+  const hidden = film.hidden_count ? `, trimmed (${film.hidden_count.toLocaleString("en-GB")} pictures hidden)` : "";
+  return `${film.width_px} × ${film.height_px}, ${perSecond(film.rate_hz)} pictures/s${film.is_variable ? " (variable)" : ""}${captured}${hidden}, ${duration(film.duration_s)}, ${film.codec}, ${bytes(size)}`;
 }
 
 /** Section of the videos. */

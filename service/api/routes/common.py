@@ -17,7 +17,8 @@ from anyio import CapacityLimiter, to_thread
 from fastapi import Depends, Header, Request, Response
 from fastapi.responses import FileResponse
 from pydantic import AfterValidator, BaseModel, Field, StringConstraints
-from starlette.datastructures import MutableHeaders
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import Message, Receive, Scope, Send
 
 from devices.errors import FileFormatError, StateError, UnknownError, UsageError
 from devices.types import StrictModel, check_user_name
@@ -116,6 +117,7 @@ def stored_file_response(
     media_type: str,
     filename: str,
     headers: Mapping[str, str] = MappingProxyType({}),
+    patch: tuple[int, bytes] | None = None,
 ) -> Response:
     """Answer with a file that never changes, or with a byte range.
 
@@ -126,14 +128,17 @@ def stored_file_response(
         media_type: media type of the content.
         filename: name for a client that stores it.
         headers: further headers.
+        patch: bytes in place of the file's, which never change either, and where they begin.
     """
+    tag = sha256 if patch is None else f"{sha256}-patched"
     sent = {
         **headers,
-        "ETag": f'"{sha256}"',
+        "ETag": f'"{tag}"',
         "Cache-Control": "private, no-cache",  # after a logout nothing may come from a cache
-        "Repr-Digest": f"sha-256=:{b64encode(bytes.fromhex(sha256)).decode()}:",
     }
-    if has_matching_etag(request, sha256):
+    if patch is None:
+        sent["Repr-Digest"] = f"sha-256=:{b64encode(bytes.fromhex(sha256)).decode()}:"
+    if has_matching_etag(request, tag):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=sent)
     size = path.stat().st_size
     wanted = request.headers.get("range")
@@ -151,7 +156,35 @@ def stored_file_response(
             )
     answer = file_response(path, headers=sent, media_type=media_type, filename=filename)
     answer.chunk_size = _CHUNK
-    return answer
+    return answer if patch is None else _PatchedResponse(answer, *patch)
+
+
+class _PatchedResponse(Response):
+    """Answer with a file, or with a range of it, of which some bytes are replaced as they pass."""
+
+    def __init__(self, answer: FileResponse, at: int, content: bytes) -> None:
+        self.answer, self.at, self.content = answer, at, content
+        self.background = None
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the answer."""
+        begin = 0  # of the next bytes in the file
+
+        async def send_patched(message: Message) -> None:
+            nonlocal begin
+            if message["type"] == "http.response.start":
+                part = Headers(raw=message["headers"]).get("content-range", "bytes 0-")
+                begin = int(part.removeprefix("bytes ").partition("-")[0])
+            elif message["type"] == "http.response.body":
+                body = message["body"]
+                low, high = max(self.at - begin, 0), self.at - begin + len(self.content)
+                if low < len(body) and high > 0:
+                    new = self.content[max(begin - self.at, 0) :][: len(body) - low]
+                    message = {**message, "body": body[:low] + new + body[low + len(new) :]}
+                begin += len(body)
+            await send(message)
+
+        await self.answer(scope, receive, send_patched)
 
 
 def run_with_usage_errors(make: Callable[[], T]) -> T:

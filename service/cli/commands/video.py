@@ -378,6 +378,8 @@ def _format_video(video: Video) -> str:
     rate = f"{film.rate_hz:g} pictures/s" + (" (variable)" if film.is_variable else "")
     if film.capture_rate_hz is not None:
         rate += f" as taken, plays at {film.play_rate_hz:g}"
+    if film.hidden_count:
+        rate += f", trimmed ({film.hidden_count} pictures hidden)"
     aligned = "not aligned" if video.alignment is None else f"aligned by {video.alignment.method}"
     return (
         f"{video.id} {video.name}: {film.width_px} x {film.height_px}, {film.duration_s:.2f} s, "

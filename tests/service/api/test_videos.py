@@ -7,13 +7,16 @@ import socket
 import struct
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 
+from service.api.routes import common
 from service.api.routes.recordings import videos as routes
 from service.video import worker
+from service.video.edit_list import read_edit_list
 from storage.sessions import videos
 from tests.service.api.sealed import Sealed
 from tests.service.fake_node import FakeNode
@@ -26,6 +29,7 @@ from tests.service.video.short_film import (
     short_film,
 )
 from tests.waiting import until
+from tests.web.session_film import TRIMMED, make_film, write_edits
 
 ID = "0123456789ab"
 
@@ -91,6 +95,8 @@ def test_a_film_is_kept_and_given_back_unchanged(session: Recording) -> None:
     url = f"{session.url}/videos/{video['id']}"
     assert answer.headers["location"] == f"/api/v1{url}"
     assert (video["name"], video["size_bytes"], video["alignment"]) == ("walk.mp4", len(film), None)
+    assert (video["film"]["hidden_count"], video["film"]["patch"]) == (0, None)
+    assert http.get(f"{url}/film", params={"whole": True}).content == film
     assert video["film"]["picture_count"] == PICTURES
     assert list_all(session) == [video]
     assert content_of(http.get(url)) == video
@@ -119,6 +125,38 @@ def test_a_film_is_kept_and_given_back_unchanged(session: Recording) -> None:
     assert http.delete(url).status_code == 204
     assert_refused(http.get(f"{url}/film"), 404, video["id"])
     assert_refused(http.delete(url), 404, video["id"])
+
+
+def test_a_trimmed_film_is_given_back_whole_as_well(
+    session: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    http, (edits, shown) = session.running.http, TRIMMED["middle"]
+    path = write_edits(make_film(tmp_path / "film.mp4", "libx264"), edits)
+    film, hidden = path.read_bytes(), read_edit_list(path)
+    video = content_of(upload(session, film), 201)
+    assert video["film"]["hidden_count"] == hidden.hidden_count == 35
+    assert hidden.patch is not None
+    assert video["film"]["patch"] == hidden.patch.model_dump()
+    url = f"{session.url}/videos/{video['id']}"
+    times = content_of(http.get(f"{url}/times"))
+    assert times["whole_s"] == pytest.approx([number / 25.0 for number in shown])
+    assert times["film_s"] == pytest.approx([number / 25.0 for number in range(len(shown))])
+
+    at, new = hidden.patch.at, bytes.fromhex(hidden.patch.hex)
+    patched = film[:at] + new + film[at + len(new) :]
+    monkeypatch.setattr(common, "_CHUNK", 7)
+    plain, whole = (http.get(f"{url}/film", params=query) for query in ({}, {"whole": True}))
+    assert plain.content == film
+    assert whole.content == patched != film
+    assert "repr-digest" not in whole.headers
+    assert whole.headers["etag"] != plain.headers["etag"]
+    for begin, end in ((at - 9, at + 3), (at + 1, at + 5), (at + 4, at + 99), (0, 5), (at, at)):
+        part = {"Range": f"bytes={begin}-{end}"}
+        answer = http.get(f"{url}/film", params={"whole": True}, headers=part)
+        assert (answer.status_code, answer.content) == (206, patched[begin : end + 1])
+    same = {"If-None-Match": whole.headers["etag"]}
+    assert http.get(f"{url}/film", params={"whole": True}, headers=same).status_code == 304
+    assert http.get(f"{url}/film", headers=same).content == film
 
 
 @pytest.mark.usefixtures("decoded")

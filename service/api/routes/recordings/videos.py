@@ -77,6 +77,11 @@ class TimesView(BaseModel):
     """Times of a film's pictures."""
 
     film_s: list[float] = Field(description="Of all pictures, in s from the first one.")
+    whole_s: list[float] | None = Field(
+        default=None,
+        description="Of the same pictures as the file plays with those that its edit list hides, "
+        "in s from the file's first one; none: it hides none, or cannot be replaced.",
+    )
 
 
 class PairOfInstants(StrictModel):
@@ -200,16 +205,28 @@ async def delete_video(session_id: str, video_id: str, server: ServerState) -> N
     ),
 )
 async def get_film(
-    session_id: str, video_id: str, request: Request, server: ServerState
+    session_id: str,
+    video_id: str,
+    request: Request,
+    server: ServerState,
+    whole: Annotated[
+        bool,
+        Query(
+            description="With the pictures that its edit list hides: browsers differ in which "
+            "these are, and so need the times `whole_s`."
+        ),
+    ] = False,
 ) -> Response:
     """Return the file, with ranges."""
     folder, video = await run_in_threadpool(_read, session_id, video_id, server)
+    patch = video.film.patch if whole else None
     return stored_file_response(
         request,
         require_file(get_film_path(folder, video)),
         video.sha256,
         media_type=FILM_MEDIA_TYPES.get(video.suffix, "application/octet-stream"),
         filename=video.name,
+        patch=None if patch is None else (patch.at, bytes.fromhex(patch.hex)),
     )
 
 
