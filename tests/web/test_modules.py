@@ -82,6 +82,25 @@ def test_the_rate_that_was_reached_stands_beside_that_of_the_node(ask: Ask) -> N
     assert rate_hz == pytest.approx(100.0)  # 300 periods in two parts of two seconds and of one
 
 
+def test_the_instant_of_the_cursor_is_said_beside_that_of_its_frames(ask: Ask) -> None:
+    """A pixel column has several frames, and a cursor may stand in a gap."""
+    said = ask(
+        "session/readout session/bins",
+        """({ cursorTextOf, Bins }) => {
+          const ends = { t_first_s: [1, 1.01, 2], t_last_s: [1.008, 1.01, 2] };
+          const columns = { ...ends, frames: [5, 1, 1] };
+          const bins = new Bins({ columns, serials: [] }, { from: 1, to: 2 });
+          return [1.005, 1.01, 1.0104, 1.6].map((at) => cursorTextOf(bins, bins.at(at), at));
+        }""",
+    )
+    assert said == [
+        "1.005 s (5 frames from 1.000 s)",
+        "1.010 s",
+        "1.010 s",
+        "1.600 s (frame at 2.000 s)",
+    ]
+
+
 def test_of_tiles_in_one_row_the_page_says_that_y_is_not_measured(ask: Ask) -> None:
     alone, plan = ask(
         "session/panels session/readout session/bins",

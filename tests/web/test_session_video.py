@@ -57,6 +57,10 @@ def cursor_s(page: Page) -> float:
     return float(page.locator("#plots").get_attribute("aria-valuenow") or "nan")
 
 
+def cursor_text(page: Page) -> str:
+    return page.locator("#readout [data-key=time] dd").inner_text()
+
+
 def is_at(page: Page, at_s: float, within_s: float) -> bool:
     return abs(cursor_s(page) - at_s) < within_s
 
@@ -93,6 +97,10 @@ def test_a_film_is_added_aligned_by_hand_and_removed(
         still(page, number)
         put_cursor(page, at_s)
         page.click("#pair-hand")
+        paired = page.locator("#pairs li").last.inner_text()
+        at = re.match(rf"Picture {number + 1} \u2194 (\d\.\d{{3}} s)", paired)
+        assert at is not None, paired
+        assert cursor_text(page).startswith(at[1])  # the cursor's own, not of a frame beside it
     expect(page.locator("#pairs li")).to_have_count(2)
     page.click("#pair-contact")  # of the same picture: instead of the pair before
     expect(page.locator("#pairs li").last).to_contain_text("contact at")

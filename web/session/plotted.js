@@ -376,7 +376,7 @@ export class Plotted {
     box.dataset.settled = String(!this.loader.busy && !plots.beside?.loader.busy);
     plots.beside?.writeData(view, box);
     drawSummary(bins, view, byId("summary"));
-    const text = this.readout.draw(bins, this.cursorS === null ? -1 : bins.at(this.cursorS), plots.panels,
+    const text = this.readout.draw(bins, this.cursorS, plots.panels,
       this.cursorS === null ? [] : plots.beside?.readings(view, this.cursorS));
     this.replay.draw();
     this.videos?.card.follow();

@@ -33,6 +33,13 @@ function copHalf(bins, i, axis) {
 
 const CONTACT_TEXTS = { 1: "no", 2: "yes", 4: "unknown", 3: "changes", 5: "no or unknown", 6: "yes or unknown", 7: "changes" };
 
+/** Return the instant of a cursor, and which frames are nearest to it: several in a pixel, or one beside it. */
+export function cursorTextOf(bins, i, cursorS) {
+  const [many, at, first] = [bins.columns.frames[i], timeText(cursorS, 0.001), timeText(bins.first[i], 0.001)];
+  if (many > 1) return `${at} (${many} frames from ${first})`;
+  return at === first ? at : `${at} (frame at ${first})`;
+}
+
 /**
  * Return the values of a bin for all panels.
  * @param {import("./panels.js").Panel[]} panels
@@ -91,9 +98,11 @@ export class Readout {
     this.cells = new Map();
   }
 
-  /** Draw the values; return them as a sentence for screen readers. */
-  draw(bins, i, panels, beside = []) {
+  /** Draw the values at a cursor; return them as a sentence for screen readers. */
+  draw(bins, cursorS, panels, beside = []) {
+    const i = cursorS === null ? -1 : bins.at(cursorS);
     const readings = i < 0 ? [] : [...readingsOf(bins, i, panels), ...beside];
+    if (i >= 0) readings[0][2] = cursorTextOf(bins, i, cursorS);
     const flags = i < 0 ? [] : flagTexts(bins, i);
     byId("readout-hint").hidden = i >= 0;
     for (const key of this.cells.keys()) {
