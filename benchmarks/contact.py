@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pyarrow.parquet as pq
-from stance_intervals import run_simulate
+from stance_intervals import run_foottile
 
 from devices.arrays import Bools, Floats
 
@@ -102,7 +102,7 @@ def main() -> None:
         for name, arguments in list_recordings(options.loads):
             path = folder / f"{name}.parquet"
             if not path.exists():
-                run_simulate(path, ["--truth", *arguments])
+                run_foottile("simulate", f"--out={path}", "--truth", *arguments)
             print(make_row(name, path), flush=True)
 
 

@@ -5,11 +5,17 @@
 Built-in scenes, and two loads that are drawn here: `walking` on the insole, and `taps` of 40 to
 120 ms on the foot of `standing`. `largest frame` is the largest GRF with the sigma of its frame, as
 a peak without regard to noise. Recordings stay in DIR and are used again.
+
+Each recording is also estimated with random gaps of 4 to 150 ms, about one a second, of every other
+recording as slots that were not sampled, else as lost frames: `with gaps` are its whole stances
+with a gap. There a peak without a sigma is a lower bound, which holds if the truth is above it less
+1.96 sigma of its frame.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -20,9 +26,13 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from devices.arrays import Floats
+from devices.flags import FrameFlag
+from devices.frames import FrameBatch
 from service.cli.main import main as foottile
 from service.sessions.stances import compute_stances
+from storage.schema import TRUTH_COLUMNS
 from storage.sessions.reader import SealedFileReader
+from storage.sessions.writer import SealedFileWriter
 
 DRAWS = 12
 PARTS = 4
@@ -42,6 +52,11 @@ SIGMAS = {
     "cop_x_range_m": "cop_x_range_sigma_m",
 }
 """Figures, and their standard uncertainties."""
+_BOUND = "peak_grf_n, at least"
+"""Peaks that are lower bounds: a gap may hide a higher one."""
+GAP_S = (0.004, 0.15)
+"""Shortest and longest gap; evenly distributed over the logarithm."""
+GAPS_EVERY_S = 1.0
 _NAMES = ("t_ns", "grf_n", "grf_sigma_n", "cop_x_m", "true_grf_n", "true_cop_x_m")
 _LOAD_SECONDS = 36.0
 
@@ -87,12 +102,42 @@ def simulate(scene: str, seed: int, path: Path) -> None:
         load = path.with_suffix(".csv")
         write_load(scene, seed, load)
         options.append(f"--load={load}")
-    run_simulate(path, options)
+    run_foottile("simulate", f"--out={path}", *options)
 
 
-def run_simulate(path: Path, options: list[str]) -> None:
-    """Run `foottile simulate` in this process."""
-    sys.argv = ["foottile", "simulate", f"--out={path}", *options]
+def estimate_with_gaps(path: Path, seed: int, out: Path) -> None:
+    """Write a session without the frames in random gaps, estimated again."""
+    rng = np.random.default_rng(seed)
+    punched = out.with_suffix(".punched.parquet")
+    with (
+        SealedFileReader(path) as session,
+        SealedFileWriter(punched, session.info, session.notes) as writer,
+    ):
+        first_ns, _ = session.read_span_on_axis_ns()
+        at_ns = first_ns + 1e9 * np.cumsum(rng.exponential(GAPS_EVERY_S, 1000))
+        end_ns = at_ns + 1e9 * np.exp(rng.uniform(np.log(GAP_S[0]), np.log(GAP_S[1]), len(at_ns)))
+        frames = 0
+        for batch, truth in session.read_batches(*(column.name for column in TRUTH_COLUMNS)):
+            # After the lead, for the tare.
+            is_lead = (batch.frame_flags & FrameFlag.LEAD) != 0
+            in_gap = (batch.t_ns[:, None] > at_ns) & (batch.t_ns[:, None] < end_ns)
+            kept = np.flatnonzero(is_lead | ~in_gap.any(axis=1))
+            columns = {
+                field.name: getattr(batch, field.name)[kept] for field in dataclasses.fields(batch)
+            }
+            if seed % 2:  # not sampled: numbers go on
+                columns["seq"] = np.arange(frames, frames + len(kept)).astype(np.uint64)
+            frames += len(kept)
+            writer.append_frames(
+                FrameBatch(**columns), {name: values[kept] for name, values in truth.items()}
+            )
+    run_foottile("estimate", str(punched), f"--out={out}")
+    punched.unlink()
+
+
+def run_foottile(*arguments: str) -> None:
+    """Run a command of foottile, which must succeed."""
+    sys.argv = ["foottile", *arguments]
     try:
         foottile()
     except SystemExit as ended:
@@ -100,20 +145,30 @@ def run_simulate(path: Path, options: list[str]) -> None:
             raise
 
 
-def compare_stances(path: Path) -> Iterator[tuple[dict[str, Any], dict[str, float]]]:
-    """Yield each whole stance of a session with its true figures."""
+def find_whole_stances(path: Path) -> list[dict[str, Any]]:
+    """Find the whole stances of a session."""
+    with SealedFileReader(path) as session:
+        return [row for row in compute_stances(session).to_pylist() if row["is_whole"]]
+
+
+def compare_stances(
+    path: Path, stances: list[dict[str, Any]]
+) -> Iterator[tuple[dict[str, Any], dict[str, float]]]:
+    """Yield stances, of all or some frames of a session, with the true figures of all frames."""
     table = pq.read_table(path, columns=list(_NAMES))
     t_ns, grf_n, sigma_n, cop_m, true_n, true_m = (table[name].to_numpy() for name in _NAMES)
     t_s = (t_ns - t_ns[0]) * 1e-9
-    with SealedFileReader(path) as session:
-        stances = [row for row in compute_stances(session).to_pylist() if row["is_whole"]]
-    edges = [np.searchsorted(t_ns, [row["begin_t_ns"], row["end_t_ns"]]) for row in stances]
+
+    def find_edges(stances: list[dict[str, Any]]) -> list[Any]:
+        return [np.searchsorted(t_ns, [row["begin_t_ns"], row["end_t_ns"]]) for row in stances]
+
+    edges = find_edges(find_whole_stances(path))
     if not edges:
         return
     # The thresholds of contact are between the forces on either side of its edges.
     on_n = 0.5 * (max(grf_n[i - 1] for i, _ in edges) + min(grf_n[i] for i, _ in edges))
     off_n = 0.5 * (max(grf_n[j + 1] for _, j in edges) + min(grf_n[j] for _, j in edges))
-    for row, (i, j) in zip(stances, edges, strict=True):
+    for row, (i, j) in zip(stances, find_edges(stances), strict=True):
         begin_s, first = _crossing(t_s, true_n, int(i), on_n, -1)
         end_s, last = _crossing(t_s, true_n, int(j), off_n, 1)
         stated = np.isfinite(cop_m[i : j + 1]) & np.isfinite(true_m[i : j + 1])
@@ -144,12 +199,20 @@ def _crossing(t_s: Any, force_n: Any, at: int, level_n: float, way: int) -> tupl
 
 def make_row(scene: str, figure: str, found: list[tuple[dict[str, Any], dict[str, float]]]) -> str:
     """Return the table row of a figure: errors are estimate minus truth."""
-    sigma = SIGMAS[figure]
-    pairs = [(row[figure] - true[figure], row[sigma]) for row, true in found if row[sigma]]
+    is_bound = figure == _BOUND
+    value, sigma = ("peak_grf_n", SIGMAS["largest frame"]) if is_bound else (figure, SIGMAS[figure])
+    stated = [
+        (row, true)
+        for row, true in found
+        if (row["peak_sigma_n"] is None if is_bound else row[sigma])
+    ]
+    if not stated:
+        return f"| {scene} | {figure} | 0 of {len(found)} | | | | |"
+    pairs = [(row[value] - true[value], row[sigma]) for row, true in stated]
     errors, sigmas = np.array(pairs).T
-    inside = np.abs(errors) <= 1.96 * sigmas
+    inside = (errors if is_bound else np.abs(errors)) <= 1.96 * sigmas
     return (
-        f"| `{scene}` | {figure} | {len(pairs)} of {len(found)} | {np.mean(errors):+.2g} "
+        f"| {scene} | {figure} | {len(pairs)} of {len(found)} | {np.mean(errors):+.2g} "
         f"| {np.sqrt(np.mean(errors**2)):.2g} | {np.median(sigmas):.2g} "
         f"| {100 * np.mean(inside):.0f} % |"
     )
@@ -165,13 +228,24 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.data or Path(temporary)
         for scene in SCENES:
-            found = []
+            found, gapped, split = [], [], []
             for seed in range(options.draws):
                 path = folder / f"{scene}-{seed}.parquet"
                 if not path.exists():
                     simulate(scene, seed, path)
-                found += list(compare_stances(path))
-            rows += [make_row(scene, figure, found) for figure in SIGMAS]
+                whole = find_whole_stances(path)
+                found += list(compare_stances(path, whole))
+                other = folder / f"{scene}-{seed}-gaps.parquet"
+                if not other.exists():
+                    estimate_with_gaps(path, seed, other)
+                after = find_whole_stances(other)
+                gapped += list(compare_stances(path, [row for row in after if row["gap_s"]]))
+                split.append((len(whole), len(after)))
+            rows += [make_row(f"`{scene}`", figure, found) for figure in SIGMAS]
+            rows += [
+                make_row(f"`{scene}` with gaps", figure, gapped) for figure in (*SIGMAS, _BOUND)
+            ]
+            print(f"{scene}: whole without and with gaps: {np.sum(split, axis=0)}")
     print("| scene | figure | stances | bias | rms error | median sigma | within 95 % |")
     print("|---|---|--:|--:|--:|--:|--:|")
     print("\n".join(rows))

@@ -245,6 +245,14 @@ class PeakSearch:
             self._search(slice(0, _CHUNK + 2 * MAX_HALF_WIDTH))
             self._t_ns, self._forces = self._t_ns[_CHUNK:], self._forces[:, _CHUNK:]
 
+    def join(self, other: PeakSearch) -> None:
+        """Add the frames of another search, after a gap that no window spans."""
+        for each in (self, other):
+            each._search(slice(None))  # noqa: SLF001
+        self._best = max(self._best, other._best, key=lambda best: best.lower_n)
+        self._frames += other._frames
+        self._t_ns, self._forces = other._t_ns[:0], other._forces[:, :0]
+
     def estimate_peak(self) -> StancePeak | None:
         """Estimate the highest peak until now; None without a force."""
         if not self._frames:

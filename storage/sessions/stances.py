@@ -29,12 +29,14 @@ STORED_STANCE_COLUMNS = (
     Column("begin_t_ns", pa.int64(), "ns", "t_ns of its first frame"),
     Column("end_t_ns", pa.int64(), "ns", "t_ns of its last frame"),
     Column("duration_s", _F64, "s", "from the first frame to the last"),
-    Column("duration_sigma_s", _F64, "s", "its standard uncertainty; null if an edge is not seen"),
+    Column("duration_sigma_s", _F64, "s", "its standard uncertainty; null if an edge is not known"),
     Column("peak_grf_n", _F64, "N", "largest GRF less noise bias; null if unknown or saturated"),
     Column("peak_t_ns", pa.int64(), "ns", "t_ns of the frame with that GRF"),
-    Column("peak_sigma_n", _F64, "N", "standard uncertainty of the peak"),
-    Column("impulse_n_s", _F64, "N s", "integral of the GRF; null if a frame or a GRF is missing"),
-    Column("impulse_sigma_n_s", _F64, "N s", "its standard uncertainty"),
+    Column(
+        "peak_sigma_n", _F64, "N", "its standard uncertainty; null if a gap may hide a higher peak"
+    ),
+    Column("impulse_n_s", _F64, "N s", "integral of the GRF; null if gaps exceed a quarter of it"),
+    Column("impulse_sigma_n_s", _F64, "N s", "its standard uncertainty, gaps included"),
     Column("cop_x_first_m", _F64, "m", "cop_x_m where it is first stated"),
     Column("cop_x_last_m", _F64, "m", "cop_x_m where it is last stated"),
     Column(
@@ -49,10 +51,11 @@ STORED_STANCE_COLUMNS = (
     Column("frames", pa.uint32(), "1", "frames that are there, first and last included"),
     Column("unknown_frames", pa.uint32(), "1", "of these, without a GRF"),
     Column("missing_frames", pa.uint32(), "1", "numbers in between that are not there"),
+    Column("gap_s", _F64, "s", "time without a frame or a GRF, within it and beside its ends"),
     Column("estimate_flags", pa.uint16(), "bits", "bits that any of its frames has"),
-    Column("begun", pa.bool_(), "1", "the frame before it is there, and without contact"),
-    Column("ended", pa.bool_(), "1", "the frame behind it is there, and without contact"),
-    Column("is_whole", pa.bool_(), "1", "begun, ended, no frame missing, and a GRF in each"),
+    Column("begun", pa.bool_(), "1", "the known contact before it is none, and near"),
+    Column("ended", pa.bool_(), "1", "the known contact after it is none, and near"),
+    Column("is_whole", pa.bool_(), "1", "begun, ended, and its impulse is known"),
 )
 """Columns of a stance: `service.estimation.stances.Stance`."""
 

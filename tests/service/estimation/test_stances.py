@@ -140,10 +140,151 @@ def test_an_impulse_is_uncertain_by_shared_errors_and_its_edges() -> None:
     assert one.impulse_sigma_n_s == pytest.approx(np.hypot(one.impulse_n_s / 10, edges_n_s))
     (cut,) = compute_stances(*make_recording(RAMP_N[1:-1], [1] * 20))
     assert cut.impulse_sigma_n_s == pytest.approx(cut.impulse_n_s / 10)  # of the known frames
-    gone = compute_stances(
-        *make_recording(RAMP_N, [0, *[1] * 20, 0], seq=[*range(15), *range(16, 23)])
+
+
+def make_steps(
+    gaps_ms: Sequence[tuple[float, float]],
+    *,
+    duration_ms: float = 800.0,
+    is_sampled: bool = True,
+    step_ms: float = 2.0,
+) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.int64], Columns]:
+    """Make a stance of a half sine of 50 N without the frames in gaps, in flight before and after.
+
+    Args:
+        gaps_ms: begin and end of each, after touchdown.
+        duration_ms: duration.
+        is_sampled: frames are lost; False: they were not sampled, so that numbers go on.
+        step_ms: time between frames.
+    """
+    t_ms = np.arange(-300.0, duration_ms + 300.0, step_ms) + step_ms / 2
+    grf_n = np.where(
+        (t_ms > 0) & (t_ms < duration_ms), 50.0 * np.sin(np.pi * t_ms / duration_ms), 0.0
     )
-    assert np.isnan(gone[0].impulse_sigma_n_s)
+    kept = ~np.any([(t_ms > begin) & (t_ms < end) for begin, end in gaps_ms], axis=0)
+    rows = np.flatnonzero(kept) if len(gaps_ms) else np.arange(len(t_ms))
+    after_gap = np.append(False, np.diff(rows) > 1)
+    return make_recording(
+        grf_n[rows].tolist(),
+        (grf_n[rows] > 0).astype(int).tolist(),
+        seq=[100 + int(row) for row in (rows if is_sampled else np.arange(len(rows)))],
+        t_ms=t_ms[rows].tolist(),
+        estimate_flags=[int(EstimateFlag.GAP) * int(after) for after in after_gap],
+    )
+
+
+@pytest.mark.parametrize("is_sampled", [True, False], ids=["lost", "not sampled"])
+@pytest.mark.parametrize("gap_ms", [20.0, 60.0, 150.0])
+def test_a_gap_that_is_short_against_the_stance_is_bridged(gap_ms: float, is_sampled: bool) -> None:
+    (ungapped,) = compute_stances(*make_steps([]))
+    (one,) = compute_stances(*make_steps([(100, 100 + gap_ms)], is_sampled=is_sampled))
+    assert (one.begun, one.ended, one.is_whole) == (True, True, True)
+    assert (one.begin_t_ns, one.end_t_ns) == (ungapped.begin_t_ns, ungapped.end_t_ns)
+    assert one.missing_frames == (gap_ms / 2 if is_sampled else 0)
+    assert one.gap_s == pytest.approx(1e-3 * (gap_ms + 2))
+    # The force rises no faster than at touchdown: 50 N pi / 0.8 s.
+    change_n_s = 50 * np.pi / 0.8
+    shared_n_s, gap_n_s = ungapped.impulse_sigma_n_s, change_n_s * one.gap_s**2 / 4 / np.sqrt(3)
+    assert one.impulse_sigma_n_s == pytest.approx(np.hypot(shared_n_s, gap_n_s), rel=0.01)
+    assert abs(one.impulse_n_s - ungapped.impulse_n_s) < gap_n_s
+    # The peak lies far from the gap, and has its interval.
+    assert one.peak_grf_n == pytest.approx(ungapped.peak_grf_n, rel=1e-3)
+    assert one.peak_sigma_n == pytest.approx(ungapped.peak_sigma_n, rel=0.1)
+    assert one.duration_sigma_s == pytest.approx(ungapped.duration_sigma_s)
+
+
+def test_a_stance_without_a_gap_has_none() -> None:
+    (one,) = compute_stances(*make_steps([]))
+    assert (one.gap_s, one.is_whole) == (0.0, True)
+    slower = make_steps([], step_ms=25.0)
+    assert [s.gap_s for s in compute_stances(*slower)] == [0.0]
+
+
+@pytest.mark.parametrize("gap_ms", [20.0, 60.0, 150.0])
+def test_a_peak_that_may_lie_in_a_gap_is_a_lower_bound(gap_ms: float) -> None:
+    recording = make_steps([(400 - gap_ms / 2, 400 + gap_ms / 2)])
+    for name in ("grf_n", "grf_sigma_n"):  # a precise foot
+        recording[2]["grf_sigma_n"] = 0.01 * recording[2][name]
+    (one,) = compute_stances(*recording)
+    assert one.is_whole
+    assert np.isnan(one.peak_sigma_n)
+    assert one.peak_grf_n <= 50.0
+    assert one.peak_t_ns is not None
+
+
+def test_an_edge_in_a_gap_widens_the_duration_and_may_hide_the_peak() -> None:
+    seen, late = (compute_stances(*make_steps(gaps))[0] for gaps in ([], [(-5, 100)]))
+    assert (late.begun, late.ended, late.is_whole) == (True, True, True)
+    gap_s = late.gap_s
+    assert gap_s == pytest.approx(0.107, abs=0.002)
+    assert late.duration_s == pytest.approx(seen.duration_s - 0.1, abs=0.003)
+    assert late.duration_sigma_s > np.hypot(0.5 * gap_s, gap_s / np.sqrt(12))
+    missing_n_s = seen.impulse_n_s - late.impulse_n_s
+    assert missing_n_s < 1.96 * late.impulse_sigma_n_s
+    frames = make_recording([0, 40, 39, 20, 0], [0, 1, 1, 1, 0], t_ms=[0, 40, 42, 60, 62])
+    frames[2]["estimate_flags"][1] = EstimateFlag.GAP
+    (tap,) = compute_stances(*frames)
+    assert np.isnan(tap.peak_sigma_n)
+    assert (tap.begun, tap.is_whole) == (True, False)  # the gap is longer than the rest
+
+
+@pytest.mark.parametrize(
+    ("gaps_ms", "duration_ms", "expected"),
+    [
+        ([(300, 520)], 800.0, 2),  # more than a quarter, and than 0.2 s
+        ([(100, 160)], 200.0, 2),
+        ([(3000, 3190)], 8000.0, 1),
+        ([(3000, 3210)], 8000.0, 2),
+        ([(20, 80)], 800.0, 1),  # of a short contact before it
+        ([(20, 80), (100, 160), (180, 240)], 2400.0, 1),
+        ([(20, 80), (100, 160), (180, 240)], 246.0, 4),
+    ],
+)
+def test_a_gap_that_is_long_against_the_stance_cuts_it(
+    gaps_ms: list[tuple[float, float]], duration_ms: float, expected: int
+) -> None:
+    found = compute_stances(*make_steps(gaps_ms, duration_ms=duration_ms))
+    assert [one.number for one in found] == list(range(1, expected + 1))
+    assert [one.is_whole for one in found] == [expected == 1] * expected
+    assert (found[0].begun, found[-1].ended) == (True, True)
+    assert not any(one.ended for one in found[:-1])
+    assert not any(one.begun for one in found[1:])
+
+
+def test_gaps_of_more_than_a_quarter_of_the_stance_leave_no_impulse() -> None:
+    gaps_ms = [(at, at + 45.0) for at in range(100, 700, 100)]  # 6 of 47 ms
+    (one,) = compute_stances(*make_steps(gaps_ms))
+    assert (one.begun, one.ended, one.is_whole) == (True, True, False)
+    assert one.gap_s > 0.25 * one.duration_s
+    assert np.isnan([one.impulse_n_s, one.impulse_sigma_n_s]).all()
+    assert np.isfinite(one.duration_sigma_s)
+
+
+def test_a_cop_range_beside_a_gap_is_a_lower_bound() -> None:
+    def is_bound(gaps_ms: list[tuple[float, float]]) -> bool:
+        seq, t_ns, columns = make_steps(gaps_ms)
+        columns["cop_x_m"] = np.where(columns["contact"] == 1, 1e-10 * t_ns, NAN)
+        columns["cop_sigma_x_m"] = np.where(columns["contact"] == 1, 0.001, NAN)
+        (one,) = compute_stances(seq, t_ns, columns)
+        return bool(np.isnan(one.cop_x_range_sigma_m))
+
+    assert not is_bound([(300, 440)])
+    assert is_bound([(-5, 20)])
+    assert is_bound([(790, 810)])
+    assert is_bound([(300, 390), (500, 590)])
+
+
+def test_a_stance_that_begins_before_contact_is_known_has_no_begin() -> None:
+    grf_n, unsure = [8.0, 9, 9, 8, 0, 0, 5, 0], CONTACT_UNKNOWN
+    first, second = compute_stances(*make_recording(grf_n, [unsure, unsure, 1, 1, 0, 0, 1, 0]))
+    assert (first.begun, first.ended, first.is_whole) == (False, True, False)
+    assert np.isnan(first.duration_sigma_s)
+    assert second.is_whole
+    # Never before a stance of another run of the node.
+    part = [0] * 2 + [1] * 4
+    parts = make_recording([0, 0, 9, 9, 9, 0], [0, 0, unsure, 1, 1, 0], part=part)
+    (cut,) = compute_stances(*parts)
+    assert (cut.begun, cut.ended) == (False, True)
 
 
 def test_stances_at_the_ends_of_a_recording_are_not_whole() -> None:
@@ -152,45 +293,53 @@ def test_stances_at_the_ends_of_a_recording_are_not_whole() -> None:
     assert (last.number, last.begun, last.ended, last.is_whole) == (2, True, False, False)
 
 
-@pytest.mark.parametrize(
-    ("grf_n", "contact", "seq", "unknown", "missing"),
-    [
-        ([0, 2, NAN, NAN, 8, 0], [0, 1, CONTACT_UNKNOWN, CONTACT_UNKNOWN, 1, 0], range(6), 2, 0),
-        ([0, 2, 3, 8, 0], [0, 1, 1, 1, 0], [0, 1, 2, 6, 7], 0, 3),
-    ],
-    ids=["frames without a force", "missing frames"],
-)
-def test_a_stance_with_a_gap_has_a_peak_and_no_impulse(
-    grf_n: list[float], contact: list[int], seq: Sequence[int], unknown: int, missing: int
-) -> None:
+@pytest.mark.parametrize("cut", range(1, 30))
+def test_unknown_frames_in_a_bridged_gap_count_in_any_batch(cut: int) -> None:
+    # 20 frames, four unknown ones 2 ms apart, 60 ms, 20 frames.
+    contact = [0, *[1] * 20, *[CONTACT_UNKNOWN] * 4, *[1] * 100, 0]
+    t_ms = [2.0 * k + (60.0 if k > 24 else 0.0) for k in range(len(contact))]
+    seq, t_ns, columns = make_recording([5.0] * len(contact), contact, t_ms=t_ms)
+    detector, found = StanceDetector(), list[Stance]()
+    for rows in (slice(0, cut), slice(cut, None)):
+        found += detector.add_frames(
+            seq[rows], t_ns[rows], {k: v[rows] for k, v in columns.items()}
+        )
+    (one,) = [*found, *detector.finish()]
+    assert (one.frames, one.unknown_frames) == (124, 4)
+    assert one.gap_s == pytest.approx(0.070)
+
+
+def test_frames_of_unknown_contact_within_a_stance_are_a_gap() -> None:
+    unsure = CONTACT_UNKNOWN
+    grf_n = [0, 2, *range(3, 18), NAN, NAN, 8, 4, 0]
+    contact = [0, *[1] * 16, unsure, unsure, 1, 1, 0]
     flags = [32 if np.isnan(force) else 0 for force in grf_n]
-    frames = make_recording(grf_n, contact, seq=list(seq), estimate_flags=flags)
-    (one,) = compute_stances(*frames)
-    assert (one.frames, one.unknown_frames, one.missing_frames) == (
-        sum(c > 0 for c in contact),
-        unknown,
-        missing,
-    )
-    assert np.isnan(one.impulse_n_s)
-    assert (one.peak_grf_n, one.estimate_flags) == (8.0, max(flags))
-    assert (one.begun, one.ended, one.is_whole) == (True, True, False)
+    (one,) = compute_stances(*make_recording(grf_n, contact, estimate_flags=flags))
+    assert (one.frames, one.unknown_frames, one.missing_frames) == (20, 2, 0)
+    assert one.gap_s == pytest.approx(0.006)
+    known_n_s = np.trapezoid(np.array(grf_n[1:17] + grf_n[19:21]), 2e-3 * np.r_[0:16, 18:20])
+    assert one.impulse_n_s == pytest.approx(known_n_s)
+    assert one.estimate_flags == 32
+    assert (one.begun, one.ended, one.is_whole) == (True, True, True)
 
 
 @pytest.mark.parametrize(
-    ("contact", "seq", "begun", "ended"),
+    ("contact", "seq"),
     [
-        ([0, 1, 1, 0], [100, 102, 103, 104], False, True),
-        ([0, 1, 1, 0], [100, 101, 102, 104], True, False),
-        ([CONTACT_UNKNOWN, 1, 1, 0], [100, 101, 102, 103], False, True),
-        ([0, 1, 1, CONTACT_UNKNOWN], [100, 101, 102, 103], True, False),
+        ([0, 1, 1, 0], [100, 102, 103, 104]),
+        ([0, 1, 1, 0], [100, 101, 102, 104]),
+        ([0, CONTACT_UNKNOWN, 1, 0], [100, 101, 102, 103]),
+        ([0, 1, CONTACT_UNKNOWN, 0], [100, 101, 102, 103]),
     ],
 )
-def test_an_edge_beside_missing_frames_is_unseen(
-    contact: list[int], seq: list[int], begun: bool, ended: bool
+def test_an_edge_beside_missing_or_unknown_frames_is_a_gap(
+    contact: list[int], seq: list[int]
 ) -> None:
     (one,) = compute_stances(*make_recording([0, 5, 5, 0], contact, seq=seq))
-    assert (one.frames, one.missing_frames) == (2, 0)
-    assert (one.begun, one.ended, one.is_whole) == (begun, ended, False)
+    assert one.missing_frames == 0
+    assert one.gap_s == pytest.approx(0.004)
+    assert (one.begun, one.ended) == (True, True)
+    assert not one.is_whole  # the gap is longer than the rest
 
 
 def test_frames_of_unknown_contact_at_an_edge_belong_to_no_stance() -> None:
@@ -201,8 +350,7 @@ def test_frames_of_unknown_contact_at_an_edge_belong_to_no_stance() -> None:
     )
     (one,) = compute_stances(*frames)
     assert (one.begin_t_ns, one.end_t_ns, one.frames) == (STEP_NS, 2 * STEP_NS, 2)
-    assert one.estimate_flags == 0
-    assert one.impulse_n_s == pytest.approx(5 * 0.002)
+    assert (one.estimate_flags, one.unknown_frames) == (0, 0)
 
 
 @pytest.mark.parametrize(("t_ms", "expected"), [(54.0, 1), (54.001, 2)])
@@ -269,7 +417,7 @@ def test_a_stance_is_reported_as_soon_as_it_is_over() -> None:
 def recordings(draw: st.DrawFn) -> tuple[Any, ...]:
     n = draw(st.integers(1, 40))
     contact = draw(st.lists(st.sampled_from([0, 1, 1, CONTACT_UNKNOWN]), min_size=n, max_size=n))
-    steps = draw(st.lists(st.sampled_from([1, 1, 1, 1, 3, 30]), min_size=n, max_size=n))
+    steps = draw(st.lists(st.sampled_from([1, 1, 1, 1, 3, 30, 90]), min_size=n, max_size=n))
     part = np.cumsum(draw(st.lists(st.sampled_from([0] * 9 + [1]), min_size=n, max_size=n)))
     rng = np.random.default_rng(draw(st.integers(0, 9)))
     forces = [float(f) for f in np.where(rng.random(n) < 0.1, NAN, rng.uniform(0, 20, n))]

@@ -22,10 +22,11 @@ from storage.sessions.stances import (
 NAN = float("nan")
 HOP = Stance(
     *(1, 0, 10, 30, 2e-9, 5.0, 20, 0.5, 9e-8, 8e-9, -0.01, 0.02, 0.03, 0.001),
-    *(3, 0, 0, 16, True, True),
+    *(3, 0, 0, 0.0, 16, True, True),
 )
 HIDDEN = Stance(
-    *(2, 1, 50, 90, NAN, NAN, None, NAN, NAN, NAN, NAN, NAN, NAN, NAN), *(2, 1, 3, 1, True, False)
+    *(2, 1, 50, 90, NAN, NAN, None, NAN, NAN, NAN, NAN, NAN, NAN, NAN),
+    *(2, 1, 3, 0.01, 1, True, False),
 )
 HASH = "0123456789abcdef" * 4
 
@@ -79,7 +80,7 @@ def test_another_table_is_refused(tmp_path: Path) -> None:
 
 def test_a_table_of_another_version_is_told_from_a_damaged_one(tmp_path: Path) -> None:
     path = tmp_path / "stances.parquet"
-    older = written(path).drop_columns(["duration_sigma_s"])
+    older = written(path).drop_columns(["gap_s"])
     write_stances(path, older, frames_sha256=HASH)
     with pytest.raises(OtherVersionError, match="another version of foottile wrote it"):
         read_stances(path)

@@ -57,6 +57,7 @@ class StanceView(BaseModel):
     frames: int
     unknown_frames: int
     missing_frames: int
+    gap_s: float
     estimate_flags: int
     begun: bool
     ended: bool
