@@ -101,18 +101,24 @@ def make_findings_json(findings: EstimateSummary) -> dict[str, object]:
 
 
 def format_stances(stances: Sequence[Stance]) -> str:
-    """Return number, median peak, impulse and duration of the stances."""
+    """Return number, median peak, impulse and duration of the stances.
+
+    A median is stated if it is of most stances: a few whole ones may be of another kind.
+    """
     hidden = [s for s in stances if not math.isfinite(s.peak_grf_n)]
     whole = [s for s in stances if s.is_whole]
     text = f"{len(stances)} stance{'s' if len(stances) != 1 else ''}"
     if hidden:
         text += f", {len(hidden)} with an unknown peak"
-    if len(whole) + len(hidden) < len(stances):
-        text += f", {len(whole)} of them complete"
-    if not whole:
-        return text
+    if len(whole) < len(stances):
+        text += f", {len(whole)} of them whole"
+    if 2 * len(whole) <= len(stances):
+        return f"{text}: no medians, as most are cut by gaps or an end of the session"
+    peaks_n = [s.peak_grf_n for s in whole if math.isfinite(s.peak_sigma_n)]
+    is_known = 2 * len(peaks_n) > len(stances)
+    peak = f"median peak {median(peaks_n):.2f} N" if is_known else "most peaks at least, for gaps"
     return (
-        f"{text}: median peak {median(s.peak_grf_n for s in whole):.2f} N, impulse "
+        f"{text}: {peak}, {'' if is_known else 'median '}impulse "
         f"{median(s.impulse_n_s for s in whole):.2f} N s, duration "
         f"{median(s.duration_s for s in whole):.2f} s"
     )

@@ -2,7 +2,7 @@
 
 The only definition of this normalization. A stance lasts from its first frame to its last
 (`service.estimation.stances`). A value between two frames lies on the straight line between them,
-and is NaN if either frame is.
+and is NaN if either frame is, or if frames are missing between them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Columns, Floats, Ints, Times
+from devices.arrays import Bools, Columns, Floats, Ints, Times
+from devices.flags import EstimateFlag
 
 OVERLAY_COLUMNS = ("grf_n", "cop_x_m", "cop_y_m")
 """Columns of estimates in the overlay."""
@@ -59,12 +60,13 @@ def select_evenly(count: int, max_count: int) -> Ints:
     return np.round(np.linspace(0, count - 1, max_count)).astype(np.int64)
 
 
-def resample_stance(t_ns: Times, values: Floats, points: int) -> Floats:
+def resample_stance(t_ns: Times, values: Floats, is_after_gap: Bools, points: int) -> Floats:
     """Resample one stance at `points` percentages from 0 to 100, (points, ...).
 
     Args:
         t_ns: (n,), instants of its frames, rising, n of 2 or more.
         values: (n, ...), in these frames.
+        is_after_gap: (n,), whether frames are missing before each.
         points: number of points, 2 or more.
     """
     share = (t_ns - t_ns[0]) / float(t_ns[-1] - t_ns[0])
@@ -73,8 +75,10 @@ def resample_stance(t_ns: Times, values: Floats, points: int) -> Floats:
     before = behind - 1
     wide = (slice(None), *(None,) * (values.ndim - 1))
     part = ((at - share[before]) / (share[behind] - share[before]))[wide]
-    low, high = values[before], values[behind]
+    low, high = values[before], np.array(values[behind])
+    is_between = is_after_gap[behind] & (part.reshape(-1) < 1.0)
     # Exactly at a frame its value counts, even beside a NaN.
+    high[is_between] = np.nan
     between = np.where(part >= 1.0, high, low + (high - low) * part)
     return np.asarray(np.where(part <= 0.0, low, between))
 
@@ -107,7 +111,7 @@ class StanceOverlayBuilder:
             zip(part.tolist(), begin_t_ns.tolist(), end_t_ns.tolist(), strict=True)
         )
         self._next = 0
-        self._open: list[tuple[Times, Floats]] = []
+        self._open: list[tuple[Times, Floats, Bools]] = []
         self._points = points
         self._wanted = frozenset(int(row) for row in rows)
         self._kept: list[tuple[int, Floats]] = []
@@ -120,15 +124,17 @@ class StanceOverlayBuilder:
 
         Args:
             t_ns: (n,), instants, rising within a part.
-            columns: `OVERLAY_COLUMNS`, (n,) each; `part`, 0 if absent.
+            columns: `OVERLAY_COLUMNS` and `estimate_flags`, (n,) each; `part`, 0 if absent.
         """
         if not len(t_ns) or self._next >= len(self._windows):
             return
         part = columns["part"] if "part" in columns else np.zeros(len(t_ns), np.uint16)
         values = np.stack([columns[name].astype(np.float64) for name in OVERLAY_COLUMNS], axis=1)
+        gaps = (columns["estimate_flags"] & EstimateFlag.GAP) != 0
         edges = [0, *(np.flatnonzero(np.diff(part)) + 1).tolist(), len(part)]
         for first, end in pairwise(edges):
-            self._add_part_frames(int(part[first]), t_ns[first:end], values[first:end])
+            rows = slice(first, end)
+            self._add_part_frames(int(part[first]), t_ns[rows], values[rows], gaps[rows])
 
     def build_overlay(self) -> Overlay:
         """Return the overlay of all stances that are complete."""
@@ -147,7 +153,7 @@ class StanceOverlayBuilder:
             spread, rows, {name: curves[:, :, i] for i, name in enumerate(OVERLAY_COLUMNS)}
         )
 
-    def _add_part_frames(self, part: int, t_ns: Times, values: Floats) -> None:
+    def _add_part_frames(self, part: int, t_ns: Times, values: Floats, gaps: Bools) -> None:
         while self._next < len(self._windows):
             of, begin_ns, end_ns = self._windows[self._next]
             if of != part or begin_ns > t_ns[-1]:
@@ -156,7 +162,7 @@ class StanceOverlayBuilder:
                 int(np.searchsorted(t_ns, begin_ns)),
                 int(np.searchsorted(t_ns, end_ns, side="right")),
             )
-            self._open.append((t_ns[rows], values[rows]))
+            self._open.append((t_ns[rows], values[rows], gaps[rows]))
             if t_ns[-1] < end_ns:
                 return
             self._add_stance()
@@ -164,9 +170,8 @@ class StanceOverlayBuilder:
     def _add_stance(self) -> None:
         row, pieces = self._next, self._open
         self._next, self._open = row + 1, []
-        t_ns = np.concatenate([piece for piece, _ in pieces])
-        values = np.concatenate([piece for _, piece in pieces])
-        curve = resample_stance(t_ns, values, self._points)
+        t_ns, values, gaps = (np.concatenate(each) for each in zip(*pieces, strict=True))
+        curve = resample_stance(t_ns, values, gaps, self._points)
         if row in self._wanted:
             self._kept.append((row, curve))
         # Welford (1962): no cancellation for any number of stances.

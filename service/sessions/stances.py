@@ -214,7 +214,9 @@ def overlay_stances(
         UnknownError: it lacks estimates of an overlaid quantity.
         FileFormatError: it is damaged.
     """
-    if absent := [name for name in OVERLAY_COLUMNS if not session.has_columns(name)]:
+    if absent := [
+        name for name in (*OVERLAY_COLUMNS, "estimate_flags") if not session.has_columns(name)
+    ]:
         raise UnknownError(
             f"stances cannot be overlaid without {', '.join(absent)}",
             where=str(session.path),
@@ -229,7 +231,8 @@ def overlay_stances(
     rows = select_evenly(chosen.num_rows, curves)
     gathered = StanceOverlayBuilder(part, begin_ns, end_ns, points=points, rows=rows.tolist())
     if chosen.num_rows:
-        names = ("t_ns", *OVERLAY_COLUMNS, *(("part",) if session.has_columns("part") else ()))
+        names = ["t_ns", "estimate_flags", *OVERLAY_COLUMNS]
+        names += ["part"] if session.has_columns("part") else []
         begins_ns, ends_ns = (
             session.time_axis.shift_to_axis(t_ns, part) for t_ns in (begin_ns, end_ns)
         )

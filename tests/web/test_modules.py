@@ -217,12 +217,28 @@ def test_of_an_even_number_of_stances_the_median_is_between_the_two_in_the_middl
         "session/stances",
         """({ medianOf }) => {
           const of = (...peaks) =>
-            medianOf(peaks.map((peak) => ({ peak_grf_n: peak, duration_s: null })));
+            medianOf(peaks.map((peak) => (
+              { is_whole: true, peak_grf_n: peak, peak_sigma_n: 0.1, duration_s: null })));
           return [of(1, 5, 2), of(4, 1, 2, null, 9), of(null), of()]
             .map((all) => [all.peak_grf_n, all.duration_s]);
         }""",
     )
     assert found == [[2, None], [3, None], [None, None], [None, None]]
+
+
+def test_a_median_is_of_most_stances_or_of_none(ask: Ask) -> None:
+    found = ask(
+        "session/stances",
+        """({ medianOf }) => {
+          const whole = { is_whole: true, begun: true, ended: true };
+          const seen = { ...whole, peak_grf_n: 3, peak_sigma_n: 0.1, duration_s: 0.5 };
+          const hidden = { ...seen, peak_sigma_n: null };
+          const cut = { ...seen, is_whole: false, begun: false };
+          return [[seen, cut], [seen, seen, cut], [hidden, seen, seen], [hidden, hidden, seen]]
+            .map((all) => [medianOf(all).peak_grf_n, medianOf(all).duration_s]);
+        }""",
+    )
+    assert found == [[None, None], [3, 0.5], [3, 0.5], [None, 0.5]]
 
 
 def test_the_neighbour_is_that_of_the_cursor_or_the_first_in_view(ask: Ask) -> None:

@@ -41,13 +41,13 @@ export class AlignmentCard {
   add(method) {
     const { cursorS, plots, view } = this.page;
     const { film } = this.card;
-    const contacts = plots.stances.filter((stance) => stance.begun).map((stance) => stance.from);
+    const contacts = plots.stances.filter((stance) => stance.begun && !stance.gap_s).map((stance) => stance.from);
     if (!film.times.length) return notice("this browser does not show the film.", { bad: true });
     if (!this.card.isCertain) return notice("which picture this browser shows is not known: see below the film.", { bad: true });
     if (!film.isStill) return notice("the film is moving: pause it.", { bad: true });
     if (cursorS === null) return notice(`put the cursor ${method === "hand" ? "on the instant" : "near the contact"} first.`, { bad: true });
     if (method === "contact" && film.wanted === 0) return notice("no picture before this one shows the foot in the air.", { bad: true });
-    if (method === "contact" && !contacts.length) return notice("the session has no contact that begins in it.", { bad: true });
+    if (method === "contact" && !contacts.length) return notice("the session has no contact without gaps that begins in it.", { bad: true });
     const timeS = method === "hand" ? cursorS : contacts.reduce((best, one) => (Math.abs(one - cursorS) < Math.abs(best - cursorS) ? one : best));
     const resolutionS = method === "hand" ? (view.to - view.from) / plots.plotWidth : 1 / plots.whole.rateHz;
     this.pairs = this.pairs.filter(({ index }) => index !== film.wanted);

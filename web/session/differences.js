@@ -2,7 +2,7 @@
 
 import { byId, el, number, setText } from "../common/text.js";
 import { taresText } from "./header.js";
-import { FIGURES, valuesOf } from "./stances.js";
+import { FIGURES, isMajority, valuesOf } from "./stances.js";
 
 const STANCES_MIN = 3; // of each session: fewer do not bound their scatter
 const Z = 1.96;
@@ -49,7 +49,7 @@ function drawTares(sessions) {
  * @param {Compared} older @param {Compared} newer
  */
 export function drawDifferences(older, newer) {
-  const sessions = [older, newer].map(({ name, stances }) => ({ name, stances: stances.filter((stance) => stance.is_whole) }));
+  const sessions = [older, newer].map(({ name, stances }) => ({ name, all: stances, stances: stances.filter((stance) => stance.is_whole) }));
   byId("differences-card").hidden = false;
   sessions.forEach(({ name, stances }, i) => byId(`differences-${i}`).replaceChildren(
     el("span", { cls: "session-name", text: name, title: name }), ` (${stances.length}), ±\u00a0sd`));
@@ -57,7 +57,10 @@ export function drawDifferences(older, newer) {
   const differing = [];
   byId("differences-rows").replaceChildren(...FIGURES.map((figure) => {
     const { key, label, unit, factor, decimals } = figure;
-    const both = sessions.map(({ stances }) => momentsOf(valuesOf(stances, figure)));
+    const both = sessions.map(({ stances, all }) => {
+      const values = valuesOf(stances, figure);
+      return momentsOf(isMajority(values, all) ? values : []);
+    });
     const difference = differenceOf(both[0], both[1]);
     const places = difference ? decimalsFor(both[0].mean * factor, both[1].mean * factor, decimals) : decimals;
     const text = (mean, spread) => (Number.isFinite(mean) ? `${number(mean * factor, places)}${Number.isFinite(spread) ? ` ± ${number(spread * factor, places)}` : ""}` : "–");
@@ -70,8 +73,8 @@ export function drawDifferences(older, newer) {
       ...both.map(({ mean, variance }) => el("td", { text: text(mean, Math.sqrt(variance)) })),
       el("td", { text: difference ? text(difference.mean, difference.half) : "–" }));
   }));
-  const isKnown = sessions.every(({ stances }) => stances.length >= STANCES_MIN);
-  setText(byId("differences-verdict"), !isKnown ? `No differences: each session needs ${STANCES_MIN} whole stances.`
+  const isKnown = sessions.every(({ stances, all }) => stances.length >= STANCES_MIN && isMajority(stances, all));
+  setText(byId("differences-verdict"), !isKnown ? sessions.some(({ stances }) => stances.length < STANCES_MIN) ? `No differences: each session needs ${STANCES_MIN} whole stances.` : "No differences: less than half of the stances of a session are whole."
     : differing.length ? `Different at 95 %: ${differing.join(", ")} (${newer.name} against ${older.name}).` : "No figure differs at 95 %.");
   byId("differences-about").hidden = !isKnown;
 }

@@ -8,6 +8,7 @@ import { byId, el, number, setData, setText } from "../common/text.js";
 import { CopPaths } from "./cop_paths.js";
 
 const HIT_PX = 18;
+const GAP = 8; // of estimate_flags: frames are missing before
 const FRAMES_MAX = 4000; // of the selected stance; a longer one is binned
 const HEIGHT_PX = 320;
 
@@ -217,10 +218,12 @@ export class StanceOverlay {
     const bins = this.chosen?.whole ? this.chosen.bins : null;
     if (!bins?.t_first_s.length) return null;
     const [begin, end] = [bins.t_first_s[0], bins.t_last_s.at(-1)];
-    return {
-      percent: bins.t_first_s.map((timeS) => (100 * (timeS - begin)) / Math.max(1e-9, end - begin)),
-      low: bins.grf_n_min, high: bins.grf_n_max, copX: bins.cop_x_m_max, copY: bins.cop_y_m_max,
-    };
+    const shares = bins.t_first_s.map((timeS) => (100 * (timeS - begin)) / Math.max(1e-9, end - begin));
+    // No line over a gap: an unknown value stands in it.
+    const isGap = (i) => i > 0 && bins.estimate_flags[i] & GAP;
+    const withGaps = (values, ofGap) => values.flatMap((value, i) => (isGap(i) ? [ofGap(i), value] : [value]));
+    const [low, high, copX, copY] = ["grf_n_min", "grf_n_max", "cop_x_m_max", "cop_y_m_max"].map((name) => withGaps(bins[name], () => null));
+    return { percent: withGaps(shares, (i) => (shares[i - 1] + shares[i]) / 2), low, high, copX, copY };
   }
 
   point(event) {

@@ -24,7 +24,8 @@ function flagsOf(stance) {
   const texts = estimateTexts(stance.estimate_flags & ORDINARY);
   if (!stance.begun) texts.push("start not recorded");
   if (!stance.ended) texts.push("end not recorded");
-  if (stance.begun && stance.ended && stance.duration_sigma_s === null) texts.push("touchdown or lift-off not sampled: contact time has no interval");
+  if (stance.begun && stance.ended && stance.duration_sigma_s === null) texts.push("touchdown or lift-off too slow: contact time has no interval");
+  if (stance.gap_s) texts.push(`${number(1e3 * stance.gap_s, 0)}\u00a0ms without frames${stance.peak_sigma_n === null ? ", which may hide the peak" : ""}`);
   if (stance.missing_frames) texts.push(`${stance.missing_frames} frames missing`);
   if (stance.unknown_frames) texts.push(`${stance.unknown_frames} frames without a GRF`);
   return texts;
@@ -35,7 +36,7 @@ function faultSign(stance) {
   const texts = flagsOf(stance);
   if (!texts.length) return "";
   const ends = [stance.begun ? "" : "start", stance.ended ? "" : "end"].filter(Boolean).join(" and ");
-  const words = ends ? `cut at ${ends}` : stance.missing_frames || stance.unknown_frames ? "gaps" : texts[0].split(/:| \(/)[0];
+  const words = ends ? `cut at ${ends}` : stance.gap_s ? "gaps" : texts[0].split(/:| \(/)[0];
   const text = texts.join(", ");
   return el("small", { cls: "why", title: text }, el("span", { "aria-hidden": "true", text: `⚠ ${words}` }), el("span", { cls: "unseen", text }));
 }
@@ -54,9 +55,10 @@ export function neighbour(stances, by, cursorS, view) {
 }
 
 const Z95 = 1.96;
+const BOUNDS = new Set(["peak", "travel"]); // lower bounds where they have no interval
 
 /** Return whether a figure of a stance is a lower bound only. */
-const isLowerBound = (stance, { key, sigma }) => isCut(stance) || (key === "travel" && stance[sigma] === null);
+const isLowerBound = (stance, { key, sigma }) => isCut(stance) || (BOUNDS.has(key) && stance[sigma] === null);
 
 /** Return the values of a figure over stances, without unknown ones and lower bounds. */
 export const valuesOf = (stances, figure) => stances.filter((stance) => Number.isFinite(stance[figure.value]) && !isLowerBound(stance, figure))
@@ -82,14 +84,31 @@ export function figureOf(stance, figure) {
   ];
 }
 
-/** Return the median of each figure over stances, as a stance. */
+/** Return whether some of all stances speak for all: a few may be of another kind. @param {unknown[]} some @param {unknown[]} all */
+export const isMajority = (some, all) => 2 * some.length > all.length;
+
+/** Return the median of each figure over the whole ones of all stances, as a stance; null where fewer than half have it. */
 export function medianOf(stances) {
+  const whole = stances.filter((stance) => stance.is_whole);
   const middle = (figure) => {
-    const values = valuesOf(stances, figure).sort((a, b) => a - b);
+    const values = valuesOf(whole, figure).sort((a, b) => a - b);
     const half = values.length >> 1;
-    return values.length ? (values[half] + values[values.length - 1 - half]) / 2 : null;
+    return isMajority(values, stances) ? (values[half] + values[values.length - 1 - half]) / 2 : null;
   };
   return Object.fromEntries(FIGURES.map((figure) => [figure.value, middle(figure)]));
+}
+
+/** Return why medians of stances are not stated; empty if all are. */
+function whyNoMedian(stances) {
+  const whole = stances.filter((stance) => stance.is_whole);
+  if (isMajority(whole, stances)) {
+    const median = medianOf(stances);
+    const lacking = FIGURES.filter((figure) => median[figure.value] === null).map(({ label }) => label);
+    return lacking.length ? `no median: ${lacking.join(", ")}, unknown or a lower bound in most stances` : "";
+  }
+  const cut = stances.filter(isCut).length;
+  const parts = [[cut, "cut"], [stances.length - whole.length - cut, "with gaps or saturated"]].filter(([many]) => many);
+  return `no medians: only ${whole.length} whole; ${parts.map(([many, what]) => `${many.toLocaleString("en-GB")} ${what}`).join(", ")}`;
 }
 
 /** Table of stances. */
@@ -166,14 +185,15 @@ export class Stances {
     const many = this.stances.length.toLocaleString("en-GB");
     const whole = this.stances.filter((one) => one.is_whole);
     const all = `${many} stance${many === "1" ? "" : "s"}`;
-    setText(byId("stance-which"), stance ? `Stance ${stance.number} of ${many}` : whole.length > 1 ? `${all}, median of ${whole.length.toLocaleString("en-GB")} whole` : all);
+    const hasMedian = whole.length > 1 && isMajority(whole, this.stances);
+    setText(byId("stance-which"), stance ? `Stance ${stance.number} of ${many}` : hasMedian ? `${all}, median of ${whole.length.toLocaleString("en-GB")} whole` : all);
     byId("stance-level").hidden = !stance;
-    const shown = stance ?? medianOf(whole);
+    const shown = stance ?? medianOf(this.stances);
     for (const figure of FIGURES) {
       const [value, interval] = figureOf(shown, figure);
       setText(this.figures.get(figure.key), [value, interval, figure.unit].filter(Boolean).join("\u00a0"));
     }
-    setText(byId("stance-flags"), stance ? flagsOf(stance).join(", ") : "");
+    setText(byId("stance-flags"), stance ? flagsOf(stance).join(", ") : this.stances.length ? whyNoMedian(this.stances) : "");
     setData(this.line, "stance", stance ? String(stance.number) : "");
   }
 

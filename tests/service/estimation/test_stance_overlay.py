@@ -36,7 +36,7 @@ def test_a_curve_has_the_ends_and_the_range_of_its_frames(
 ) -> None:
     t_ns = sum_steps(steps_ns)
     force_n = data.draw(hnp.arrays(np.float64, len(t_ns), elements=FORCES))
-    curve_n = resample_stance(t_ns, force_n, points)
+    curve_n = resample_stance(t_ns, force_n, np.zeros(len(t_ns), bool), points)
     assert curve_n.shape == (points,)
     assert (curve_n[0], curve_n[-1]) == (force_n[0], force_n[-1])
     slack_n = 1e-12 * np.abs(force_n).max()
@@ -50,7 +50,9 @@ def test_a_straight_line_stays_straight(
 ) -> None:
     t_ns = sum_steps(steps_ns)
     share = (t_ns - t_ns[0]) / (t_ns[-1] - t_ns[0])
-    curve_n = resample_stance(t_ns, first_n + share * (last_n - first_n), points)
+    curve_n = resample_stance(
+        t_ns, first_n + share * (last_n - first_n), np.zeros(len(t_ns), bool), points
+    )
     assert curve_n == pytest.approx(np.linspace(first_n, last_n, points), abs=1e-9)
 
 
@@ -61,16 +63,26 @@ def test_a_curve_does_not_depend_on_the_duration(
     t_ns = sum_steps(steps_ns)
     force_n = data.draw(hnp.arrays(np.float64, len(t_ns), elements=FORCES))
     slower = t_ns[0] + times * (t_ns - t_ns[0])
-    one, other = (resample_stance(t, force_n, 101) for t in (t_ns, slower))
+    one, other = (resample_stance(t, force_n, np.zeros(len(t), bool), 101) for t in (t_ns, slower))
     assert one == pytest.approx(other, abs=1e-6)
 
 
 def test_a_missing_force_is_missing_up_to_its_neighbours() -> None:
     t_ns = sum_steps([1_000_000] * 4)
-    curve = resample_stance(t_ns, np.array([1.0, 2.0, NAN, 4.0, 5.0]), 9)
+    unbroken = np.zeros(5, bool)
+    curve = resample_stance(t_ns, np.array([1.0, 2.0, NAN, 4.0, 5.0]), unbroken, 9)
     assert curve.tolist()[:3] == [1.0, 1.5, 2.0]
     assert np.isnan(curve[3:6]).all()
     assert curve.tolist()[6:] == [4.0, 4.5, 5.0]
+
+
+def test_a_curve_is_not_drawn_over_a_gap() -> None:
+    t_ns = sum_steps([1_000_000, 2_000_000, 1_000_000])
+    is_after_gap = np.array([True, False, True, False])
+    curve = resample_stance(t_ns, np.array([1.0, 2.0, 4.0, 5.0]), is_after_gap, 9)
+    assert curve[[0, 1, 2]].tolist() == [1.0, 1.5, 2.0]
+    assert np.isnan(curve[3:6]).all()
+    assert curve[[6, 7, 8]].tolist() == [4.0, 4.5, 5.0]
 
 
 def make_recording(
@@ -91,6 +103,7 @@ def make_recording(
         "grf_n": force_n.astype(np.float32),
         "cop_x_m": np.where(force_n > 10, 0.01, NAN).astype(np.float32),
         "cop_y_m": np.zeros(len(force_n), np.float32),
+        "estimate_flags": np.zeros(len(force_n), np.uint16),
         "part": np.array(parts, np.uint16),
     }
     return t_ns, columns, rows
