@@ -613,6 +613,7 @@ type StanceView = {
   frames: number;
   unknown_frames: number;
   missing_frames: number;
+  gap_s: number;
   estimate_flags: number;
   begun: boolean;
   ended: boolean;

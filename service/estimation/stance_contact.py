@@ -25,6 +25,9 @@ BRIDGED_GAP_MAX_NS = 200_000_000
 """Greatest gap within a stance, however long it lasts: shorter than the swing of a step."""
 COP_SHARE_MIN = 0.8
 """Least share of a stance's frames with a COP, for an uncertainty of the COP's range."""
+COP_GAP_SHARE_MAX = 0.05
+"""Greatest share of gaps in the duration for it, if they last longer than `EDGE_NS`: a COP that
+rolls over the foot moves as far."""
 _SLOPE_SIGMAS = 2.0
 """Least change of the GRF over `EDGE_NS` for a slope, in its sigmas."""
 
@@ -422,8 +425,7 @@ class Contact:
         """Return the range of the centre of pressure, and its standard uncertainty.
 
         The largest of all frames lies between the largest lower and the largest upper end of their
-        intervals, the smallest likewise: an uncertain frame may be the extreme one. Often it is the
-        first or last: a gap beside them hides it.
+        intervals, the smallest likewise: an uncertain frame may be the extreme one, or one in a gap.
         """
         if self.extremes_x_m is None:
             return np.nan, np.nan
@@ -432,7 +434,7 @@ class Contact:
         duration_s = (self.last.t_ns - self.first.t_ns) * 1e-9
         is_bound = (
             self.cop_frames < COP_SHARE_MIN * self.frames
-            or self.gaps.total_s > (1.0 - COP_SHARE_MIN) * duration_s
-            or edges.total_s > EDGE_NS * 1e-9
+            or self.gaps.total_s + edges.total_s
+            > max(EDGE_NS * 1e-9, COP_GAP_SHARE_MAX * duration_s)
         )
         return float(x_m[1] - x_m[0]), np.nan if is_bound else float(np.hypot(*sigmas_m))

@@ -78,9 +78,9 @@ class Stance:
         cop_x_last_m: last known one.
         cop_x_range_m: largest less smallest.
         cop_x_range_sigma_m: standard uncertainty of the range, with independent errors of smallest
-            and largest; NaN if fewer than `COP_SHARE_MIN` of the frames have a COP, if gaps within
-            it make up more than the rest of the duration, or those beside it more than `EDGE_NS`:
-            the range is then a lower bound.
+            and largest; NaN if fewer than `COP_SHARE_MIN` of the frames have a COP, or if gaps make
+            up more than `COP_GAP_SHARE_MAX` of the duration and `EDGE_NS`: the range is then a
+            lower bound.
         frames: number of frames from the first to the last.
         unknown_frames: number of these without a GRF.
         missing_frames: number of missing frames between the first and the last.

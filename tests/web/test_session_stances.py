@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 
+from tests.builders.arrays import PERIOD_NS
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
 from tests.service.running import Running
@@ -241,6 +242,61 @@ def test_of_a_stance_that_was_not_seen_whole_the_line_says_so(
     expect(page.locator("#stance-flags")).to_be_empty()
     expect(page.locator("#stance-figures")).not_to_contain_text("≥")
     assert width_of(page) == PHONE["width"]
+    assert complaints(page) == []
+
+
+def record_with_gaps(server: Running, name: str, slots: list[int]) -> Recording:
+    """Record a stance of 0.4 s for each number of slots that are not sampled in its middle."""
+    node = FakeNode(server, name.replace(" ", "-"))
+    node.connect()
+    node.tared()
+    session = node.record(name=name)
+    for count in slots:
+        node.send(100, [0.0, 0.0], alive=True)
+        node.send(100, [12.0, 24.0], alive=True)
+        node.next_t_mono_ns += count * PERIOD_NS
+        node.send(100, [12.0, 20.0], alive=True)
+    node.deliver(100, [0.0, 0.0], alive=True)
+    node.finish(session)
+    node.close()
+    return session
+
+
+@pytest.mark.parametrize("size", [{"width": 1280, "height": 800}, PHONE], ids=["laptop", "phone"])
+def test_a_gap_in_a_stance_is_bridged_and_shown(
+    server: Running, open_page: OpenPage, size: dict[str, Any]
+) -> None:
+    session = record_with_gaps(server, f"gap {size['width']}", [0, 0, 30, 0])
+    page = opened(open_page, session, **size)
+    expect(page.locator("#stance-which")).to_have_text("4 stances, median of 4 whole")
+    expect(page.locator("#stance-flags")).to_be_empty()
+    row = page.locator("#stances-rows tr").nth(2)
+    row.locator("button").click()
+    expect(page.locator("#stance-flags")).to_have_text("62 ms without frames")
+    expect(row.get_by_text("⚠ gaps")).to_be_visible()
+    figures = page.locator("#stance-figures")
+    expect(figures.locator("[data-figure=impulse] dd")).to_have_text(re.compile(r"^[0-9.]+ ± "))
+    page.locator("#overlay-card").scroll_into_view_if_needed()
+    expect(page.locator("#overlay-legend")).to_contain_text("stance 3, frame by frame")
+    overlay = session.running.http.get(f"{session.url}/stances/overlay").json()
+    counts = overlay["spread"]["grf_n"]["count"]
+    assert (counts[50], counts[20], counts[80]) == (3, 4, 4)
+    assert width_of(page) == size["width"]
+    assert complaints(page) == []
+
+
+@pytest.mark.parametrize("size", [{"width": 1280, "height": 800}, PHONE], ids=["laptop", "phone"])
+def test_without_a_majority_of_whole_stances_the_headline_says_why_there_is_no_median(
+    server: Running, open_page: OpenPage, size: dict[str, Any]
+) -> None:
+    session = record_with_gaps(server, f"torn {size['width']}", [0, 120, 120])
+    page = opened(open_page, session, **size)
+    expect(page.locator("#stance-which")).to_have_text("5 stances")
+    expect(page.locator("#stance-flags")).to_have_text("no medians: only 1 whole; 4 cut")
+    for figure in ("peak", "duration", "impulse", "travel"):
+        shown = page.locator(f"#stance-figures [data-figure={figure}] dd")
+        expect(shown).to_have_text(re.compile("^–"))
+    assert width_of(page) == size["width"]
     assert complaints(page) == []
 
 

@@ -141,6 +141,7 @@ function whyNoCop(node, frame, { row }) {
   if (!node.calibration) return "no calibration";
   if (bits & (ESTIMATE.TILE_MISSING | ESTIMATE.SATURATED)) return whyNot(node, frame);
   if (frame.contact === false) return "no contact";
+  if ((frame.contact ?? null) === null) return "contact unknown";
   if (bits & ESTIMATE.COP_MASKED) return "too uncertain";
   if (row.x !== null && row.y !== null) return "all tiles at one place";
   return "not determined";

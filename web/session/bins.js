@@ -13,6 +13,8 @@ export function lowerBound(list, value) {
   return low;
 }
 
+const GAP_PERIODS = 2.5; // more than one slot not sampled
+
 /** Min and max per interval. */
 export class Bins {
   /**
@@ -33,6 +35,8 @@ export class Bins {
     this.provisional = Boolean(overview.provisional); // not sealed
     this.catching_up = Boolean(overview.catching_up); // estimation is not complete
     this.covers = covers;
+    /** @type {number | null} */
+    this.gapS = null; // longest time between frames without a gap; computed when it is needed
     this.estimated = "grf_n_min" in overview.columns;
   }
 
@@ -78,9 +82,11 @@ export class Bins {
     return i + 1 < this.count && this.isAdjacent(i + 1) ? this.first[i + 1] : this.last[i];
   }
 
-  /** Return true if no frame is missing between a bin and the previous one. */
+  /** Return true if no frame is missing between a bin and the previous one: lost, or not sampled. */
   isAdjacent(i) {
-    return i > 0 && this.columns.part[i] === this.columns.part[i - 1] && this.columns.missing[i] === 0;
+    this.gapS ??= GAP_PERIODS / (this.rateHz ?? GAP_PERIODS);
+    return i > 0 && this.columns.part[i] === this.columns.part[i - 1] && this.columns.missing[i] === 0
+      && this.first[i] - this.last[i - 1] <= this.gapS;
   }
 
   /** Return min of one column, max of another, and the index of the max; null: no values. */

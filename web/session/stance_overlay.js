@@ -107,7 +107,7 @@ export class StanceOverlay {
     if (!chosen) return;
     try {
       const answer = await api.overview(this.id, {
-        points: FRAMES_MAX, start_s: Math.max(0, stance.from - 1e-7), end_s: stance.to + 1e-6, columns: "grf_n,cop_x_m,cop_y_m",
+        points: FRAMES_MAX, start_s: Math.max(0, stance.from - 1e-7), end_s: stance.to + 1e-6, columns: "grf_n,cop_x_m,cop_y_m,estimate_flags",
       }, stopping.signal);
       chosen.bins = answer.columns;
       chosen.framesInBin = answer.frames_in_bin;
