@@ -116,7 +116,11 @@ def format_stances(stances: Sequence[Stance]) -> str:
         return f"{text}: no medians, as most are cut by gaps or an end of the session"
     peaks_n = [s.peak_grf_n for s in whole if math.isfinite(s.peak_sigma_n)]
     is_known = 2 * len(peaks_n) > len(stances)
-    peak = f"median peak {median(peaks_n):.2f} N" if is_known else "most peaks at least, for gaps"
+    peak = (
+        f"median peak {median(peaks_n):.2f} N"
+        if is_known
+        else "most peaks are lower bounds, for gaps"
+    )
     return (
         f"{text}: {peak}, {'' if is_known else 'median '}impulse "
         f"{median(s.impulse_n_s for s in whole):.2f} N s, duration "

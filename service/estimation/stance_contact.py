@@ -425,7 +425,8 @@ class Contact:
         """Return the range of the centre of pressure, and its standard uncertainty.
 
         The largest of all frames lies between the largest lower and the largest upper end of their
-        intervals, the smallest likewise: an uncertain frame may be the extreme one, or one in a gap.
+        intervals, the smallest likewise: an uncertain frame may be the extreme one. So may one in a
+        gap.
         """
         if self.extremes_x_m is None:
             return np.nan, np.nan

@@ -272,10 +272,13 @@ def test_a_gap_in_a_stance_is_bridged_and_shown(
     expect(page.locator("#stance-flags")).to_be_empty()
     row = page.locator("#stances-rows tr").nth(2)
     row.locator("button").click()
-    expect(page.locator("#stance-flags")).to_have_text("62 ms without frames")
+    expect(page.locator("#stance-flags")).to_have_text(
+        "62 ms without frames, which may hide the peak"
+    )
     expect(row.get_by_text("⚠ gaps")).to_be_visible()
     figures = page.locator("#stance-figures")
-    expect(figures.locator("[data-figure=impulse] dd")).to_have_text(re.compile(r"^[0-9.]+ ± "))
+    expect(figures.locator("[data-figure=impulse] dd")).to_have_text(re.compile(r"^[0-9.]+\s±"))
+    expect(figures.locator("[data-figure=peak] dd")).to_have_text(re.compile(r"^≥\s36\.0\sN"))
     page.locator("#overlay-card").scroll_into_view_if_needed()
     expect(page.locator("#overlay-legend")).to_contain_text("stance 3, frame by frame")
     overlay = session.running.http.get(f"{session.url}/stances/overlay").json()
@@ -295,7 +298,7 @@ def test_without_a_majority_of_whole_stances_the_headline_says_why_there_is_no_m
     expect(page.locator("#stance-flags")).to_have_text("no medians: only 1 whole; 4 cut")
     for figure in ("peak", "duration", "impulse", "travel"):
         shown = page.locator(f"#stance-figures [data-figure={figure}] dd")
-        expect(shown).to_have_text(re.compile("^–"))
+        expect(shown).to_have_text(re.compile("^\u2013"))
     assert width_of(page) == size["width"]
     assert complaints(page) == []
 
