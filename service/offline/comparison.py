@@ -182,7 +182,7 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
     places_m = np.array([(tile.x_m, tile.y_m) for tile in tiles if not tile.reference])
     notes += [
         *data.notes,
-        *check_cop_position(pairs, places_m),
+        *check_cop_position(pairs, places_m, options.reference_cop_sigma_m),
         *describe_implausible_alignment(alignment),
     ]
     notes += [*_describe_limitations(alignment, pairs, options)]

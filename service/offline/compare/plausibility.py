@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from devices.arrays import Floats
@@ -20,6 +22,8 @@ MAX_COP_RANGE_FEET = 10.0
 MIN_LOAD_SHARE = 0.1
 """Force, relative to the greatest, below which the COP is not checked."""
 MAX_OUTSIDE_SHARE = 0.05
+EDGE_SIGMAS = 3.0
+"""Tolerance of the foot's edge, in standard uncertainties of a COP: as of the hull of our own."""
 IMPLAUSIBLE_SCALE = 2.0
 """Scale, or its inverse, beyond any mounted foot's gain: the unit or the foot is another."""
 OTHER_UNITS = {"kgf": 9.80665, "lbf": 4.44822}
@@ -96,12 +100,18 @@ def advise_on_scale(alignment: ReferenceAlignment) -> list[str]:
     ]
 
 
-def check_cop_position(pairs: PairedFrames, tile_positions_m: Floats) -> list[str]:
+def check_cop_position(
+    pairs: PairedFrames, tile_positions_m: Floats, reference_sigma_m: float | None = None
+) -> list[str]:
     """Return notes on an implausible COP of the reference.
+
+    A load on a tile at the edge has its COP there, and half of its noise is beyond.
 
     Args:
         pairs: our frames with the reference.
         tile_positions_m: (tiles, 2), positions of the load-bearing tiles in the foot frame.
+        reference_sigma_m: standard uncertainty of each coordinate of the reference's COP; None:
+            not known, then the edge has the tolerance of our own COP alone.
 
     Raises:
         ComparisonError: the COP is in another unit.
@@ -124,11 +134,14 @@ def check_cop_position(pairs: PairedFrames, tile_positions_m: Floats) -> list[st
             expected="a centre of pressure under the foot",
             remedy="Its unit may be mm or cm: look at --units cop=",
         )
-    outside = float(np.mean(np.hypot(*(cop_m - centre_m).T) > reach_m))
+    sigmas_m = [pairs.columns[name][rows] for name in ("cop_sigma_x_m", "cop_sigma_y_m")]
+    own_m = [float(np.median(known)) for each in sigmas_m if len(known := each[np.isfinite(each)])]
+    tolerance_m = EDGE_SIGMAS * math.hypot(*own_m, reference_sigma_m or 0.0)
+    outside = float(np.mean(np.hypot(*(cop_m - centre_m).T) > reach_m + tolerance_m))
     if outside > MAX_OUTSIDE_SHARE:
         return [
-            f"the reference's centre of pressure is outside the foot in {100.0 * outside:.0f} % of "
-            "its frames: its origin or axes are not the foot's (--cop-offset-m), so only "
-            "cop_p95_about_mean_m means anything"
+            "the reference's centre of pressure is outside the foot by more than "
+            f"{1e3 * tolerance_m:.1f} mm in {100.0 * outside:.0f} % of its frames: its origin or "
+            "axes are not the foot's (--cop-offset-m), so only cop_p95_about_mean_m means anything"
         ]
     return []

@@ -101,7 +101,21 @@ TRAVEL = np.linspace(-0.015, 0.015, len(FORCE_N))
 def test_a_cop_under_the_foot_needs_no_word_and_one_beside_it_is_said() -> None:
     assert check_cop_position(under(TRAVEL), FOOT_M) == []
     (note,) = check_cop_position(under(TRAVEL + 0.4), FOOT_M)
-    assert "outside the foot in 100 % of its frames" in note
+    assert "outside the foot by more than 4.2 mm in 100 % of its frames" in note
+
+
+@pytest.mark.parametrize(
+    ("off_m", "reference_sigma_m", "is_said"),
+    [(0.0, None, False), (0.006, None, True), (0.006, 0.003, False), (0.02, 0.003, True)],
+)
+def test_the_edge_of_the_foot_has_the_uncertainty_of_a_cop(
+    off_m: float, reference_sigma_m: float | None, is_said: bool
+) -> None:
+    """A foot that stands on the tiles at its end, and a plate that is right to 0.3 mm."""
+    row_m = np.array([(-0.02, 0.0), (0.0, 0.0), (0.02, 0.0)])
+    noise_m = np.random.default_rng(1).normal(0.0, 0.0003, len(FORCE_N))
+    pairs = under(0.02 + off_m + noise_m)
+    assert bool(check_cop_position(pairs, row_m, reference_sigma_m)) == is_said
 
 
 def test_a_cop_in_millimetres_read_as_metres_is_refused() -> None:
