@@ -55,10 +55,17 @@ class UncertainValue:
     @property
     def interval_95(self) -> tuple[float, float]:
         """95 % interval, by Student's t; the part of our foot's repeating error is normal."""
-        half = math.hypot(
-            float(stdtrit(self.dof, _UPPER_95)) * self.sigma, NORMAL_95 * self.repeating_sigma
-        )
+        half = math.hypot(self._fit_half_interval, NORMAL_95 * self.repeating_sigma)
         return self.value - half, self.value + half
+
+    @property
+    def is_mostly_repeating(self) -> bool:
+        """True if the interval is mostly our foot's repeating error."""
+        return NORMAL_95 * self.repeating_sigma > self._fit_half_interval
+
+    @property
+    def _fit_half_interval(self) -> float:
+        return float(stdtrit(self.dof, _UPPER_95)) * self.sigma
 
     def scale_by(self, factor: float) -> UncertainValue:
         """Return the estimate multiplied by a unit factor."""

@@ -98,7 +98,7 @@ def _format_alignment(
     yield from (
         "## Alignment",
         "",
-        "| | value | standard error | of our foot | 95 % interval |",
+        "| | value | standard error of the fit | of our foot | 95 % interval |",
         "|---|--:|--:|--:|--:|",
     )
     for name, found, remark in rows:
@@ -106,9 +106,10 @@ def _format_alignment(
             yield f"| {name} | not known: no flight | - | - | - |"
             continue
         low, high = found.interval_95
+        largest = ", mostly of our foot" if found.is_mostly_repeating else ""
         yield (
             f"| {name}{remark} | {found.value:.4f} | {found.sigma:.4f} | "
-            f"{found.repeating_sigma:.4f} | {low:.4f} to {high:.4f} |"
+            f"{found.repeating_sigma:.4f} | {low:.4f} to {high:.4f}{largest} |"
         )
     if by_clocks is not None:
         low_s, high_s = (by_clocks.lag_s + side * by_clocks.error_bound_s for side in (-1.0, 1.0))
@@ -118,7 +119,9 @@ def _format_alignment(
         )
     yield ""
     yield f"From {alignment.block_count} blocks of time. The reference bears load from"
-    yield f"{pairs.contact_threshold_n:.2f} N over its zero."
+    yield f"{pairs.contact_threshold_n:.2f} N over its zero. Intervals have both errors: of the"
+    yield "fit, which is the scatter between blocks, and of our foot, which every stance repeats:"
+    yield "no block shows it, and no longer recording averages it out."
     yield ""
 
 

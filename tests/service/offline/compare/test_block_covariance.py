@@ -5,7 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.offline.compare.block_covariance import assign_blocks, compute_fit_uncertainty
+from service.offline.compare.block_covariance import (
+    UncertainValue,
+    assign_blocks,
+    compute_fit_uncertainty,
+)
 
 
 @pytest.mark.slow
@@ -38,3 +42,12 @@ def test_a_long_rest_beside_three_stances_does_not_put_them_into_one_block() -> 
     block = assign_blocks(score, t, weight)
     assert len(np.unique(block[:stances])) >= 4
     assert 8 <= block.max() + 1 <= 20
+
+
+def test_a_value_says_which_of_its_errors_makes_its_interval() -> None:
+    drift_ppm = UncertainValue(87.0, 13.0, 8.0, 800.0)
+    low_ppm, high_ppm = drift_ppm.interval_95
+    assert (high_ppm - low_ppm) / 2 == pytest.approx(1.96 * 800.0, rel=1e-3)
+    assert drift_ppm.is_mostly_repeating
+    assert not UncertainValue(87.0, 400.0, 8.0, 400.0).is_mostly_repeating, "by Student's t"
+    assert drift_ppm.scale_by(-1e-6).is_mostly_repeating
