@@ -56,17 +56,18 @@ def test_a_marker_that_is_set_while_the_server_is_away_has_the_instant_of_the_pr
     scripted.running.stop()
     expect(page.locator("body")).to_have_attribute("data-live", "false")
     page.fill("#marker-label", "a stone")
-    pressed_ns = time.time_ns()
+    before_ns = time.time_ns()
     page.click("#marker")
+    after_ns = time.time_ns()
     expect(page.locator("#waiting-markers")).to_contain_text("1 marker not sent yet")
     expect(page.locator("#waiting-markers")).to_contain_text("a stone")
     expect(page.locator("#waiting-markers")).to_contain_text("Closing this page loses it")
     time.sleep(1.5)
     scripted.running.start()
-    expect(page.locator("#waiting-markers")).to_be_hidden(timeout=15_000)
+    expect(page.locator("#waiting-markers")).to_be_hidden()
     [event] = scripted.running.http.get(f"{session.url}/markers").json()["items"]
     assert event["label"] == "a stone"
-    assert abs(event["t_ns"] - pressed_ns) < 1_000_000_000
+    assert before_ns - 1_000_000_000 < event["t_ns"] < after_ns + 1_000_000_000
 
 
 def test_a_deleted_session_can_be_had_back_at_once_or_from_the_trash_until_it_is_emptied(

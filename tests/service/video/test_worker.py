@@ -6,7 +6,6 @@ import io
 import json
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import av
@@ -17,7 +16,7 @@ from devices.errors import FileFormatError, FootTileError, MissingExtraError
 from service.video import worker
 from service.video.worker import check_extra_installed, describe_film
 from tests.service.video.short_film import PICTURES, RATE_HZ, short_film
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.process
 
@@ -117,19 +116,17 @@ def test_a_decoder_that_crashes_is_an_error_that_names_the_film(
 
 
 def test_a_decoder_that_hangs_is_ended(film: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worker, "_CODE", _TASK.format("time.sleep(60)"))
+    monkeypatch.setattr(worker, "_CODE", _TASK.format("time.sleep(600)"))
     monkeypatch.setattr(worker, "_SILENT_S_MAX", 1.0)
     before = set(psutil.Process().children())  # such as the tracker of another test's pool
-    begun_s = time.monotonic()
     with pytest.raises(FileFormatError, match="hung for 1"):
         describe_film(film, "walk.mp4")
-    assert time.monotonic() - begun_s < 30.0
     assert set(psutil.Process().children()) <= before
 
 
 def test_a_decoder_ends_with_the_process_that_waits_for_it(film: Path) -> None:
     begun = film.with_name("begun")
-    hang = _TASK.format(f"os.mkdir({str(begun)!r}), time.sleep(60)")
+    hang = _TASK.format(f"os.mkdir({str(begun)!r}), time.sleep(600)")
     code = (
         "import sys; from pathlib import Path; from service.video import worker\n"
         f"worker._CODE = {hang!r}\n"
@@ -140,7 +137,7 @@ def test_a_decoder_ends_with_the_process_that_waits_for_it(film: Path) -> None:
         children = psutil.Process(process.pid).children()
         process.kill()
     assert len(children) == 1
-    _, alive = psutil.wait_procs(children, timeout=20.0)
+    _, alive = psutil.wait_procs(children, timeout=PATIENCE_S)
     assert alive == []
 
 

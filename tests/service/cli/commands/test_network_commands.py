@@ -9,7 +9,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ import pytest
 import foottile
 from tests.service.cli.outcome import Run
 from tests.tokens import SHARED_BEARER
+from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.process
 
@@ -67,15 +67,13 @@ def start_demo(folder: Path, *options: str, tared: bool = True) -> Demo:
     assert process.stdout is not None
     link = process.stdout.readline().split()[-1]
     demo = Demo(link, folder / "data", process)
-    end = time.monotonic() + 30
-    while tared and not any(node["tare"] for node in demo.get("/nodes").json()["items"]):
-        assert time.monotonic() < end, (folder / "stderr.txt").read_text()
-        time.sleep(0.1)
+    if tared:
+        until(lambda: any(node["tare"] for node in demo.get("/nodes").json()["items"]), every_s=0.1)
     return demo
 
 
 def ended(process: subprocess.Popen[str]) -> int:
-    code = process.wait(30)
+    code = process.wait(PATIENCE_S)
     assert process.stdout is not None
     process.stdout.close()
     return code
@@ -93,10 +91,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Demo]:
 def session(demo: Demo) -> str:
     """Id of a sealed session of about two seconds."""
     started = demo.post("/sessions", {"node": "demo", "name": "=1+1 [b]"}).json()
-    end = time.monotonic() + 30
-    while demo.get(f"/sessions/{started['id']}").json()["frames"] < 300:
-        assert time.monotonic() < end
-        time.sleep(0.1)
+    until(lambda: demo.get(f"/sessions/{started['id']}").json()["frames"] >= 300, every_s=0.1)
     stopped = demo.post(f"/sessions/{started['id']}/stop").json()
     assert stopped["state"] == "sealed"
     return str(stopped["id"])

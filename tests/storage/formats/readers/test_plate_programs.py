@@ -389,9 +389,9 @@ def test_a_header_without_text_names_no_option_that_is_refused(tmp_path: Path) -
 
 
 def test_many_sections_without_plates_are_skipped(tmp_path: Path) -> None:
-    begin_s = time.monotonic()
+    begin_s = time.process_time()  # other processes take none of it
     check(read(tmp_path, NEXUS_MARKERS * 6000 + NEXUS, plate(2)), time_s=STEP / 500.0)
-    assert time.monotonic() - begin_s < 10.0
+    assert time.process_time() - begin_s < 10.0
 
 
 def test_a_part_of_a_recording_and_a_gap_of_frames_are_read_and_said(tmp_path: Path) -> None:
