@@ -189,13 +189,22 @@ def test_what_is_said_of_a_session_can_be_changed(scripted: Scripted, open_page:
     assert found["notes"] == "first line\nsecond"
 
 
+TAPS = """async () => {
+  const record = document.querySelector("#record");
+  record.click();
+  record.click();
+  while (!document.querySelector("#recordings li")) await new Promise(requestAnimationFrame);
+  document.dispatchEvent(new KeyboardEvent("keydown", { key: "r" }));
+}"""
+"""Three presses of one second: sent one by one to a page on a busy machine they may take longer."""
+
+
 def test_a_double_tap_records_once_and_stop_ends_all_recordings_of_the_node(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     with Play(scripted.node):
         page = live(open_page(scripted.url))
-        page.dblclick("#record")
-        page.keyboard.press("r")
+        page.evaluate(TAPS)
         expect(page.locator("#recordings li")).to_have_count(1)
         time.sleep(1.0)  # no double tap any more
         assert len(scripted.running.sessions()) == 1
