@@ -14,7 +14,7 @@ from service.protocol.link import LINK_TIMEOUT_S
 from tests.service.fake_node import Play
 from tests.service.recording import Recording
 from tests.waiting import until
-from tests.web.pages import LIVE, OpenPage, live
+from tests.web.pages import LIVE, OpenPage, complaints, live
 from tests.web.scripted import Scripted
 from tests.web.session_rows import choose, open_menu, row_of
 
@@ -86,6 +86,45 @@ def test_a_page_opened_after_the_node_died_tells_one_story(
         expect(page.locator(LIVE)).to_have_count(1)
         expect(page.locator("#record")).to_be_enabled()
         expect(page.locator("#cannot-record")).to_be_hidden()
+
+
+STALE = """(id) => {
+  const { fontStyle, color } = getComputedStyle(document.getElementById(id));
+  const stale = document.createElement("i");
+  stale.style.color = "var(--stale)";
+  document.body.append(stale);
+  const isStale = fontStyle === "italic" && color === getComputedStyle(stale).color;
+  stale.remove();
+  return isStale;
+}"""
+
+
+def test_counters_latency_and_angle_of_a_node_that_left_look_old(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    opacity = "(one) => Number(getComputedStyle(one).opacity)"
+    with Play(scripted.node):
+        page = live(open_page(scripted.url))
+        nodes = open_page(f"{scripted.url}/nodes")
+        expect(page.locator("#latency")).to_contain_text("ms")
+        expect(nodes.locator('.node[data-live="true"] .node-facts')).to_contain_text("0 lost")
+        assert not any(page.evaluate(STALE, id_) for id_ in ("rate", "lost", "latency"))
+        assert page.locator("#angle").evaluate(opacity) == 1.0
+    scripted.node.leave()
+    expect(page.locator("#frozen")).to_contain_text("Node bench is offline.")
+    expect(page.locator("#rate")).to_have_text("\u2013")
+    expect(page.locator("#latency")).to_have_text("unknown")
+    for id_ in ("rate", "lost", "latency"):
+        expect(page.locator(f"#{id_}")).to_have_attribute("data-stale", "true")
+        assert page.evaluate(STALE, id_), id_
+    assert not page.evaluate(STALE, "age")  # of now
+    assert page.locator("#angle").evaluate(opacity) < 0.6
+    assert page.locator("#range").evaluate(opacity) == 1.0  # a button, which still works
+    facts = nodes.locator(".node-facts dd")
+    expect(facts.filter(has_text="0 lost")).to_have_attribute("data-stale", "true")
+    expect(nodes.locator(".node-facts")).to_contain_text(re.compile("Frames/s *\u2013"))
+    for one in (page, nodes):
+        assert complaints(one) == []
 
 
 def test_a_node_out_of_reach_is_silent_on_the_page_and_then_away(

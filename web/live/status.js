@@ -39,12 +39,13 @@ export class Status {
     const sinceMs = silence(node, received, nowMs, serverNowMs);
     this.isBlank = sinceMs === null;
     const late = this.delayMs !== null && this.delayMs > LATE_MS;
-    const live = sinceMs !== null && sinceMs <= FROZEN_AFTER_MS && !late;
+    const live = !isFrozen(sinceMs) && !late;
     const banner = byId("frozen");
     setData(document.body, "live", String(live));
+    setData(document.body, "linked", String(this.link.open && !this.link.serverSilent));
     banner.hidden = live;
     if (!live) {
-      const frozen = sinceMs === null || sinceMs > FROZEN_AFTER_MS;
+      const frozen = isFrozen(sinceMs);
       setText(byId("frozen-text"), !frozen ? `Display is ${number(this.delayMs / 1000)} s behind`
         : sinceMs === null ? "No data yet" : `No data for ${sinceMs < 90_000 ? `${number(sinceMs / 1000)} s` : roughly(sinceMs / 1000)}`);
       setText(byId("frozen-reason"), frozen ? this.reason(node) : "The network is slower than the frame rate.");
@@ -74,29 +75,36 @@ export class Status {
 
   numbers(node, received, sinceMs) {
     const beat = received.heartbeat ?? {};
-    const rateHz = beat.rate_hz ?? node.rate_hz;
+    const frozen = isFrozen(sinceMs); // counts are those of then
+    const rateHz = frozen ? null : beat.rate_hz ?? node.rate_hz;
     const nominalHz = node.nominal_rate_hz;
     const slow = rateHz !== null && nominalHz && rateHz < SLOW * nominalHz;
     // Above the nominal rate: the nominal rate is wrong, so it is left out.
     const of = rateHz !== null && rateHz <= nominalHz ? ` of ${perSecond(nominalHz)}` : "";
-    write("rate", `${perSecond(rateHz ?? NaN)}${of}`, slow);
+    write("rate", `${perSecond(rateHz ?? NaN)}${of}`, slow, frozen);
     const lost = beat.lost_frames ?? node.lost_frames ?? 0;
     const backlog = beat.backlog_frames ?? node.backlog_frames ?? 0;
     const missed = beat.missed_slots ?? node.missed_slots ?? 0;
-    write("lost", lossCounts(lost, missed), lost > 0 || slow);
+    write("lost", lossCounts(lost, missed), lost > 0 || slow, frozen);
     byId("backlog-box").hidden = backlog < SHOWN_BACKLOG_S * (nominalHz || 400);
-    write("backlog", `${backlog.toLocaleString("en-GB")} frames`, false);
-    write("latency", this.delayMs === null ? "unknown" : `${number(this.delayMs, 0)} ms`, this.delayMs > 250);
+    write("backlog", `${backlog.toLocaleString("en-GB")} frames`, false, frozen);
+    const delayMs = frozen ? null : this.delayMs;
+    write("latency", delayMs === null ? "unknown" : `${number(delayMs, 0)} ms`, delayMs > 250, frozen);
     const ageS = sinceMs === null ? null : (sinceMs + (this.delayMs ?? 0)) / 1000;
     const ago = ageS !== null && ageS < 10 ? `${number(ageS, 2)} s ago` : `${roughly(ageS ?? 0)} ago`;
     write("age", ageS === null ? "none" : ago, ageS === null || ageS > 1);
   }
 }
 
-function write(id, text, bad) {
+/** Return true if no frames come. @param {number | null} sinceMs */
+const isFrozen = (sinceMs) => sinceMs === null || sinceMs > FROZEN_AFTER_MS;
+
+/** Write a value; `stale`: it is old or unknown. */
+function write(id, text, bad, stale = false) {
   const element = byId(id);
   setText(element, text);
   setData(element, "bad", String(Boolean(bad)));
+  setData(element, "stale", String(stale));
 }
 
 /**

@@ -136,7 +136,7 @@ export class Card {
     setText(this.state, text);
     if (this.state.className !== `state ${cls}`) this.state.className = `state ${cls}`;
 
-    this.writeFacts(node);
+    this.writeFacts(node, live);
     this.replacement.draw(node);
     this.writeNotes(this.warnings.list(node, frame, nowMs, serverNowMs));
     this.writeSession();
@@ -150,13 +150,14 @@ export class Card {
     return [sinceMs === null ? "no data yet" : `no data for ${roughly(sinceMs / 1000)}`, "away"];
   }
 
-  writeFacts(node) {
+  writeFacts(node, live) {
     const heartbeat = this.heartbeat ?? {};
-    const fact = (title, text, bad) => {
+    const fact = (title, text, bad, stale = !live) => {
       setText(this.facts[title].value, text);
       setData(this.facts[title].value, "bad", String(bad));
+      setData(this.facts[title].value, "stale", String(stale));
     };
-    const rateHz = node.connected ? heartbeat.rate_hz ?? node.rate_hz : null;
+    const rateHz = live ? heartbeat.rate_hz ?? node.rate_hz : null;
     const of = rateHz !== null && rateHz <= node.nominal_rate_hz ? ` of ${perSecond(node.nominal_rate_hz)}` : "";
     const slow = rateHz !== null && rateHz < SLOW * node.nominal_rate_hz;
     fact("Frames/s", `${perSecond(rateHz ?? NaN)}${of}`, slow);
@@ -166,7 +167,7 @@ export class Card {
     const backlog = heartbeat.backlog_frames ?? node.backlog_frames ?? 0;
     this.facts.Backlog.row.hidden = backlog < SHOWN_BACKLOG_S * (node.nominal_rate_hz || 400);
     this.facts.Tare.row.hidden = !node.tare || node.tare.undone;
-    fact("Tare", node.tare ? localTime(new Date(node.tare.t_ns / 1e6)) : "", false);
+    fact("Tare", node.tare ? localTime(new Date(node.tare.t_ns / 1e6)) : "", false, false);
     const machine = node.connected ? vitalsText(node.vitals ?? {}) : "";
     this.facts.Machine.row.hidden = !machine;
     fact("Machine", machine, false);
