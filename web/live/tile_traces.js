@@ -3,7 +3,7 @@
 import { coloursOf, fit, whenColoursChange } from "../common/axes.js";
 import { shadeOf, shadesOf } from "../common/heat.js";
 import { byId, number, printable } from "../common/text.js";
-import { runs } from "./points.js";
+import { fillBand, runs } from "./points.js";
 import { Strip } from "./strip.js";
 import { unitOf } from "./tile.js";
 
@@ -115,12 +115,7 @@ export class TileTraces {
     context.fillRect(LEFT_PX, top + rowPx - 1, 1e4, 1);
     context.fillRect(LEFT_PX, Math.round(y(0)), 1e4, 1);
     context.fillStyle = colours.band;
-    for (const run of runs(points, (point) => of(point, "max_"))) {
-      context.beginPath();
-      run.forEach((point) => context.lineTo(x(point.timeS), y(of(point, "max_"))));
-      [...run].reverse().forEach((point) => context.lineTo(x(point.timeS), y(of(point, "min_"))));
-      context.fill();
-    }
+    for (const run of runs(points, (point) => of(point, "max_"))) fillBand(context, run, x, y, (point) => of(point, "min_"), (point) => of(point, "max_"));
     context.strokeStyle = colours.fill;
     context.lineWidth = 1.5;
     // History has min and max, not the latest value.
@@ -146,7 +141,7 @@ export class TileTraces {
     const key = [this.restarts, shades.map(({ fill }) => fill), ...rows.map(({ tile, unit, most }) => `${tile.serial} ${most} ${unit}`)].join();
     strip.draw(points, { endS, windowS, widthPx: width, heightPx: height, key }, (context, k, x) => {
       const to = x(points[k].timeS);
-      const from = points[k].gap || !k ? to - 2 : x(points[k - 1].timeS);
+      const from = Math.min(to - 2, x(points[k].fromS));
       for (const { of, top, most } of rows) {
         const value = of(points[k], "max_");
         if (value === null) continue; // unknown
@@ -158,7 +153,7 @@ export class TileTraces {
   }
 }
 
-/** @typedef {{timeS: number, tiles: Record<string, (number | null)[]> | null, gap?: boolean}} TilePoint */
+/** @typedef {{fromS: number, timeS: number, tiles: Record<string, (number | null)[]> | null, gap?: boolean}} TilePoint */
 
 /** Return the greatest values of the visible points, in the form of a frame. @param {TilePoint[]} points */
 function greatestOf(points) {

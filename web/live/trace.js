@@ -2,7 +2,7 @@
 
 import { coloursOf, whenColoursChange } from "../common/axes.js";
 import { byId, setData } from "../common/text.js";
-import { Points, runs } from "./points.js";
+import { fillBand, Points, runs } from "./points.js";
 import { TraceAxes } from "./trace_axes.js";
 
 const WINDOWS_S = [5, 10, 30, 60];
@@ -124,13 +124,7 @@ export class Trace {
     context.clip();
     // Band alone: shows a peak even if the latest frame of its span has no force.
     context.fillStyle = colours.band;
-    for (const run of runs(points, (point) => point.high)) {
-      context.beginPath();
-      run.forEach((point) => context.lineTo(x(point.timeS), y(point.high)));
-      [...run].reverse().forEach((point) => context.lineTo(x(point.timeS), y(point.low)));
-      context.fill();
-      if (run.length === 1) context.fillRect(x(run[0].timeS) - 1, y(run[0].high), 2, Math.max(1, y(run[0].low) - y(run[0].high)));
-    }
+    for (const run of runs(points, (point) => point.high)) fillBand(context, run, x, y, (point) => point.low, (point) => point.high);
     context.strokeStyle = colours.line;
     context.lineWidth = 2;
     context.lineJoin = "round";

@@ -2,7 +2,7 @@
 
 import { coloursOf, crisp, fit } from "../common/axes.js";
 import { History } from "../live/history.js";
-import { Points, runs } from "../live/points.js";
+import { fillBand, Points, runs } from "../live/points.js";
 import { autoScale } from "../live/range.js";
 
 const WINDOW_S = 10;
@@ -47,7 +47,7 @@ export class SmallTrace {
     this.top.update(points.flatMap(({ high, bound }) => [high, bound]), nowMs);
     const top = this.top.value;
     const box = { left: LEFT_PX, right: width - RIGHT_PX, top: TOP_PX, bottom: height - BOTTOM_PX };
-    const x = ({ timeS }) => box.right - ((endS - timeS) / WINDOW_S) * (box.right - box.left);
+    const x = (timeS) => box.right - ((endS - timeS) / WINDOW_S) * (box.right - box.left);
     const y = (n) => Math.min(height, box.bottom - (n / top) * (box.bottom - box.top));
     context.font = "600 12px system-ui, sans-serif";
     context.textAlign = "right";
@@ -62,12 +62,7 @@ export class SmallTrace {
       context.fillText(n ? `${n} N` : "0", box.left - 5, Math.min(y(n), height - 7));
     }
     context.fillStyle = colours.band;
-    for (const run of runs(points, (point) => point.high)) {
-      context.beginPath();
-      for (const point of run) context.lineTo(x(point), y(point.high));
-      for (const point of [...run].reverse()) context.lineTo(x(point), y(point.low));
-      context.fill();
-    }
+    for (const run of runs(points, (point) => point.high)) fillBand(context, run, x, y, (point) => point.low, (point) => point.high);
     context.lineWidth = 1.5;
     context.lineJoin = "round";
     // Dashed: lower bound.
@@ -78,7 +73,7 @@ export class SmallTrace {
       context.setLineDash(dashes);
       for (const run of runs(points, valueOf)) {
         context.beginPath();
-        for (const point of run) context.lineTo(x(point), y(valueOf(point)));
+        for (const point of run) context.lineTo(x(point.timeS), y(valueOf(point)));
         context.stroke();
       }
     }
