@@ -526,3 +526,96 @@ def test_a_picture_is_the_nearest_one_and_a_pair_is_as_sure_as_a_person(ask: Ask
     assert [text.replace("\xa0", " ").removesuffix(" (95 %)") for text in texts] == [
         *("\u00b1 1.2 ms", "\u00b1 45 ms", "\u00b1 1.3 s", "\u00b1 0.050 ms"),
     ]
+
+
+BINS = """
+  const binsOf = ({ times, values, half, framesInBin = 1, frames = 1, lasts = times }) => {
+    const all = (value) => times.map(() => value);
+    const unknown = ["grf_lower_bound_n_max", ...["x", "y"].flatMap((axis) =>
+      ["min", "max"].map((end) => `cop_${axis}_m_${end}`))];
+    const columns = {
+      ...Object.fromEntries(unknown.map((name) => [name, all(null)])),
+      t_first_s: times, t_last_s: lasts, part: all(0), missing: all(0), frames: all(frames),
+      grf_n_min: values, grf_low_n_min: values.map((one) => one - half),
+      grf_n_max: values, grf_high_n_max: values.map((one) => one + half),
+    };
+    return new Bins({
+      frames_in_bin: framesInBin, duration_s: 9, serials: [], begin_t_ns: 0, columns,
+    }, { from: 0, to: 9 });
+  };
+"""
+
+
+@pytest.mark.parametrize(
+    ("values", "half_n", "low", "high"),
+    [
+        ([0.0, 0.5, -0.3], 16.0, -0.8, 1.0),  # noise: a newton keeps half of the axis
+        ([0.0, 60.0], 16.0, -16.0, 76.0),  # narrower than the force: all of it
+        ([40.0, 40.1], 2.0, 0.0, 42.1),
+        ([0.0, 8.0], 16.0, -4.0, 12.0),
+    ],
+)
+def test_the_axis_is_that_of_the_force_however_wide_its_interval_is(
+    ask: Ask, values: list[float], half_n: float, low: float, high: float
+) -> None:
+    found = ask(
+        "session/bins session/scales session/panels",
+        """({ Bins, panelsOf, scalesOf }, given) => {"""
+        + BINS
+        + """
+          const bins = binsOf({ times: given.values.map((_, i) => i), ...given });
+          const panels = panelsOf(bins, false);
+          const plots = { panels, best: () => bins, stances: [], scaled: () => 180, beside: null };
+          return scalesOf(plots, { from: 0, to: 9 }).get("grf");
+        }""",
+        {"values": values, "half": half_n},
+    )
+    room = 0.06 * (high - low)
+    assert found["low"] == pytest.approx(low - room * (low != 0))
+    assert found["high"] == pytest.approx(high + room)
+
+
+def test_a_pause_without_frames_is_a_gap_and_the_pace_of_a_slow_node_is_none(ask: Ask) -> None:
+    function = (
+        "({ Bins }, given) => {"
+        + BINS
+        + "const bins = binsOf(given);"
+        + "return given.times.map((_, i) => [bins.isAdjacent(i), bins.isMostlyGap(i)]); }"
+    )
+    every_s = 0.004  # half of the slots of 500 a second
+    times = [i * every_s for i in range(10)]
+    after = [0.020 + i * every_s for i in range(10, 20)]
+    found = ask("session/bins", function, {"times": times + after, "values": [0] * 20, "half": 1})
+    assert [adjacent for adjacent, _ in found] == [False] + 9 * [True] + [False] + 9 * [True]
+    # Of a merged bin only its length tells that it has a gap in it.
+    firsts = [0.4 * i for i in range(5)] + [5.0]
+    lasts = [first + 0.396 for first in firsts[:4]] + [4.996, 5.396]
+    merged = {"times": firsts, "lasts": lasts, "values": [0] * 6, "half": 1}
+    found = ask("session/bins", function, {**merged, "frames": 100, "framesInBin": 128})
+    assert [mostly for _, mostly in found] == 4 * [False] + [True, False]
+
+
+POINTS = """({ Points }, { spans, rateHz }) => {
+  const points = new Points();
+  points.periodS = 1 / rateHz;
+  let seq = -1;
+  for (const [n, timeS] of spans) {
+    points.add({ seq_first: seq + 1, seq: seq + n, n, t_ns: timeS * 1e9, grf_n: 1 }, timeS * 1e3);
+    seq += n;
+  }
+  return points.all.map(({ gap, fromS }) => [gap, fromS]);
+}"""
+
+
+def test_a_live_gap_is_one_of_time_too_and_a_band_begins_with_its_own_frames(ask: Ask) -> None:
+    spans = [[16, 100 + 0.032 * i] for i in range(1, 9)]
+    end_s = spans[-1][1]
+    spans += [[16, end_s + 0.112], [16, end_s + 0.144]]  # 80 ms were not sampled before the first
+    found = ask("live/points", POINTS, {"spans": spans, "rateHz": 500})
+    assert [gap for gap, _ in found] == [True] + 7 * [False] + [True, False]
+    assert found[-2][1] == pytest.approx(end_s + 0.112 - 15 * 0.002)
+    assert found[-1][1] == pytest.approx(end_s + 0.112)
+    # Once a second, of a node that samples each third slot: that is its pace.
+    slow = [[167, 100.0 + i] for i in range(8)]
+    found = ask("live/points", POINTS, {"spans": slow, "rateHz": 500})
+    assert [gap for gap, _ in found][2:] == 6 * [False]

@@ -6,14 +6,15 @@ import re
 
 import numpy as np
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import Route, expect
 
 from storage.formats.writers.registry import FORMATS
+from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
 from tests.service.running import Running
 from tests.waiting import until
-from tests.web.pages import OpenPage, box_of
-from tests.web.session_page import grf, recorded_walk, seen, settled, summary, url_of
+from tests.web.pages import OpenPage, blue_px, box_of, complaints_at
+from tests.web.session_page import grf, left_px, recorded_walk, seen, settled, summary, url_of
 
 pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
@@ -235,3 +236,61 @@ def test_a_marker_is_set_at_the_cursor_and_what_is_in_view_can_be_downloaded(
     with page.expect_download() as picture:
         page.click("#picture")
     assert picture.value.path().read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_gap_is_empty_in_lines_and_bands_at_any_zoom(
+    server: Running, open_page: OpenPage
+) -> None:
+    node = FakeNode(server, "late")
+    node.connect()
+    node.tared()
+    session = node.record(name="late")
+    node.send(512, [20.0, 60.0], alive=True)
+    node.next_t_mono_ns += 1_000_000_000  # no frame is sampled, none is lost
+    node.send(512, [20.0, 60.0], alive=True)
+    node.finish(session)
+    node.close()
+    since_s, _ = grf(session)
+    gap = int(np.argmax(np.diff(since_s)))
+    begin_s, end_s = since_s[gap], since_s[gap + 1]
+    assert end_s - begin_s == pytest.approx(1.002)
+    for query in ("", f"?from={begin_s - 0.02}&to={end_s + 0.02}"):
+        for width in (1366, 390, 280):  # frame by frame, and merged
+            page = open_page(url_of(session, query), width)
+            from_s, to_s = seen(page)
+            left = left_px(page)
+            full = float(page.locator("#plots").evaluate("(plots) => plots.clientWidth"))
+
+            def share(time_s: float, left: float = left, full: float = full) -> float:
+                return (left + (time_s - from_s) / (to_s - from_s) * (full - left - 12)) / full  # noqa: B023
+
+            canvas, margin_s = "#plots-canvas", 0.05 * (end_s - begin_s)
+            assert blue_px(page, canvas, share(begin_s + margin_s), share(end_s - margin_s)) == 0
+            assert blue_px(page, canvas, share(from_s), share(begin_s)) > 20
+            assert blue_px(page, canvas, share(end_s), share(to_s)) > 20
+
+
+def test_an_interval_that_reaches_beyond_the_axis_says_so(
+    walk: Recording, open_page: OpenPage
+) -> None:
+    def widen(route: Route) -> None:
+        answer = route.fetch()
+        body = answer.json()
+        columns = body["columns"]
+        for end, of, by_n in (("low_n_min", "min", -16.0), ("high_n_max", "max", 16.0)):
+            values = columns[f"grf_n_{of}"]
+            columns[f"grf_{end}"] = [None if one is None else one + by_n for one in values]
+        route.fulfill(response=answer, json=body)
+
+    query = "?from=0.05&to=0.3"  # unloaded
+    page = open_page(url_of(walk, query))
+    expect(settled(page)).to_have_attribute("data-clipped", "")
+    sign = page.locator('#legend [data-kind="clipped"]')
+    expect(sign).to_have_count(0)
+    answers = {"**/timeseries?**": widen}
+    page = open_page(url_of(walk, query), answers=answers, service_workers="block")
+    expect(settled(page)).to_have_attribute("data-clipped", "grf")
+    expect(page.locator('#legend [data-kind="clipped"]')).to_have_text(
+        "interval reaches beyond the axis"
+    )
+    assert complaints_at(page) == []

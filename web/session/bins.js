@@ -13,7 +13,7 @@ export function lowerBound(list, value) {
   return low;
 }
 
-const GAP_PERIODS = 2.5; // more than one slot not sampled
+const GAP_STEPS = 3.5; // a longer step is a gap, as in a comparison's series
 
 /** Min and max per interval. */
 export class Bins {
@@ -35,9 +35,18 @@ export class Bins {
     this.provisional = Boolean(overview.provisional); // not sealed
     this.catching_up = Boolean(overview.catching_up); // estimation is not complete
     this.covers = covers;
-    /** @type {number | null} */
-    this.gapS = null; // longest time between frames without a gap; computed when it is needed
     this.estimated = "grf_n_min" in overview.columns;
+    /** @type {number | null} */
+    this.step = null;
+  }
+
+  /** Usual time from one frame to the next, s: the median between bins; infinite: unknown. */
+  get stepS() {
+    if (this.step !== null) return this.step;
+    const steps = [];
+    for (let i = 1; i < this.count; i++) if (this.columns.part[i] === this.columns.part[i - 1]) steps.push(this.first[i] - this.last[i - 1]);
+    this.step = steps.sort((a, b) => a - b)[steps.length >> 1] ?? Infinity;
+    return this.step;
   }
 
   /** Sampling rate, lost frames included; null: too few frames. */
@@ -84,9 +93,18 @@ export class Bins {
 
   /** Return true if no frame is missing between a bin and the previous one: lost, or not sampled. */
   isAdjacent(i) {
-    this.gapS ??= GAP_PERIODS / (this.rateHz ?? GAP_PERIODS);
     return i > 0 && this.columns.part[i] === this.columns.part[i - 1] && this.columns.missing[i] === 0
-      && this.first[i] - this.last[i - 1] <= this.gapS;
+      && this.first[i] - this.last[i - 1] <= GAP_STEPS * this.stepS;
+  }
+
+  /** Return true if an instant is no gap away from the frames of a bin. */
+  isAt(i, timeS) {
+    return timeS >= this.first[i] - GAP_STEPS * this.stepS && timeS <= this.edge(i) + GAP_STEPS * this.stepS;
+  }
+
+  /** Return true if more than half of a bin's time is without frames: where in it is not known. */
+  isMostlyGap(i) {
+    return this.last[i] - this.first[i] > 2 * this.columns.frames[i] * this.stepS;
   }
 
   /** Return min of one column, max of another, and the index of the max; null: no values. */

@@ -8,6 +8,7 @@ export function drawLegend(plots) {
   const items = [];
   if (keys.includes("grf")) items.push(["interval", "95 % interval of GRF"], ["contact", "contact"]);
   if (keys.some((key) => key.startsWith("cop"))) items.push(["cop-interval", "95 % interval of COP"]);
+  if (plots.clipped.size) items.push(["clipped", "interval reaches beyond the axis"]);
   if (plots.stances.length) items.push(["stance", "stance with number; ▾ peak"]);
   if (plots.beside) items.push(["own", plots.name], ["beside", plots.beside.title]);
   items.push(...plots.shownKinds.map(({ key, label }) => [key, key === "lost" && plots.whole.provisional ? "frames lost or pending" : label]));

@@ -13,6 +13,7 @@ const TITLE_PX = 19; // above a plot; tiles have it inside
  * @property {"series" | "heat"} kind
  * @property {[string, string]} [columns] min and max
  * @property {[string, string]} [band] interval around it
+ * @property {number} [least] range of values, in the unit shown, below which differences are noise; of a panel with a band
  * @property {string} [note] after the title; a phone has room for three words
  * @property {string} [bound] column of the lower bound
  * @property {string} [group] panels with a common scale
@@ -38,7 +39,7 @@ export function panelsOf(bins, asHeat, beside = null) {
   if (bins.estimated) {
     panels.push({
       key: "grf", title: "Ground reaction force", unit: "N", kind: "series", columns: ["grf_n_min", "grf_n_max"],
-      band: ["grf_low_n_min", "grf_high_n_max"], bound: "grf_lower_bound_n_max", force: true, zero: true, height: FORCE_PX, head: TITLE_PX,
+      band: ["grf_low_n_min", "grf_high_n_max"], least: 1, bound: "grf_lower_bound_n_max", force: true, zero: true, height: FORCE_PX, head: TITLE_PX,
     });
   }
   if (bins.estimated && beside?.columns.difference) {
@@ -75,7 +76,7 @@ export function panelsOf(bins, asHeat, beside = null) {
     if (!bins.estimated || !isVariable(bins, `cop_${axis}_m`)) continue;
     panels.push({
       key: `cop-${axis}`, title, unit: "mm", factor: 1e3, kind: "series",
-      columns: [`cop_${axis}_m_min`, `cop_${axis}_m_max`], band: [`cop_${axis}_low_m_min`, `cop_${axis}_high_m_max`],
+      columns: [`cop_${axis}_m_min`, `cop_${axis}_m_max`], band: [`cop_${axis}_low_m_min`, `cop_${axis}_high_m_max`], least: 2,
       height: PLACE_PX, head: TITLE_PX, ...unmeasured(bins, axis === "x" ? "y" : "x"),
     });
   }

@@ -7,7 +7,7 @@ import { HEAD_PX, drawMarkers, drawPeaks, drawStances, drawTime } from "./overla
 import { drawTiles } from "./heat.js";
 import { panelsOf } from "./panels.js";
 import { scalesOf } from "./scales.js";
-import { drawBand, drawBound, drawSeries } from "./series.js";
+import { drawBand, drawBound, drawClipped, drawSeries } from "./series.js";
 
 const AXIS_PX = 26;
 const FOOT_PX = 6;
@@ -41,6 +41,7 @@ export class Plots {
     this.name = ""; // of the session, with an overlay
     this.asHeat = null;
     this.heat = null; // range of the colours
+    this.clipped = new Set();
     this.peaks = []; // boxes of the peaks' signs and values
     this.flags = []; // positions of the markers' flags
     this.panels = [];
@@ -114,6 +115,7 @@ export class Plots {
     const right = this.left + this.plotWidth;
     drawStances(this, context, view, x, bottom, current);
     const scales = scalesOf(this, view);
+    this.clipped = new Set(); // panels with a band that is clipped
     let top = HEAD_PX;
     this.drawn = this.panels.map((panel) => {
       const box = { left: this.left, right, top: top + panel.head, bottom: top + panel.head + this.scaled(panel) };
@@ -126,6 +128,7 @@ export class Plots {
     drawTime(this, context, view, x, bottom);
     drawMarkers(this, context, view, x, bottom);
     setData(this.box, "framesInBin", String(this.best(view).framesInBin));
+    setData(this.box, "clipped", [...this.clipped].join(" "));
     setData(this.box, "kinds", this.shownKinds.map(({ key }) => key).join(" "));
   }
 
@@ -150,6 +153,7 @@ export class Plots {
       this.drawLayers(context, box, layers, x, (bins, begin, end) => {
         drawSeries(context, bins, begin, end, x, y, panel.columns, isCop ? colours.cop : colours.series);
         if (panel.bound) drawBound(context, bins, begin, end, x, y, panel.bound, colours["warn-line"]);
+        if (panel.band && drawClipped(context, bins, begin, end, x, y, panel.band, box, isCop ? colours.cop : colours.series)) this.clipped.add(panel.key);
       });
     }
     this.drawTitle(context, panel, box);
@@ -296,7 +300,7 @@ export class Plots {
     for (const peak of this.peaks) {
       if (peak.left <= lineX && lineX <= peak.right) context.clearRect(lineX - 2, peak.top, 4, peak.bottom - peak.top);
     }
-    if (i < 0) return;
+    if (i < 0 || !bins.isAt(i, timeS)) return; // in a gap nothing is known
     for (const { panel, y } of this.drawn) {
       const value = y && bins.columns[panel.columns[1]]?.[i];
       if (value === null || value === undefined) continue;

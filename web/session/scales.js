@@ -1,11 +1,13 @@
 // Axis ranges of the plots. Pure.
 
 const PEAK_PX = 24; // above a peak, for its triangle and value
+const BAND_SHARE = 0.5; // of the range of the values: so far a band extends the axis on each side
 
 /** @typedef {{low: number, high: number, empty?: boolean}} Scale */
 
 /**
- * Return the range of each panel in view; panels of a group share one.
+ * Return the range of each panel in view; panels of a group share one. The values make it: a band that is wider
+ * than they are extends it only so far that they keep half of it.
  * @param {import("./plots.js").Plots} plots @param {import("./view.js").View} view
  * @returns {Map<string, Scale>} by group, or key
  */
@@ -18,14 +20,19 @@ export function scalesOf(plots, view) {
     const factor = panel.factor ?? 1;
     const key = panel.group ?? panel.key;
     const scale = scales.get(key) ?? { low: panel.zero ? 0 : Infinity, high: panel.zero ? 0 : -Infinity };
-    const own = panel.besideOnly ? [] : [panel.columns, panel.band].filter(Boolean);
-    const all = own.map(([low, high]) => bins.extremes(low, high, begin, end));
-    for (const found of [...all, plots.beside?.extremes(panel.key, view)]) {
+    const own = panel.besideOnly ? null : bins.extremes(...panel.columns, begin, end);
+    for (const found of [own, plots.beside?.extremes(panel.key, view)]) {
       if (!found) continue;
       scale.low = Math.min(scale.low, found.low * factor);
       scale.high = Math.max(scale.high, found.high * factor);
     }
     if (panel.bound) scale.high = Math.max(scale.high, bins.extremes(panel.bound, panel.bound, begin, end)?.high ?? 0);
+    const band = panel.band && bins.extremes(...panel.band, begin, end);
+    if (band) {
+      const room = BAND_SHARE * Math.max(scale.high - scale.low, panel.least);
+      scale.low = Math.max(scale.low - room, Math.min(scale.low, band.low * factor));
+      scale.high = Math.min(scale.high + room, Math.max(scale.high, band.high * factor));
+    }
     scales.set(key, scale);
   }
   for (const scale of scales.values()) {

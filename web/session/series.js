@@ -1,14 +1,16 @@
 // Series over time: min-max columns, single frames, or colours.
 
+const PALE = 0.25; // a bin that is mostly gap
+
 /**
- * Yield index ranges [begin, end) of adjacent bins with values.
+ * Yield index ranges [begin, end) of adjacent bins with values; a bin that is mostly gap is by itself.
  * @returns {Generator<[number, number]>}
  */
 function* runs(bins, begin, end, known) {
   let start = -1;
   for (let i = begin; i < end; i++) {
     const here = known(i);
-    if (start >= 0 && (!here || !bins.isAdjacent(i))) {
+    if (start >= 0 && (!here || !bins.isAdjacent(i) || bins.isMostlyGap(i) || bins.isMostlyGap(i - 1))) {
       yield [start, i];
       start = -1;
     }
@@ -32,14 +34,55 @@ function outline(context, bins, [start, stop], x, y, lows, highs) {
   context.closePath();
 }
 
+/** Fill the outline of a run, pale where it is mostly gap: its values are somewhere in it. */
+function fillOutline(context, bins, run, x, y, lows, highs) {
+  const { globalAlpha } = context;
+  if (bins.isMostlyGap(run[0])) context.globalAlpha *= PALE;
+  outline(context, bins, run, x, y, lows, highs);
+  context.fill();
+  context.globalAlpha = globalAlpha;
+}
+
 /** Draw a band between two columns, such as an interval. */
 export function drawBand(context, bins, begin, end, x, y, [lowName, highName], colour) {
   const [lows, highs] = [bins.columns[lowName], bins.columns[highName]];
   context.fillStyle = colour;
   for (const run of runs(bins, begin, end, (i) => lows[i] !== null && highs[i] !== null)) {
-    outline(context, bins, run, x, y, lows, highs);
-    context.fill();
+    fillOutline(context, bins, run, x, y, lows, highs);
   }
+}
+
+const SIGN_PX = 10; // from sign to sign
+
+/**
+ * Draw signs at the edges of a plot where a band reaches beyond them; return true if there are some.
+ * @param {{left: number, right: number, top: number, bottom: number}} box
+ */
+export function drawClipped(context, bins, begin, end, x, y, [lowName, highName], box, colour) {
+  let some = false;
+  context.strokeStyle = colour;
+  context.lineWidth = 1.5;
+  context.beginPath();
+  for (const [name, tip, down, isBeyond] of /** @type {[string, number, number, (px: number) => boolean][]} */ ([
+    [highName, box.top, 3.5, (px) => px < box.top - 1], [lowName, box.bottom, -3.5, (px) => px > box.bottom + 1],
+  ])) {
+    let free = box.left + 3;
+    for (let i = begin; i < end; i++) {
+      const value = bins.columns[name][i];
+      if (value === null || !isBeyond(y(value))) continue;
+      // Over the whole width of a bin; at a single frame.
+      const to = Math.min(box.right - 3, x(bins.framesInBin > 1 ? bins.edge(i) : bins.first[i]));
+      for (let at = Math.max(free, x(bins.first[i])); at <= to; at += SIGN_PX) {
+        context.moveTo(at - 3, tip + down);
+        context.lineTo(at, tip);
+        context.lineTo(at + 3, tip + down);
+        free = at + SIGN_PX;
+        some = true;
+      }
+    }
+  }
+  context.stroke();
+  return some;
 }
 
 /** Draw a quantity: min-max columns keep every peak; single frames as dots and lines. */
@@ -52,9 +95,8 @@ export function drawSeries(context, bins, begin, end, x, y, [lowName, highName],
   for (const [start, stop] of runs(bins, begin, end, (i) => lows[i] !== null && highs[i] !== null)) {
     if (bins.framesInBin > 1) {
       context.lineWidth = widthPx - 0.5; // beside the filled area
-      outline(context, bins, [start, stop], x, y, lows, highs);
-      context.fill();
-      context.stroke();
+      fillOutline(context, bins, [start, stop], x, y, lows, highs);
+      if (!bins.isMostlyGap(start)) context.stroke();
       continue;
     }
     context.lineWidth = widthPx;
