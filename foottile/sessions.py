@@ -285,9 +285,22 @@ class RemoteSession:
 
     @property
     def complete(self) -> bool | str:
-        """Completeness. True: all frames stored; False: undecided; "lossy": frames are lost."""
+        """Completeness. True: all sampled frames stored; False: undecided; "lossy": some are lost.
+
+        A node that was late leaves frames out: `not_sampled_share`.
+        """
         complete: bool | str = self.metadata["complete"]
         return complete
+
+    @property
+    def not_sampled_frames(self) -> int:
+        """Number of frames that the node did not sample, because it was late."""
+        return int(self.metadata["missed_slots"])
+
+    @property
+    def not_sampled_share(self) -> float:
+        """Their share of all slots of the session, 0 to 1."""
+        return float(self.metadata["not_sampled_share"])
 
     @property
     def frame_count(self) -> int:

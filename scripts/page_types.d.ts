@@ -542,6 +542,7 @@ type SessionProgress = {
   pending_reason: "frames" | "end" | null;
   lost: Record<string, number>;
   missed_slots: number;
+  not_sampled_share: number;
   duration_s: number;
 };
 
@@ -556,6 +557,7 @@ type SessionView = {
   pending_reason: "frames" | "end" | null;
   lost: Record<string, number>;
   missed_slots: number;
+  not_sampled_share: number;
   duration_s: number;
   id: string;
   name: string;
@@ -756,6 +758,7 @@ type TrialView = {
   state: "open" | "skipped" | "recording" | "pending" | "complete" | "lossy";
   recordings: number;
   sessions: Array<string>;
+  not_sampled_share: number;
 };
 
 type TrialsChanged = {

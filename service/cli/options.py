@@ -227,6 +227,13 @@ def remark(message: str) -> None:
     )
 
 
+def format_not_sampled(share: float) -> str:
+    """Return the share of slots that were not sampled, as the pages do; empty without any."""
+    if not share:
+        return ""
+    return f", {'<1' if share < 0.01 else round(100 * share)} % not sampled"
+
+
 def exit_incomplete_for(problems: Collection[str]) -> None:
     """Print each problem on stderr, and exit with code 3 if there is one."""
     for problem in problems:

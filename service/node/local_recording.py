@@ -122,19 +122,19 @@ class LocalRecording:
         self._update_retention()
         self._save(session)
 
-    def stop_and_seal(self) -> tuple[str | None, bool]:
-        """Seal the session; return its id (None without a session), and whether it is lossy.
+    def stop_and_seal(self) -> Session | None:
+        """Seal the session and return it; None: there is none.
 
         Raises:
             FootTileError: it cannot be sealed; all files stay, for `foottile recover`.
         """
         session, self._session = self._session, None
         if session is None:
-            return None, False
+            return None
         sealed = self._seal(apply_event(session, Stop(), self._make_facts()).session)
         self._update_retention()
         self.seal_earlier_sessions()
-        return sealed.id, sealed.ledger is None or not sealed.ledger.complete
+        return sealed
 
     def seal_earlier_sessions(self) -> None:
         """Seal sessions of earlier runs; report failures and leave these sessions."""

@@ -93,12 +93,14 @@ class NodeOutcome:
         lost_frames: frames of sessions that are on no disk of node or server.
         recorded_session_id: id of the local session; None: no recording, or not sealed.
         is_lossy: True if that session is not complete.
+        not_sampled_share: share of its slots in which no frame was sampled, 0 to 1.
     """
 
     undelivered_frames: int = 0
     lost_frames: int = 0
     recorded_session_id: str | None = None
     is_lossy: bool = False
+    not_sampled_share: float = 0.0
 
 
 async def run_node(
@@ -416,7 +418,8 @@ class RunningNode:
             self._recording.seal_earlier_sessions()
 
     def _make_outcome(self) -> NodeOutcome:
-        recorded, is_lossy = self._recording.stop_and_seal()
+        recorded = self._recording.stop_and_seal()
+        ledger = None if recorded is None else recorded.ledger
         lost = 0
         for stream in self._journal.streams:
             wanted = self._journal.retention_requests.node_session_or_server_numbers_of(
@@ -430,8 +433,9 @@ class RunningNode:
             if self._options.server_url is not None
             else 0,
             lost_frames=lost,
-            recorded_session_id=recorded,
-            is_lossy=is_lossy,
+            recorded_session_id=None if recorded is None else recorded.id,
+            is_lossy=recorded is not None and (ledger is None or not ledger.complete),
+            not_sampled_share=0.0 if ledger is None else ledger.not_sampled_share,
         )
 
 

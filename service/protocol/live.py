@@ -203,8 +203,9 @@ class SessionProgress(View):
     )
     lost: dict[str, int] = Field(description="Lost frames, by reason.", examples=[{"evicted": 12}])
     missed_slots: int = Field(
-        description="Slots that the node did not sample because it was late: no frame exists."
+        description="Frames not sampled: slots that the node left out because it was late."
     )
+    not_sampled_share: float = Field(description="Their share of all slots, 0 to 1.")
     duration_s: float
 
 
@@ -218,7 +219,7 @@ class SessionView(SessionProgress):
         description="pending: waits for the node (`pending_reason`), and completes by itself."
     )
     complete: bool | Literal["lossy"] = Field(
-        description="true: it has every frame; 'lossy': some frames are lost."
+        description="true: it has every frame that was sampled; 'lossy': some are lost."
     )
     started_t_ns: int = Field(description="Server's UTC.")
     stopped_t_ns: int | None
@@ -263,6 +264,7 @@ class TrialView(View):
     )
     recordings: int = Field(description="Number of its recordings.")
     sessions: list[str] = Field(description="Ids of the sessions of its latest recording.")
+    not_sampled_share: float = Field(description="Greatest share of them, of slots not sampled.")
 
 
 class TrialsView(View):

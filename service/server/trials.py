@@ -304,6 +304,7 @@ class TrialRecorder:
 
     def _make_trial_view(self, i: int, row: _StoredTrial, sessions: list[Session]) -> TrialView:
         states = {session.state for session in sessions}
+        ledgers = [self._recorder.compute_ledger(session) for session in sessions]
         state: TrialState
         if not sessions:
             state = "skipped" if i < self._list.next_index else "open"
@@ -312,13 +313,14 @@ class TrialRecorder:
         elif states != {"sealed"}:
             state = "pending"
         else:
-            whole = all(self._recorder.compute_ledger(s).completeness is True for s in sessions)
+            whole = all(ledger.completeness is True for ledger in ledgers)
             state = "complete" if whole else "lossy"
         return TrialView(
             **row.model_dump(exclude={"takes"}),
             state=state,
             recordings=len(row.takes),
             sessions=[session.id for session in sessions],
+            not_sampled_share=max((each.not_sampled_share for each in ledgers), default=0.0),
         )
 
     @property

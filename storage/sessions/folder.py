@@ -70,7 +70,13 @@ class Ledger(_Record):
     lossy: bool
     parts: tuple[PartLedger, ...]
     missed_slots: int
-    """Slots in which the node sampled no frame; they never had a number."""
+    """Frames not sampled: slots that the node left out because it was late, without a number."""
+
+    @property
+    def not_sampled_share(self) -> float:
+        """Share of its slots in which no frame was sampled, 0 to 1."""
+        slots = self.recorded + self.pending + sum(self.lost.values()) + self.missed_slots
+        return self.missed_slots / slots if slots else 0.0
 
     @property
     def completeness(self) -> Completeness:

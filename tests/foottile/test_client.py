@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -18,6 +19,7 @@ import foottile
 import foottile.sessions
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running, ServeWith
+from tests.waiting import until
 
 TOKEN = "open sesame".replace(" ", "-")
 HEAVY = ("httpx", "pyarrow", "numpy", "websockets", "service", "storage", "devices", "asyncio")
@@ -58,6 +60,7 @@ def test_a_session_is_recorded_marked_found_and_read(
 ) -> None:
     session = recorded(server, tared)
     assert (session.state, session.complete, session.node) == ("sealed", True, "bench")
+    assert (session.not_sampled_frames, session.not_sampled_share) == (0, 0.0)
     assert [marker.label for marker in session.markers()] == ["a stone"]
     now = datetime.now(UTC)
     found = list(
@@ -218,3 +221,17 @@ def test_all_of_it_is_there_for_asyncio(running: Running, tared: FakeNode, tmp_p
                 assert live.position == (tared.stream_id, batch["seq"][-1].as_py() + 1)
 
     asyncio.run(run())
+
+
+def test_a_complete_session_says_how_many_frames_its_node_did_not_sample(
+    server: foottile.Client, tared: FakeNode
+) -> None:
+    with server.record("bench", "late") as session:
+        tared.deliver(300, [20.0, 60.0], alive=True)
+        tared.socket.send(json.dumps({"type": "status", "missed_slots": 500, "warnings": []}))
+        until(lambda: server.session(session.id).not_sampled_frames == 500)
+        session.stop()
+        tared.send(10, now=True)
+        session.wait_until_sealed()
+    assert session.complete is True
+    assert session.not_sampled_share == pytest.approx(500 / (500 + session.frame_count))

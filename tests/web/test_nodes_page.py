@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import pytest
@@ -45,7 +46,13 @@ def test_two_feet_are_recorded_marked_and_stopped_together_and_one_is_lost_in_be
             page.press("#take-name", "Enter")
             expect(page.locator('.node[data-recording="true"]')).to_have_count(2)
             expect(page.locator("#take-running")).to_contain_text("“both feet” on 2 nodes")
-            expect(page.locator("#take-running")).to_contain_text("0 frames lost")
+            expect(page.locator("#take-losses")).to_have_text("0 lost, 0 not sampled")
+            late = {"type": "status", "missed_slots": 2000, "warnings": []}
+            right.socket.send(json.dumps(late))
+            expect(page.locator("#take-losses")).to_have_text(
+                re.compile(r"^0 lost, 2,000 not sampled \(up to \d+\u00a0%\)$")
+            )
+            expect(page.locator("#take-losses")).to_have_attribute("data-bad", "true")
             page.fill("#take-label", "a stone")
             page.press("#take-label", "Enter")
             expect(page.locator("#notices")).to_contain_text("Marker “a stone” set on 2 nodes")

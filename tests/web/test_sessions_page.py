@@ -143,6 +143,9 @@ def test_a_complete_session_says_how_much_was_not_sampled(
     page = open_page(f"{scripted.url}/sessions")
     expect(row_of(page, session).locator(".state")).to_have_text(share)
     expect(row_of(page, session).locator(".c-state")).to_contain_text(counts)
+    expect(row_of(page, session).locator(".state")).to_have_attribute(
+        "title", "Complete: every frame that the node sampled is stored."
+    )
     page.goto(scripted.url)
     expect(page.locator("#last-session")).to_contain_text(share)
     page.goto(f"{scripted.url}/sessions/{session.id}")

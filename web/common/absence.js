@@ -1,7 +1,7 @@
 // Summary of what a page has missed while it slept or had no link.
 
 import * as api from "./api.js";
-import { countLost } from "./losses.js";
+import { countLost, missedText } from "./losses.js";
 import { notice, withdraw } from "./notices.js";
 import { unlessRefused } from "./request.js";
 import { roughly } from "./text.js";
@@ -60,10 +60,11 @@ export class Absence {
 }
 
 /** Describe a session's name and end. */
-function describe({ name, node, state, complete, lost }) {
+function describe(session) {
+  const { name, node, state, complete, lost } = session;
   const count = countLost(lost);
   const end = { recording: "", pending: " pending", sealing: " being sealed", sealed: complete === true ? " complete" : ` lossy (${count.toLocaleString("en-GB")} frames)` }[state];
-  return `“${name}” of ${node}${end}`;
+  return [`“${name}” of ${node}${end}`, missedText(session)].filter(Boolean).join(", ");
 }
 
 /** Return sentences about a node that changed; `before` is undefined for a new one. */

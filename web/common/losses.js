@@ -25,17 +25,16 @@ export function lossTexts(lost) {
     .map(([reason, count]) => [reason, `${many(count)}: ${REASONS[reason] ?? reason.replaceAll("_", " ")}`]);
 }
 
-/** Return the share of a session's slots that were not sampled, 0 to 1. @param {SessionView} session */
-export function missedShare({ frames: recorded, lost, missed_slots: missed }) {
-  const slots = recorded + countLost(lost) + missed;
-  return slots ? missed / slots : 0;
-}
+/** Return a share of slots in percent, such as "12 %"; "" for none. @param {number} share 0 to 1 */
+export const percentText = (share) => (share ? `${share < 0.01 ? "<1" : Math.round(100 * share)}\u00a0%` : "");
 
-/** Return the share of slots that were not sampled, such as "12 % not sampled"; "" without any. @param {SessionView} session */
-export function missedText(session) {
-  const percent = 100 * missedShare(session);
-  return percent ? `${percent < 1 ? "<1" : Math.round(percent)}\u00a0% not sampled` : "";
-}
+/** Return the share of slots that were not sampled, such as "12 % not sampled"; "" without any. @param {{not_sampled_share: number}} session */
+export const missedText = ({ not_sampled_share: share }) => (share ? `${percentText(share)} not sampled` : "");
+
+/** Return the greatest share of slots that were not sampled. @param {{not_sampled_share: number}[]} sessions */
+export const greatestShare = (sessions) => Math.max(0, ...sessions.map((session) => session.not_sampled_share));
+
+export const MISSED_SHARE_MAX = 0.01; // more is a warning
 
 /** Return the number of lost frames. @param {Record<string, number>} [lost] by reason */
 export const countLost = (lost) => Object.values(lost ?? {}).reduce((sum, count) => sum + count, 0);
@@ -44,6 +43,6 @@ export const countLost = (lost) => Object.values(lost ?? {}).reduce((sum, count)
 export const lossCounts = (lost, missed) => `${lost.toLocaleString("en-GB")} lost, ${missed.toLocaleString("en-GB")} not sampled`;
 
 export const LOSSES_HELP = "“0 lost, 12 not sampled”: lost frames were sampled, but did not arrive. Not sampled: the node’s computer was late and left "
-  + "these slots out; all other frames are correct. “Complete”: nothing is lost. If many slots are not sampled, reduce other load on that computer.";
+  + "these slots out; all other frames are correct. “Complete”: every frame that was sampled is stored; those that were not sampled are stated beside it. If many slots are not sampled, reduce other load on that computer.";
 
 export { many as frames };

@@ -1,6 +1,7 @@
 // Dialog of the list of trials: all rows, the text of the list, and its settings.
 
 import * as api from "./api.js";
+import { missedText } from "./losses.js";
 import { unlessRefused } from "./request.js";
 import { el, setText } from "./text.js";
 
@@ -63,7 +64,7 @@ export function openTrials(trials) {
       const named = row.recordings > 1 ? `${row.name} (${row.recordings})` : row.name;
       const name = row.sessions.length ? el("a", { href: `/sessions/${encodeURIComponent(row.sessions[0])}`, text: named }) : el("span", { text: row.name });
       return el("li", { "data-state": row.state, ...(isNext ? { "aria-current": "step" } : {}) }, name,
-        el("span", { cls: "trial-row-tags", text: row.tags.join(", ") }), el("span", { cls: "trial-row-state", text: isNext ? "next" : SIGNS[row.state] }));
+        el("span", { cls: "trial-row-tags", text: row.tags.join(", ") }), el("span", { cls: "trial-row-state", text: isNext ? "next" : [SIGNS[row.state], missedText(row)].filter(Boolean).join(", ") }));
     }));
     rows.querySelector("[aria-current]")?.scrollIntoView({ block: "center" });
     if (text.value === drawnText) text.value = list.text;

@@ -1,7 +1,7 @@
 // Record, marker and stop for all nodes: one request, with a result per node. Tare all: one request per node.
 
 import * as api from "../common/api.js";
-import { countLost } from "../common/losses.js";
+import { countLost, greatestShare, lossCounts, MISSED_SHARE_MAX, percentText } from "../common/losses.js";
 import { notice, quietly, withdraw } from "../common/notices.js";
 import { bindField, press } from "../common/press.js";
 import { byId, duration, isShortcut, localTime, setData, setText } from "../common/text.js";
@@ -129,8 +129,13 @@ export class Takes {
     byId("take-text").hidden = !take;
     if (take) {
       const longest = Math.max(...take.sessions.map((session) => session.duration_s));
-      const lost = take.sessions.reduce((sum, session) => sum + countLost(session.lost), 0);
-      setText(byId("take-running"), `“${take.name}” on ${nodes(take.sessions.length)}, ${duration(Math.floor(longest))}, ${lost.toLocaleString("en-GB")} frames lost`);
+      const sum = (countOf) => take.sessions.reduce((total, session) => total + countOf(session), 0);
+      const lost = sum((session) => countLost(session.lost));
+      const share = greatestShare(take.sessions);
+      setText(byId("take-running"), `“${take.name}” on ${nodes(take.sessions.length)}, ${duration(Math.floor(longest))}, `);
+      const counts = byId("take-losses");
+      setText(counts, `${lossCounts(lost, sum((session) => session.missed_slots))}${share ? ` (${take.sessions.length > 1 ? "up to " : ""}${percentText(share)})` : ""}`);
+      setData(counts, "bad", String(lost > 0 || share > MISSED_SHARE_MAX));
     }
     setText(byId("take-why"), take ? "" : reason ? `Cannot record: ${reason[0].toLowerCase()}${reason.slice(1)}` : "Not recording");
   }

@@ -1,7 +1,7 @@
 // Header of a session: name, state, facts, labels and notes.
 
 import { byId, duration, el, localTime, perSecond, setText, TARE_SOURCES } from "../common/text.js";
-import { stateText } from "../sessions/state.js";
+import { stateText, stateTitle } from "../sessions/state.js";
 
 /**
  * Return the achieved rate, such as "434 of 449 frames/s".
@@ -31,6 +31,7 @@ export function drawHeader(session, whole = null, array = null) {
   const state = byId("state");
   state.className = `state ${weight}`;
   setText(state, short);
+  state.title = stateTitle(session);
   setText(byId("state-why"), session.state === "sealed" ? long : "");
   const facts = [
     ["Node", session.node],

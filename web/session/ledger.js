@@ -1,7 +1,7 @@
 // Integrity of a session: ledger and verification as texts.
 
 import * as api from "../common/api.js";
-import { frames, lossTexts } from "../common/losses.js";
+import { frames, lossTexts, percentText } from "../common/losses.js";
 import { unlessRefused } from "../common/request.js";
 import { byId, bytes, el, localTime, setText } from "../common/text.js";
 
@@ -14,9 +14,9 @@ export function ledgerTexts(ledger, session) {
   if (pending) texts.push(`${frames(pending)} still on the node.`);
   for (const [, text] of lossTexts(session.lost)) texts.push(`Lost: ${text}.`);
   if (session.max_lost_tail_frames) texts.push(`Up to ${frames(session.max_lost_tail_frames)} at the end may be lost (power failure).`);
-  if (ledger.missed_slots) texts.push(`${ledger.missed_slots.toLocaleString("en-GB")} slot${ledger.missed_slots === 1 ? "" : "s"} not sampled (node late). They have no frame number and do not count as lost.`);
+  if (ledger.missed_slots) texts.push(`${ledger.missed_slots.toLocaleString("en-GB")} slot${ledger.missed_slots === 1 ? "" : "s"} not sampled (node late), ${percentText(session.not_sampled_share)} of all. They have no frame number and do not count as lost.`);
   if (ledger.parts.length > 1) texts.push(`Node restarted: ${ledger.parts.length} parts.`);
-  if (ledger.complete) texts.push("Frame numbers are complete from first to last.");
+  if (ledger.complete) texts.push("Complete: every frame that was sampled is stored.");
   if (session.sha256) {
     texts.push(`Sealed file: ${bytes(session.bytes)}, SHA-256 ${session.sha256}. Data on this page were verified by checksum. “Verify files” reads all files again on the server; “foottile pull” and “foottile verify” do so on your computer.`);
   } else texts.push("Not sealed yet: these figures are provisional.");

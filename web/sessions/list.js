@@ -2,7 +2,7 @@
 
 import * as api from "../common/api.js";
 import { ask, edit } from "../common/dialogs.js";
-import { frames } from "../common/losses.js";
+import { frames, greatestShare, percentText } from "../common/losses.js";
 import { isOperator } from "../common/login.js";
 import { menuButton } from "../common/menu.js";
 import { notice, quietly } from "../common/notices.js";
@@ -169,7 +169,7 @@ export class Sessions {
   /** Return the row of a take; the old one if unchanged. */
   takeRow(group, takeRows) {
     const { take } = group[0];
-    const key = JSON.stringify(group.map(({ id, name, node }) => [id, name, node]));
+    const key = JSON.stringify([percentText(greatestShare(group)), ...group.map(({ id, name, node }) => [id, name, node])]);
     const old = this.takeRows.get(take);
     const shown = old?.key === key ? old : { key, row: makeTakeRow(group, this.chosen.pickAll(group)) };
     takeRows.set(take, shown);

@@ -1,8 +1,8 @@
 // Rows of the list: sessions and takes.
 
-import { countLost, frames } from "../common/losses.js";
+import { countLost, frames, greatestShare, percentText } from "../common/losses.js";
 import { bytes, duration, el, localTime } from "../common/text.js";
-import { stateText } from "./state.js";
+import { stateText, stateTitle } from "./state.js";
 
 const HEADS = ["Name", "Node", "Started", "Duration", "Frames", "Markers", "Size", "State", "Actions"];
 
@@ -19,7 +19,7 @@ export function makeRow(session, pick, menu) {
   const name = el("a", {
     cls: "session-name", text: session.name || session.id, "data-part": "open", href: `/sessions/${encodeURIComponent(session.id)}`,
   });
-  const state = el("div", { cls: "c-state", role: "cell" }, el("span", { cls: `state ${weight}`, text: short }));
+  const state = el("div", { cls: "c-state", role: "cell" }, el("span", { cls: `state ${weight}`, text: short, title: stateTitle(session) }));
   if (long) state.append(" ", el("span", { cls: "why", text: long }));
   if (session.absolute_scale === "assumed") state.append(" ", el("span", { cls: "why", text: "Scale assumed." }));
   const cell = (cls, label, text) => el("div", { cls, role: "cell", "data-label": label, text });
@@ -56,12 +56,14 @@ export const comparisonAddress = (session, other) => `/sessions/${encodeURICompo
 /** Make the row above the sessions of a take. @param {SessionView[]} sessions @param {HTMLInputElement} pick selects them all */
 export function makeTakeRow(sessions, pick) {
   const names = [...new Set(sessions.map(({ name }) => name))];
+  const share = greatestShare(sessions);
   const started = localTime(new Date(Math.min(...sessions.map(({ started_t_ns: t_ns }) => t_ns)) / 1e6)).slice(0, 16);
   return el("div", { cls: "take", role: "row", "data-take": sessions[0].take },
     el("div", { cls: "c-pick", role: "cell" }, pick),
     el("div", { cls: "c-take", role: "cell", "aria-colspan": String(HEADS.length) },
       el("span", { cls: "take-word", text: "Take" }), " ", el("strong", { text: names.join(", ") }),
-      el("span", { cls: "why", text: ` ${started}, ${sessions.length} nodes: ${sessions.map(({ node }) => node).join(", ")}` })));
+      el("span", { cls: "why", text: ` ${started}, ${sessions.length} nodes: ${sessions.map(({ node }) => node).join(", ")}` }),
+      share ? el("span", { cls: "take-missed", text: `, up to ${percentText(share)} not sampled` }) : ""));
 }
 
 /** Return the texts that change during a recording, by class. @param {SessionView} session */

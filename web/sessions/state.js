@@ -1,13 +1,15 @@
 // State of a session as text.
 
-import { countLost, frames, lossCounts, lossTexts, missedShare, missedText } from "../common/losses.js";
-
-const MISSED_SHARE_MAX = 0.01; // more is a warning
+import { countLost, frames, lossCounts, lossTexts, MISSED_SHARE_MAX, missedText } from "../common/losses.js";
 
 const WAITS = {
   frames: (session) => `${frames(session.pending_frames)} still on the node; sealed once they arrive.`,
   end: () => "Waiting for the last frames before stop.",
 };
+
+/** Explanation of a state's word, as a tooltip. @param {SessionView} session */
+export const stateTitle = ({ complete }) => (complete === true ? "Complete: every frame that the node sampled is stored."
+  : complete === "lossy" ? "Lossy: frames that the node sampled are lost." : "");
 
 /** Return state and completeness: [label, details, severity]. @param {SessionView} session */
 export function stateText(session) {
@@ -24,7 +26,7 @@ export function stateText(session) {
     }
     case "sealing": return [`sealing${share}`, `Writing files.${missing}${why}`, "run"];
     case "sealed":
-      if (session.complete === true) return [`complete${share}`, `${missed}${why}`.trim(), missedShare(session) > MISSED_SHARE_MAX ? "warn" : "good"];
+      if (session.complete === true) return [`complete${share}`, `${missed}${why}`.trim(), session.not_sampled_share > MISSED_SHARE_MAX ? "warn" : "good"];
       if (session.complete === "lossy") return [`lossy${share}`, `${missing.trim() || "Frames are lost."}${missed && ` ${missed}`}${why}`, "warn"];
       return ["incomplete", why.trim() || "Not all frames have arrived.", "warn"];
     default: return [String(session.state), why.trim(), "warn"];

@@ -27,6 +27,7 @@ from service.cli.options import (
     add_options,
     create_stop_event,
     echo,
+    format_not_sampled,
     load_adapted_scene,
     remark,
 )
@@ -138,6 +139,7 @@ def node_command(
         echo(
             f"session {outcome.recorded_session_id}"
             + (" is lossy" if outcome.is_lossy else " is complete")
+            + format_not_sampled(outcome.not_sampled_share)
         )
     if outcome.lost_frames:
         remark(f"{outcome.lost_frames} frames of sessions are lost")

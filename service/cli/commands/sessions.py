@@ -24,6 +24,7 @@ from service.cli.options import (
     add_options,
     echo,
     expand_options,
+    format_not_sampled,
     print_json,
     remark,
     resolve_data_folder,
@@ -112,7 +113,7 @@ def sessions_command(
     until: Annotated[str | None, typer.Option("--to", help="End of the starts, exclusive.")] = None,
     complete: Annotated[
         str | None,
-        typer.Option(help="true: all frames stored; false: undecided; lossy: frames lost."),
+        typer.Option(help="true: all sampled frames stored; false: undecided; lossy: frames lost."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -164,7 +165,7 @@ def sessions_command(
             f"{session['duration_s']:.1f}",
             str(session["frames"]),
             str(session.get("marker_count", "")),
-            session["state"] + lossy + _format_missed(session) + assumed,
+            session["state"] + lossy + format_not_sampled(session["not_sampled_share"]) + assumed,
         )
     stdout.print(table)
 
@@ -339,15 +340,6 @@ def export_command(
         remark(f"without markers: there is no {MARKERS_NAME} beside {sources[0].name}")
 
 
-def _format_missed(session: Mapping[str, Any]) -> str:
-    """Return the share of slots that were not sampled, as the pages do; empty without any."""
-    missed = session["missed_slots"]
-    if not missed:
-        return ""
-    percent = 100 * missed / (session["frames"] + sum(session["lost"].values()) + missed)
-    return f", {'<1' if percent < 1 else round(percent)} % not sampled"
-
-
 def _parse_clock(clock: str) -> ClockName:
     """Return the clock of an option.
 
@@ -421,6 +413,9 @@ def _list_folder_sessions(data: Path, filters: SessionFilter) -> list[Mapping[st
             **session.model_dump(mode="json", exclude=_UNLISTED_FIELDS),
             "complete": complete(session),
             "missed_slots": 0 if session.ledger is None else session.ledger.missed_slots,
+            "not_sampled_share": 0.0
+            if session.ledger is None
+            else session.ledger.not_sampled_share,
             "lost": {} if session.ledger is None else session.ledger.lost,
             "marker_count": len(session.markers),
         }

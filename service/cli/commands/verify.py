@@ -15,6 +15,7 @@ from service.cli.options import (
     JsonOption,
     add_options,
     echo,
+    format_not_sampled,
     print_json,
     remark,
     resolve_data_folder,
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 _EXIT_CODES = {"complete": 0, "lossy": 3, "pending": 3, "damaged": 1, "unproven": 4, "export": 4}
 _VERDICT_TEXTS = {"unproven": "not all proven"}
 _VERDICT_SENTENCES = {
-    "complete": "Everything is whole and complete.",
+    "complete": "Everything is whole, and every frame that was sampled is there.",
     "lossy": "Everything is whole, but some frames are lost for good: they are counted above.",
     "pending": "Everything is whole, but not every session is sealed yet.",
     "damaged": "Something is damaged: do not trust what is named above. Pull a damaged session "
@@ -200,7 +201,9 @@ def _format_ledger(ledger: Ledger | None) -> str:
     text += "".join(f", {count} {what}" for what, count in counts.items() if count)
     tail = ledger.max_lost_tail_frames
     text += f", and at most {tail} more when it broke off" if tail else ""
-    return text + (f", {ledger.missed_slots} slots missed" if ledger.missed_slots else "")
+    if not ledger.missed_slots:
+        return text
+    return f"{text}{format_not_sampled(ledger.not_sampled_share)} ({ledger.missed_slots} slots)"
 
 
 def _format_stream(report: StreamReport) -> str:

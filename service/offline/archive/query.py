@@ -72,6 +72,8 @@ _SESSION_COLUMNS: list[tuple[str, pa.DataType]] = [
     ("duration_s", pa.float64()),
     ("frames", pa.int64()),
     ("lossy", pa.bool_()),
+    ("not_sampled_frames", pa.int64()),
+    ("not_sampled_share", pa.float64()),
     ("bytes", pa.int64()),
     ("calibration_id", pa.string()),
     ("absolute_scale", pa.string()),
@@ -147,8 +149,13 @@ class SessionArchive:
         rows = []
         for each in self.sessions:
             ledger = each.metadata.ledger
-            lossy = ledger.lossy if ledger is not None else None
-            about = {"session_id": each.session_id, "lossy": lossy, "folder": each.location.uri}
+            about: dict[str, Any] = {
+                "session_id": each.session_id,
+                "lossy": None if ledger is None else ledger.lossy,
+                "not_sampled_frames": None if ledger is None else ledger.missed_slots,
+                "not_sampled_share": None if ledger is None else ledger.not_sampled_share,
+                "folder": each.location.uri,
+            }
             rows.append({**each.metadata.content, **about})
         return pa.Table.from_pylist(rows, schema=SESSIONS_SCHEMA)
 

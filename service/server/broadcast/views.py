@@ -204,9 +204,10 @@ def make_session_view(session: Session, recorder: Recorder) -> SessionView:
 
 
 def make_session_progress(session: Session, recorder: Recorder) -> SessionProgress:
-    """Return the present progress of a session; to 0.1 s, so that it seldom changes."""
+    """Return the present progress of a session; coarse, so that it seldom changes."""
     fields = _list_progress_fields(session, recorder.compute_ledger(session), recorder)
-    return SessionProgress(**fields | {"duration_s": round(fields["duration_s"], 1)})
+    coarse = {"duration_s": 1, "not_sampled_share": 3}
+    return SessionProgress(**fields | {name: round(fields[name], n) for name, n in coarse.items()})
 
 
 def _list_progress_fields(session: Session, ledger: Ledger, recorder: Recorder) -> dict[str, Any]:
@@ -216,6 +217,7 @@ def _list_progress_fields(session: Session, ledger: Ledger, recorder: Recorder) 
         "pending_reason": recorder.find_pending_reason(session, ledger),
         "lost": ledger.lost,
         "missed_slots": ledger.missed_slots,
+        "not_sampled_share": ledger.not_sampled_share,
         "duration_s": recorder.compute_duration_s(session, ledger.recorded),
     }
 

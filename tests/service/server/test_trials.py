@@ -15,6 +15,7 @@ from pydantic import ValidationError
 from devices.errors import FootTileError, StateError, UsageError
 from service.server.takes import Take
 from service.server.trials import ListedTrial, TrialRecorder, format_trials, parse_trials
+from storage.sessions.folder import Ledger
 
 _TEXT = st.text(
     st.characters(codec="utf-8", exclude_categories=("Cc", "Cs")), min_size=1, max_size=12
@@ -58,7 +59,7 @@ class FakeServer:
             iterate_newest_first=lambda: iter(self.sessions[::-1]),
             find_by_idempotency_key=lambda _: [],
         )
-        ledger = SimpleNamespace(completeness=True)
+        ledger = Ledger(complete=True, lossy=False, parts=(), missed_slots=0)
         recorder = SimpleNamespace(compute_ledger=lambda _: ledger)
         make: Any = TrialRecorder
         made: TrialRecorder = make(path, self, recorder, store, None, lambda _: None)

@@ -346,3 +346,12 @@ def test_a_completeness_is_one_of_three_words() -> None:
     ]
     with pytest.raises(UsageError, match="true, false or lossy"):
         parse_completeness("True", where="--complete")
+
+
+def test_the_share_that_was_not_sampled_is_of_all_slots_those_that_are_still_to_come_too() -> None:
+    part = PartLedger(
+        stream_id="a", seq_first=0, seq_last=89, recorded=10, lost={"evicted": 30}, pending=50
+    )
+    ledger = Ledger(complete=False, lossy=True, parts=(part,), missed_slots=30)
+    assert ledger.not_sampled_share == 0.25
+    assert Ledger(complete=True, lossy=False, parts=(), missed_slots=0).not_sampled_share == 0.0

@@ -72,7 +72,9 @@ def test_a_crash_is_recovered_and_proven(run: Run, data: Path) -> None:
     after = run("verify", data)
     assert after.code == 0
     assert f"session {ID} (walk): complete, 100 recorded" in after.out
-    assert after.out.splitlines()[-1] == "Everything is whole and complete."
+    assert after.out.splitlines()[-1] == (
+        "Everything is whole, and every frame that was sampled is there."
+    )
 
 
 def test_json_of_one_session_is_its_ledger(run: Run, data: Path) -> None:
@@ -319,6 +321,13 @@ def test_a_list_of_sessions_shows_the_part_that_was_not_sampled(run: Run, data: 
     assert "sealed, 20 % not" in run("sessions", "--data", data).out  # as wide as a terminal
     (listed,) = run("sessions", "--data", data, "--json").printed()["items"]
     assert (listed["missed_slots"], listed["lost"]) == (25, {})
+    assert listed["not_sampled_share"] == pytest.approx(25 / (25 + listed["frames"]))
+    verified = run("verify", data)
+    assert "100 recorded, 20 % not sampled (25 slots)" in verified.out
+    sql = "SELECT lossy, not_sampled_frames, not_sampled_share FROM sessions"
+    assert run("query", sql, data, "--json").printed()["rows"] == [
+        {"lossy": False, "not_sampled_frames": 25, "not_sampled_share": 0.2}
+    ]
 
 
 def test_verify_names_unreadable_files(

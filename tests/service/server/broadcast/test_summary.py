@@ -95,6 +95,7 @@ def progress(frames: int) -> SessionProgress:
         pending_reason=None,
         lost={},
         missed_slots=0,
+        not_sampled_share=0.0,
         duration_s=0.0,
     )
 
