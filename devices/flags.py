@@ -57,6 +57,7 @@ class EstimateFlag(IntFlag):
     STUCK = 2048
     CLIPPED = 4096
     BASELINE_LOST = 8192
+    HISTORY_UNKNOWN = 16384
 
 
 class Severity(StrEnum):
@@ -180,6 +181,11 @@ ESTIMATE_FLAGS: Mapping[EstimateFlag, FlagText] = {
     EstimateFlag.AFTER_SATURATION: FlagText(
         "less certain: a tile saturated or not read just before",
         "an unseen load (saturation, or no data for 50 ms) still adds more to sigma than noise",
+        Severity.DOUBT,
+    ),
+    EstimateFlag.HISTORY_UNKNOWN: FlagText(
+        "less certain: loads before the first frame are not known",
+        "estimates began under load, and loads before that still add more to sigma than noise",
         Severity.DOUBT,
     ),
     EstimateFlag.OVER_RATED: FlagText(

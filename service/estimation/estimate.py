@@ -32,7 +32,7 @@ from service.estimation.pipeline.smoothing_stage import (
     BOUND_SIGMAS,
     TILE_FORCE,
     TileForce,
-    compute_forces_and_after_saturation,
+    compute_forces_and_flags,
 )
 from service.estimation.pipeline.state import (
     ROWS_MIN,
@@ -46,7 +46,6 @@ from service.estimation.pipeline.state import (
 from service.estimation.records import ColumnDict, Estimates, RecordArray, view_records_as_bytes
 
 _COP_MASKED = int(EstimateFlag.COP_MASKED)
-_AFTER_SATURATION = int(EstimateFlag.AFTER_SATURATION)
 _GAUGE, _FORCE, _SIGMA = range(3)
 
 _C_CONTIGUOUS, _ALIGNED, _WRITEABLE = 0x1, 0x100, 0x400  # numpy's own, of `flags.num`
@@ -308,9 +307,7 @@ def _estimate_due_rows(
             rows = denoise.find_oldest_and_newest_window_rows(
                 buffer.t_mono_ns, i, end, rows, look_ns
             )
-        unsettled = compute_forces_and_after_saturation(
-            params, tile_states, buffer, i, rows, windows, forces
-        )
+        unseen = compute_forces_and_flags(params, tile_states, buffer, i, rows, windows, forces)
         if foot_params.has_servo == 1:
             counts = interpolate_servo_counts(buffer.readings, i, end, lookahead_ns)
             out[grf_cop.FOOT_ANGLE] = (counts - foot_params.zero_counts) * foot_params.rad_per_count
@@ -333,9 +330,7 @@ def _estimate_due_rows(
                 by_tile[_FORCE, k, j], by_tile[_SIGMA, k, j] = _force_or_bound(forces[j])
         seq[k], t_ns[k] = row.seq, row.t_ns
         contact[k] = foot_state.contact.is_contact if is_known else CONTACT_UNKNOWN
-        flags[k] = (
-            row.flags | (_COP_MASKED if masked else 0) | (_AFTER_SATURATION if unsettled else 0)
-        )
+        flags[k] = row.flags | unseen | (_COP_MASKED if masked else 0)
         foot_state.release_row += 1
 
 

@@ -18,7 +18,7 @@ export const FRAME_FLAGS = [
   [8, "unloaded lead-in", "note"],
   [16, "array scanned again", "note"],
 ];
-export const ESTIMATE = { SATURATED: 1, EXTRAPOLATED: 2, OUTLIER_REPLACED: 4, GAP: 8, COP_MASKED: 16, TILE_MISSING: 32, ASSUMED_SCALE: 64, TARE_OLD: 128, OVER_RATED: 256, TARE_LOST: 512, AFTER_SATURATION: 1024, STUCK: 2048, CLIPPED: 4096, BASELINE_LOST: 8192 };
+export const ESTIMATE = { SATURATED: 1, EXTRAPOLATED: 2, OUTLIER_REPLACED: 4, GAP: 8, COP_MASKED: 16, TILE_MISSING: 32, ASSUMED_SCALE: 64, TARE_OLD: 128, OVER_RATED: 256, TARE_LOST: 512, AFTER_SATURATION: 1024, STUCK: 2048, CLIPPED: 4096, BASELINE_LOST: 8192, HISTORY_UNKNOWN: 16384 };
 /** @type {[bit: number, title: string, severity: string][]} titled, in their order */
 export const ESTIMATE_FLAGS = [
   [1, "tile saturated", "bound"],
@@ -30,6 +30,7 @@ export const ESTIMATE_FLAGS = [
   [128, "tare in doubt", "doubt"],
   [8192, "zero of a tile has dropped", "doubt"],
   [1024, "less certain: a tile saturated or not read just before", "doubt"],
+  [16384, "less certain: loads before the first frame are not known", "doubt"],
   [256, "above the rated pressure", "doubt"],
   [4, "outlier replaced", "note"],
   [64, "scale assumed", "note"],

@@ -19,6 +19,7 @@ const FROM_ESTIMATE = [
   [ESTIMATE.STUCK, "stuck", "A tile repeats one reading: its force is unknown. Unplug and replug it."],
   [ESTIMATE.BASELINE_LOST, "baseline_lost", "Zero of a tile has dropped: force is less certain. Lift the foot, press Tare; if it recurs, the dome may leak."],
   [ESTIMATE.AFTER_SATURATION, "after_saturation", "Force is less certain: a tile was saturated or not read just before."],
+  [ESTIMATE.HISTORY_UNKNOWN, "history_unknown", "Force is less certain: loads before the first frame are not known."],
   [ESTIMATE.OVER_RATED, "over_rated", "Above the chip's rated range, within the calibration."],
 ];
 /** @type {[bit: number, key: string, text: string][]} */

@@ -12,6 +12,8 @@ const WARNINGS = {
     why: "The unloaded pressure is below that of the last tare. The dome leaks or the tile's temperature has changed, so forces are off by a few newtons." },
   after_saturation: { section: "too-low",
     why: "The rubber remembers each load, and a saturated tile or frames not sampled hid one: the 95 % interval is wider until that fades. If it recurs, reduce the load on the foot or on the node's computer." },
+  history_unknown: { section: "too-low",
+    why: "The rubber remembers each load, and the node began to read under one: the 95 % interval is wider until that fades. Lift the foot once." },
   over_rated: { section: "too-low",
     why: "The data sheet specifies accuracy up to the end of the chip's range only. The calibration covers this pressure, so the force is known, but the chip is overloaded." },
   below_range: { section: "a-force-in-the-air",

@@ -84,6 +84,12 @@ def compensate_flow(
 
 
 @jit_cached
+def settle_state(state: FlowState, force_n: float, t_ns: int) -> None:
+    """Set the state of a branch that has relaxed under a force, until `t_ns`."""
+    state.stress_n, state.force_n, state.t_ns = 0.0, force_n, t_ns
+
+
+@jit_cached
 def copy_state(state: FlowState, to: FlowState) -> None:
     """Copy a state into another."""
     to.stress_n, to.force_n, to.t_ns = state.stress_n, state.force_n, state.t_ns

@@ -113,6 +113,12 @@ def compute_isothermal_pressure(
 
 
 @jit_cached
+def begin_after_gap(state: GasState, t_ns: int) -> None:
+    """Set the state of gas that has its first reading at `t_ns`, as after a long gap."""
+    state.ln_kpa, state.t_ns = 0.0, t_ns - 2 * LONG_GAP_NS
+
+
+@jit_cached
 def copy_state(state: GasState, to: GasState) -> None:
     """Copy a state into another."""
     to.temperature_ratio, to.ln_kpa, to.t_ns = state.temperature_ratio, state.ln_kpa, state.t_ns

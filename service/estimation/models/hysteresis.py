@@ -97,6 +97,25 @@ def compensate_hysteresis(
 
 
 @jit_cached
+def settle_state(
+    params: HysteresisParams, state: HysteresisState, force_n: float, highest_n: float, t_ns: int
+) -> None:
+    """Set the state of a dome that has borne a force until `t_ns`, and before a higher one or none.
+
+    Args:
+        params: of the tile.
+        state: set.
+        force_n: the force, by which the viscous branch has relaxed.
+        highest_n: the plays are where they were after this one.
+        t_ns: instant of the next reading.
+    """
+    if params.has_flow == 1:
+        flow.settle_state(state.flow, force_n, t_ns)
+    for m in range(PLAYS):
+        state.plays_n[m] = highest_n
+
+
+@jit_cached
 def copy_state(state: HysteresisState, to: HysteresisState) -> None:
     """Copy a state into another."""
     flow.copy_state(state.flow, to.flow)

@@ -115,6 +115,23 @@ def compensate_creep(
 
 
 @jit_cached
+def settle_state(params: RubberParams, state: RubberState, force_n: float, t_ns: int) -> None:
+    """Set the state of a dome that has borne a force for long, until `t_ns`."""
+    state.force_n, state.t_ns = force_n, t_ns
+    for m in range(params.n_terms):
+        state.crept_n[m] = force_n
+
+
+@jit_cached
+def sum_fractions(params: RubberParams) -> float:
+    """Return the part of a force that appears later, by all terms."""
+    total = 0.0
+    for m in range(params.n_terms):
+        total += params.creep_fraction[m]
+    return total
+
+
+@jit_cached
 def copy_state(state: RubberState, to: RubberState) -> None:
     """Copy a state into another."""
     to.force_n, to.t_ns = state.force_n, state.t_ns

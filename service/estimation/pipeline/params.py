@@ -161,6 +161,7 @@ class TileParams(ModelParamsByName):
     # pressure in the rig, if that was higher or the chip saturated there.
     chip_max_kpa: float
     range_low_kpa: float  # gauge pressure below which noise does not explain the distance
+    unloaded_max_kpa: float  # gauge pressure up to which noise explains it without a load
     saturation: SaturationParams
     dome_misfit: float  # uncertain part of the corrections of creep and loop
     position_m: Annotated[Floats, (3,)]

@@ -54,6 +54,9 @@ CONTACT_MIN_NS = 10_000_000  # a shorter change is an outlier or a bounce
 SIGNIFICANCE_SIGMAS = 5.0
 """Least GRF for a COP, in its sigmas: below, the first-order variance of a ratio is invalid. Also
 the distance below the calibrated range that noise does not explain."""
+UNLOADED_MAX_SIGMAS = 3.0
+"""Largest first reading of an unloaded tile, in sigmas: it has borne nothing. Noise alone exceeds
+it once in 700, and sigma is then a little larger than it need be."""
 SUCTION_MAX_KPA = 10.0
 """Largest pressure below the baseline that can be a force: no foot pulls a dome that much, and 30 K
 make less. Beyond, a count wrapped far, a dome is torn, or there is another fault."""
@@ -296,6 +299,7 @@ def _make_bearing_params(
         chip_max_kpa=chip_max_kpa,
         range_low_kpa=curves["range_low_kpa"]
         - SIGNIFICANCE_SIGMAS * _compute_unloaded_sigma_kpa(tare)[bearing],
+        unloaded_max_kpa=UNLOADED_MAX_SIGMAS * _compute_unloaded_sigma_kpa(tare)[bearing],
         saturation=make_saturation_params(
             curves,
             by_model["gas"]["gamma"] if "gas" in by_model else np.ones(len(bearing)),

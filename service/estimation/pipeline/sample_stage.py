@@ -313,12 +313,17 @@ def _isothermal_pressure(
     used_kpa = min(kpa, most_kpa) if is_hidden and not math.isnan(kpa) else kpa
     is_known = 0.0 < used_kpa < math.inf and not math.isnan(tile_state.gas.ln_kpa)
     had_gap = is_known and is_after_long_gap(t_ns, tile_state.gas.t_ns)
-    if tile_state.has_gas_alt == 0 and not is_hidden and not had_gap:
+    # The first reading, under load: when that came is not known.
+    is_first = 0.0 < used_kpa < math.inf and math.isnan(tile_state.gas.ln_kpa)
+    begins_loaded = is_first and kpa - tile_params.baseline_kpa > tile_params.unloaded_max_kpa
+    if tile_state.has_gas_alt == 0 and not is_hidden and not had_gap and not begins_loaded:
         return gas.compute_isothermal_pressure(
             tile_params.gas, tile_state.gas, used_kpa, t_ns, math.nan
         ), 0.0
     if tile_state.has_gas_alt == 0:
         gas.copy_state(tile_state.gas, tile_state.gas_alt)
+        if begins_loaded:
+            gas.begin_after_gap(tile_state.gas_alt, t_ns)
     found = gas.compute_isothermal_pressure(
         tile_params.gas, tile_state.gas, used_kpa, t_ns, math.nan
     )

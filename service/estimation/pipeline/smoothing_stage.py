@@ -11,6 +11,7 @@ import math
 from typing import Annotated
 
 from devices.arrays import Floats
+from devices.flags import EstimateFlag
 from devices.jit import jit_cached, jit_inlined
 from service.estimation.models import denoise, flow, hysteresis, rubber
 from service.estimation.pipeline.params import KernelParams, TileParams
@@ -21,6 +22,9 @@ from service.estimation.pipeline.saturation import (
 )
 from service.estimation.pipeline.state import DomeState, FrameBuffer, TileSample, TileState
 from service.estimation.records import KernelRecord, RecordArray
+
+_AFTER_SATURATION = int(EstimateFlag.AFTER_SATURATION)
+_HISTORY_UNKNOWN = int(EstimateFlag.HISTORY_UNKNOWN)
 
 BOUND_SIGMAS = 2.33
 """Distance of a stated bound in standard uncertainties: one in a hundred is above the truth."""
@@ -53,7 +57,7 @@ TILE_FORCE = TileForce.dtype()
 
 
 @jit_inlined
-def compute_forces_and_after_saturation(
+def compute_forces_and_flags(
     params: KernelParams,
     tile_states: RecordArray[TileState],
     buffer: FrameBuffer,
@@ -61,8 +65,8 @@ def compute_forces_and_after_saturation(
     rows: tuple[int, int],
     windows: Floats,
     forces: RecordArray[TileForce],
-) -> bool:
-    """Compute the tiles' forces in row `i`, into `forces`; return whether AFTER_SATURATION applies.
+) -> int:
+    """Compute the tiles' forces in row `i`, into `forces`; return flags of loads not seen.
 
     Args:
         params: of the estimate.
@@ -74,8 +78,8 @@ def compute_forces_and_after_saturation(
         forces: (tiles,), the answer.
 
     Returns:
-        Whether saturation or gaps before leave more uncertainty than the noise of a reading, in any
-        tile.
+        Bits of `EstimateFlag`: loads during saturation or gaps, or before the first frame, leave
+        more uncertainty than the noise of a reading, in any tile.
     """
     foot_params, n = params.foot[0], len(tile_states)
     for j in range(n):
@@ -85,7 +89,7 @@ def compute_forces_and_after_saturation(
         force.noise_n, force.smoothing_error_n = buffer.noise_n[i, j], 0.0
     if foot_params.has_denoise == 1:
         denoise_forces_and_scale_noise(params, buffer, i, rows, windows, forces)
-    unsettled = False
+    flags = 0
     for j in range(n):
         tile_params, sample = params.tiles[j], buffer.samples[i, j]
         if tile_params.is_load_bearing == 1:
@@ -95,8 +99,10 @@ def compute_forces_and_after_saturation(
                 else buffer.sampled_ns[i, j]
             )
             alt_n = _correct_force(tile_params, tile_states[j], sample, forces[j], at_ns)
-            unsettled = unsettled or (sample.is_saturated == 0 and alt_n > buffer.noise_n[i, j])
-    return unsettled
+            if sample.is_saturated == 0 and alt_n > buffer.noise_n[i, j]:
+                is_first = tile_states[j].is_history_unknown == 1
+                flags |= _HISTORY_UNKNOWN if is_first else _AFTER_SATURATION
+    return flags
 
 
 @jit_cached
@@ -199,6 +205,9 @@ def _remove_hysteresis_and_creep(
 ) -> tuple[float, float]:
     """Return the force without loop and creep, and its sigma by saturation and gaps before."""
     is_saturated, had_gap = sample.is_saturated == 1, False
+    if tile_state.has_force == 0 and not math.isnan(force_n):
+        tile_state.has_force = 1
+        _begin_under_load(tile_params, tile_state, force_n, at_ns)
     if tile_params.rubber.is_used == 1:
         last = tile_state.dome.rubber
         had_gap = not math.isnan(last.force_n) and is_after_long_gap(at_ns, last.t_ns)
@@ -208,6 +217,8 @@ def _remove_hysteresis_and_creep(
             at_ns, last_of_flow.t_ns
         )
     had_gap = had_gap and not math.isnan(force_n)
+    if is_saturated or had_gap:
+        tile_state.is_history_unknown = 0  # from here on the newer cause is the greater one
     state_force_n = sample.extrapolated_n if is_saturated else math.nan
     if tile_state.has_dome_alt == 0 and not is_saturated and not had_gap:
         found_n = _invert_dome_models(
@@ -233,6 +244,40 @@ def _remove_hysteresis_and_creep(
     if is_saturated:
         return alt_n if alt_n < found_n else found_n, 0.0
     return found_n, UNIFORM_SIGMA * (alt_n - found_n)
+
+
+@jit_cached
+def _begin_under_load(
+    tile_params: TileParams, tile_state: TileState, force_n: float, at_ns: int
+) -> None:
+    """Set both states of a tile whose first force is a load: earlier ones are not known.
+
+    Best guess: this load for long, since a foot stands longer than it takes to put it down.
+    Alternative: the farther of no load, and the largest load that leaves this force, each for long
+    and until just now. Creep presses on after a load, so a smaller force bounds that load. Without
+    a load the dome is at rest, which is the initial state.
+    """
+    unloaded_max_n = tile_params.unloaded_max_kpa * tile_params.static.slope_at_zero_n_per_kpa
+    if not force_n > unloaded_max_n:
+        return
+    most_n = tile_params.saturation.range_end_n
+    if tile_params.rubber.is_used == 1:
+        later = rubber.sum_fractions(tile_params.rubber)
+        most_n = force_n / later if force_n < most_n * later else most_n
+    past_n = select_farther_bound(force_n, 0.0, most_n)
+    _settle_dome(tile_params, tile_state.dome, force_n, 0.0, at_ns)
+    _settle_dome(tile_params, tile_state.dome_alt, past_n, past_n, at_ns)
+    tile_state.has_dome_alt = tile_state.is_history_unknown = 1
+
+
+@jit_cached
+def _settle_dome(
+    tile_params: TileParams, dome_state: DomeState, force_n: float, highest_n: float, at_ns: int
+) -> None:
+    hysteresis.settle_state(
+        tile_params.hysteresis, dome_state.hysteresis, force_n, highest_n, at_ns
+    )
+    rubber.settle_state(tile_params.rubber, dome_state.rubber, force_n, at_ns)
 
 
 @jit_cached

@@ -47,13 +47,15 @@ class TileState(KernelRecord):
     temperature: TemperatureState
     gas: GasState
     # Alternative hypothesis: the state after the load farthest from the best guess of all that are
-    # possible, if the tile was saturated or had a gap.
+    # possible, if the tile was saturated, had a gap, or had its first reading under load.
     has_gas_alt: int
     gas_alt: GasState
     skew: SkewState
     dome: DomeState
     has_dome_alt: int
     dome_alt: DomeState
+    has_force: int  # 1: the models of the dome have had a force
+    is_history_unknown: int  # 1: its alternative is of the loads before the first of them
     previous_force_n: float  # force in the frame before, ...
     previous_force_ns: int  # ... and its instant
     has_previous_force: int

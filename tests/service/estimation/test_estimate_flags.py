@@ -160,12 +160,14 @@ def test_a_lost_tare_leaves_the_angle_and_missing_tiles(lag_ms: float) -> None:
     info = array_at(SQUARE, servo=make_servo())
     models = [name for name in MODEL_NAMES if name != "ambient"]
     tiles = [newton_tile(serial, effects=make_effects()) for serial in info.serials]
-    plan = newton_plan(info, models=models, tiles=tiles, lag_ms=lag_ms)
+    # Gas of which the squeeze is not known hides the COP for a while, creep that of a light load.
+    known = [name for name in models if name != "gas"]
+    plan = newton_plan(info, models=known, tiles=tiles, lag_ms=lag_ms)
     tare = Tare.make_lost(tiles=4, t_ns=0)
     lost = make_plan(info, plan.calibration, tare, models=models, lag_ms=lag_ms)
     tile_flags = np.zeros((12, 4))
     tile_flags[11, 1] = TileFlag.NO_ANSWER
-    whole, e = (estimate_load([9] * 4, each, tile_flags=tile_flags) for each in (plan, lost))
+    whole, e = (estimate_load([60] * 4, each, tile_flags=tile_flags) for each in (plan, lost))
     for name in ("gauge_kpa", "force_n", "force_sigma_n", *GRF, *COP):
         assert np.isnan(getattr(e, name)).all(), name
         assert np.isfinite(getattr(whole, name)).any(), name
