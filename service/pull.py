@@ -108,8 +108,9 @@ def pull_session(server: foottile.Client, session_id: str, out_folder: Path) -> 
     ledger = server.http.get(f"/sessions/{session_id}/ledger")
     for name, content in (("session", session), ("markers", markers), ("ledger", ledger)):
         write_checksummed_json(folder / f"{name}.json", json.dumps(content, indent=1).encode())
-    for name in ("markers", "clock"):
-        _pull_table(server, f"/sessions/{session_id}/{name}", folder / f"{name}.parquet")
+    for name in ("markers", "clock", "warm-up"):
+        path = folder / f"{name.replace('-', '_')}.parquet"
+        _pull_table(server, f"/sessions/{session_id}/{name}", path)
     write_sha256_sums(folder, session["sha256"])
     return {**session, "path": str(path), "resumed_bytes": resumed}
 
@@ -292,7 +293,7 @@ def _pull_table(server: foottile.Client, url: str, path: Path) -> None:
         with server.http.stream(url, {"format": "parquet"}) as answer:
             content = answer.read()
     except foottile.NotFoundError:
-        return  # a rebuilt session may lack its clock
+        return  # a rebuilt session may lack its clock, and many have no warm-up
     try:
         parse_hashed_table(content, where=path.name)
     except DamagedFileError as error:

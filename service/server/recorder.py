@@ -45,7 +45,7 @@ from service.sessions.lifecycle import (
     has_unreadable_journal,
     iterate_needed_parts,
 )
-from service.sessions.parts import NodeFacts, find_first_seq
+from service.sessions.parts import NodeFacts, compute_warm_up, find_first_seq
 from service.sessions.sealing import write_sealed_files
 from storage.clock.table import ClockTable, StreamClockFacts, group_rows_by_stream_in_given_order
 from storage.edges import read_edges
@@ -129,19 +129,23 @@ class Recorder:
         newest = node.last_seq, node.last_t_ns
         stream = node.present_stream
         coming = node.present_stream_lost_or_pending & stream.obtainable
+        live = node.estimator.live
         seq_first = find_first_seq(stream.make_session_stream(), newest, pre_roll_s, coming)
         session = create_session(
             node.last_info,
             name,
             Part(stream_id=node.stream_id, seq_first=seq_first),
             scene_content=node.hello.scene,
-            calibration=node.estimator.live.calibration,
+            calibration=live.calibration,
             calibration_source=node.estimator.calibration_source,
             subject=subject,
             notes=notes,
             tags=tags,
             take=take,
             request=request,
+            warm_up=compute_warm_up(
+                node.last_info, seq_first, live.settling_time_s, live.unloaded_seq
+            ),
             missed_slots_at_start=stream.missed_slots,
             vitals_at_start=node.vitals,
             clock=stream.list_clock_offsets_since(seq_first),

@@ -2,6 +2,7 @@
 
 Used by `run_simulation` during acquisition, by `estimate` from a file, and by the server live and
 at sealing. Frames wait until a tare is known; estimates are returned together with their frames.
+Warm-up frames, from before the recording, give the models their history, and are not returned.
 """
 
 from __future__ import annotations
@@ -24,7 +25,11 @@ from devices.flags import FrameFlag
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
 from service.estimation.estimate import Estimator, ModelEstimator
-from service.estimation.pipeline.plan import EstimationPlan, make_plan
+from service.estimation.pipeline.plan import (
+    EstimationPlan,
+    compute_settling_time_s,
+    make_plan,
+)
 from service.estimation.quantization import Quantization
 from service.estimation.records import ColumnDict, Estimates
 from service.estimation.tare.tare import Tare
@@ -119,6 +124,7 @@ class EstimateStream:
         plan: first plan of the estimates.
         rounding: rounding of all estimates; known with `plan`.
         tare: tare of the newest frames.
+        settling_time_s: time until its models have settled, with any tare.
     """
 
     def __init__(self, info: ArrayInfo, options: EstimateOptions) -> None:
@@ -131,6 +137,8 @@ class EstimateStream:
         self._tare_changes = 0
         """Number of changes of the tare up to now."""
         self._last_t_mono_ns = 0
+        self._warm_up_left = 0
+        """Number of warm-up frames that still wait for their look-ahead."""
         # Fail early: unknown models, tiles without calibration.
         if options.tare_s is not None and not 0 <= options.tare_s[0] < options.tare_s[1]:
             raise UsageError(
@@ -138,23 +146,36 @@ class EstimateStream:
                 expected="BEGIN,END in seconds from the first frame, BEGIN before END",
             )
         nothing = np.zeros(len(info.tiles))
-        self.make_plan(Tare(nothing, nothing, nothing, nothing, 0, 0.0, 0.0, 0, "interval"))
+        plan = self.make_plan(Tare(nothing, nothing, nothing, nothing, 0, 0.0, 0.0, 0, "interval"))
+        self.settling_time_s = compute_settling_time_s(plan)
 
     def estimate_batches(
-        self, batches: Iterable[tuple[FrameBatch, Columns]], *, is_final: bool = True
+        self,
+        batches: Iterable[tuple[FrameBatch, Columns]],
+        *,
+        warm_up: Iterable[tuple[FrameBatch, Columns]] = (),
+        is_final: bool = True,
     ) -> Iterator[tuple[FrameBatch, ColumnDict]]:
         """Yield frames with their extra columns and estimates, rounded, in order, every frame once.
 
         Args:
             batches: next frames.
+            warm_up: frames just before the first of all, with the same extra columns. They count
+                with the first tare, give none, and are not yielded.
             is_final: True: no more frames will come; else `state_dict` has the frames that wait for
                 their look-ahead.
 
         Raises:
             TareError: no tare can be found.
         """
-        for frames, columns in self._estimate(iter(batches), ends=is_final):
-            yield frames, self.rounding.round_to_steps(columns)
+        for frames, found in self._estimate(iter(batches), warm_up, ends=is_final):
+            before = min(self._warm_up_left, len(frames))
+            self._warm_up_left -= before
+            if not before:
+                yield frames, self.rounding.round_to_steps(found)
+            elif before < len(frames):
+                due = {name: values[before:] for name, values in found.items()}
+                yield frames.slice_rows(before, len(frames)), self.rounding.round_to_steps(due)
 
     def state_dict(self) -> ColumnDict:
         """Return the whole state, to resume from.
@@ -164,7 +185,12 @@ class EstimateStream:
         """
         if self.plan is None or self._run is None:
             raise TareError("the recording has no frames")
-        content = [self.plan.tare.as_dict(), self._tare_changes, self._last_t_mono_ns]
+        content = [
+            self.plan.tare.as_dict(),
+            self._tare_changes,
+            self._last_t_mono_ns,
+            self._warm_up_left,
+        ]
         return {"stream": np.array(json.dumps(content)), **self._run.state_dict()}
 
     def load_state(self, state: ColumnDict) -> None:
@@ -173,7 +199,8 @@ class EstimateStream:
         Raises:
             ValueError: the state is of another one.
         """
-        tare, self._tare_changes, self._last_t_mono_ns = json.loads(str(state["stream"]))
+        content = json.loads(str(state["stream"]))
+        tare, self._tare_changes, self._last_t_mono_ns, self._warm_up_left = content
         first = Tare.from_dict(tare, tiles=len(self._info.tiles))
         self._start_run(self._options.tares[0] if self._options.tares else first)
         tares = (first, *self._options.tares[1:])
@@ -191,7 +218,11 @@ class EstimateStream:
         return self._find_tare([frames for frames, _ in self._read_until_tare(iter(batches))])
 
     def _estimate(
-        self, pieces: Iterator[tuple[FrameBatch, Columns]], *, ends: bool
+        self,
+        pieces: Iterator[tuple[FrameBatch, Columns]],
+        warm_up: Iterable[tuple[FrameBatch, Columns]],
+        *,
+        ends: bool,
     ) -> Iterator[tuple[FrameBatch, ColumnDict]]:
         run = self._run
         if run is None:
@@ -201,6 +232,7 @@ class EstimateStream:
                 read_ahead = self._read_until_tare(pieces)
                 run = self._start_run(self._find_tare([frames for frames, _ in read_ahead]))
                 pieces = chain(read_ahead, pieces)
+            pieces = chain(self._count_warm_up(warm_up), pieces)
         for frames, extra in pieces:
             rest, rest_of = frames, extra
             if not len(rest):
@@ -223,6 +255,13 @@ class EstimateStream:
                 yield from run.feed_frames(rest, rest_of)
         if ends:
             yield from run.flush()
+
+    def _count_warm_up(
+        self, pieces: Iterable[tuple[FrameBatch, Columns]]
+    ) -> Iterator[tuple[FrameBatch, Columns]]:
+        for frames, columns in pieces:
+            self._warm_up_left += len(frames)
+            yield frames, columns
 
     def _start_run(self, tare: Tare) -> EstimateRun:
         self.plan = self.make_plan(tare)

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from devices.arrays import Columns
-from devices.errors import FootTileError, require_extra
+from devices.errors import DamagedFramesError, FootTileError, require_extra
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation import OFFLINE_LAG_MS
 from service.estimation.calibration import Calibration
@@ -26,6 +27,7 @@ from storage.journal.journal import Journal
 from storage.sessions.folder import Session
 from storage.sessions.ledger import find_lost_numbers, mark_damaged_and_abandoned_lost
 from storage.sessions.time_axis import NODE_AXIS, PartSpan, TimeAxis, compute_time_axis
+from storage.sessions.warm_up import with_part_column
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,36 @@ class SessionInputs:
             else StreamClockFacts(stream_id)
             for stream_id in stream_ids
         )
+
+    @cached_property
+    def warm_up(self) -> tuple[FrameBatch, ...]:
+        """Frames just before the session's first part, as far as they are stored and undamaged.
+
+        They are read once: all that uses these inputs has the same ones.
+
+        Raises:
+            StorageError: the journal cannot be read.
+        """
+        before, found = self.session.warm_up, list[FrameBatch]()
+        journal = None if before is None else self.journals.get(before.stream_id)
+        if (
+            before is None
+            or before.seq_last is None
+            or journal is None
+            or before.stream_id != self.session.parts[0].stream_id
+        ):
+            return ()
+        seq = before.seq_first
+        while seq <= before.seq_last:
+            try:
+                for frames in journal.read_frames(seq, before.seq_last):
+                    if len(frames):
+                        found.append(frames)
+                        seq = int(frames.seq[-1]) + 1
+                break
+            except DamagedFramesError as error:  # nobody waits for these: the others do
+                seq = error.seq_last + 1
+        return tuple(found)
 
     def make_clock_table(self) -> ClockTable:
         """Return the clock table of a session that is not sealed yet."""
@@ -258,7 +290,9 @@ class SessionFrames:
             unquantized=sources.unquantized,
         )
         stream = EstimateStream(sources.info, options)
-        for frames, columns in stream.estimate_batches(iterate_raw_frames_with_part(self._inputs)):
+        for frames, columns in stream.estimate_batches(
+            iterate_raw_frames_with_part(sources), warm_up=iterate_warm_up_with_part(sources)
+        ):
             if not self.notes and stream.plan is not None:
                 self.notes = make_estimate_metadata(stream.plan, stream.rounding, sources.tares)
                 if any(tare.is_lost for tare in sources.tares):
@@ -274,6 +308,11 @@ class SessionFrames:
             self.notes["calibration"] = calibration.model_dump(mode="json")
         if tares:
             self.notes["tares"] = [tare.as_dict() for tare in tares]
+
+
+def iterate_warm_up_with_part(inputs: SessionInputs) -> Iterator[tuple[FrameBatch, Columns]]:
+    """Yield the warm-up frames, with the column `part`; read when the first one is taken."""
+    yield from map(with_part_column, inputs.warm_up)
 
 
 def iterate_raw_frames_with_part(

@@ -402,7 +402,12 @@ def compute_present_ledger(session: Session, node: NodeFacts) -> Ledger:
 
 
 def iterate_needed_parts(session: Session, node: NodeFacts) -> Iterator[Part]:
-    """Yield the parts that an unsealed session needs in the journals, possible later ones too."""
+    """Yield the parts that an unsealed session needs in the journals, possible later ones too.
+
+    Its warm-up frames are among them: they are kept, and sent again, but not waited for.
+    """
+    if session.warm_up is not None:
+        yield session.warm_up
     yield from session.parts
     if session.parts[-1].seq_last is None:
         # The stream in which the session was stopped is not known yet.

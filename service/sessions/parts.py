@@ -24,7 +24,7 @@ from devices.frames import ArrayInfo
 from devices.vitals import Vitals
 from service.estimation.calibration import Calibration
 from storage.intervals import NO_END, Intervals
-from storage.journal.journal import Journal
+from storage.journal.journal import RING_DURATION_NS, Journal
 from storage.journal.stream_notes import compute_max_lost_tail_frames
 from storage.sessions.folder import Part, Session
 from storage.sessions.ledger import StreamState
@@ -328,6 +328,34 @@ def find_first_seq(
         coming = coming.restricted_to(max(0, seq_first - back), seq_first - 1)
         seq_first = min((first for first, _ in coming), default=seq_first)
     return seq_first
+
+
+_BEFORE_LOAD_S = 0.1
+"""Time before a load in which the foot was in the air: contact is found late by less."""
+
+
+def compute_warm_up(
+    info: ArrayInfo, seq_first: int, settling_s: float, unloaded_seq: int | None = None
+) -> Part | None:
+    """Return the frames before a session in which models settle; None: its stream begins there.
+
+    Time settles creep and gas, and a load that ends closes loops: frames reach back to the last
+    unloaded one, but not farther than frames of no session are kept. Missing ones may still come.
+
+    Args:
+        info: array of the session's first part.
+        seq_first: first number of the session.
+        settling_s: time that the models need.
+        unloaded_seq: number of the last frame without contact; None: unknown.
+    """
+    if not seq_first:
+        return None
+    rate_hz = info.nominal_rate_hz  # of a slower stream it is a longer time
+    first = seq_first - math.ceil(settling_s * rate_hz)
+    if unloaded_seq is not None:
+        first = min(first, unloaded_seq - math.ceil(_BEFORE_LOAD_S * rate_hz))
+    first = max(0, first, seq_first - math.floor(RING_DURATION_NS * 1e-9 * rate_hz))
+    return Part(stream_id=info.stream_id, seq_first=first, seq_last=seq_first - 1)
 
 
 def reopen_earlier_part(session: Session, node: NodeFacts) -> Session:

@@ -29,7 +29,11 @@ from devices.frames import FrameBatch
 from service.estimation import LIVE_LAG_MS
 from service.estimation.compilation import is_compiling
 from service.sessions.estimate_stream import EstimateOptions, EstimateStream
-from service.sessions.inputs import SessionInputs, iterate_raw_frames_with_part
+from service.sessions.inputs import (
+    SessionInputs,
+    iterate_raw_frames_with_part,
+    iterate_warm_up_with_part,
+)
 from service.sessions.overview import BinnedSlice
 from storage.durable_files import ScratchBlock, ScratchFile
 from storage.formats.slice import Slice
@@ -309,7 +313,9 @@ class SessionPreview:
         due = (
             iter(pieces)
             if self._stream is None
-            else self._stream.estimate_batches(pieces, is_final=False)
+            else self._stream.estimate_batches(
+                pieces, warm_up=iterate_warm_up_with_part(self._inputs), is_final=False
+            )
         )
         names = bin_source_columns(has_estimates=self.has_estimate_stream)
         for estimated, columns in due:

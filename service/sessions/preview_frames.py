@@ -13,7 +13,11 @@ from typing import Any
 from devices.arrays import Columns
 from devices.errors import UsageError
 from devices.frames import FrameBatch
-from service.sessions.inputs import SessionInputs, iterate_raw_frames_with_part
+from service.sessions.inputs import (
+    SessionInputs,
+    iterate_raw_frames_with_part,
+    iterate_warm_up_with_part,
+)
 from service.sessions.preview import SessionPreview
 from storage.formats.export import FrameSource, make_one_pass_frame_source
 from storage.formats.slice import Slice
@@ -97,7 +101,9 @@ class PreviewFrames:
             self._inputs, places[start].part, places[start].seq
         )
         if stream is not None:
-            pieces = stream.estimate_batches(pieces)
+            pieces = stream.estimate_batches(
+                pieces, warm_up=iterate_warm_up_with_part(self._inputs)
+            )
         for frames, columns in pieces:
             if stream is not None and not self.notes:
                 self.notes = {ROUNDING_STEP_KEY: stream.rounding.collect_flat_column_steps()}

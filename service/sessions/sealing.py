@@ -30,6 +30,7 @@ from storage.sessions.metadata import (
     write_markers,
     write_sha256_sums,
 )
+from storage.sessions.warm_up import write_or_delete_warm_up
 from storage.sessions.writer import SealedFileWriter
 from storage.verify.sealed_file import verify_sealed_file
 
@@ -55,6 +56,7 @@ def write_sealed_files(inputs: SessionInputs, folder: Path, ledger: Ledger) -> S
     count = duration_ns = earlier_ns = part_begin_ns = 0
     notes: dict[str, object] = {
         **inputs.notes,
+        **write_or_delete_warm_up(folder, inputs.info, inputs.warm_up),
         "session": session.model_dump(
             mode="json",
             include=_FIELDS_IN_FILE

@@ -30,6 +30,7 @@ from storage.durable_files import (
 )
 
 FRAMES_NAME = "frames.parquet"
+WARM_UP_NAME = "warm_up.parquet"
 DELETED_PREFIX = ".deleted-"
 SESSION_ID = re.compile(r"[0-9]{8}T[0-9]{6}Z-[0-9a-f]{6}")
 
@@ -141,6 +142,9 @@ class Session(_Record):
     """Start in the server's UTC."""
     stopped_t_ns: int | None = None
     parts: tuple[Part, ...]
+    warm_up: Part | None = None
+    """Frames just before the first part, for the models' history; no part of the session, which
+    waits for none of them."""
     subject: str = ""
     notes: str = ""
     tags: tuple[str, ...] = ()

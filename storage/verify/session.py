@@ -7,16 +7,16 @@ a check that finds problems, the check is repeated.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from devices.errors import FileFormatError, OtherVersionError, StorageError
+from devices.errors import DamagedFileError, FileFormatError, OtherVersionError, StorageError
 from storage.clock.table import CLOCK_NAME, read_clock_file
 from storage.intervals import NO_END, Intervals
 from storage.parquet_hash import compute_sha256
-from storage.sessions.folder import FRAMES_NAME, Ledger, Marker, Session
+from storage.sessions.folder import FRAMES_NAME, WARM_UP_NAME, Ledger, Marker, Session
 from storage.sessions.ledger import compute_ledger, mark_damaged_and_abandoned_lost
 from storage.sessions.metadata import (
     MARKERS_NAME,
@@ -32,6 +32,7 @@ from storage.sessions.metadata import (
 from storage.sessions.overview import OVERVIEW_NAME, open_overview
 from storage.sessions.stances import STANCES_NAME, read_stances
 from storage.sessions.videos import verify_videos
+from storage.sessions.warm_up import read_warm_up
 from storage.verify.journal import StreamReport, verify_journal
 from storage.verify.sealed_file import (
     SealedFileReport,
@@ -187,6 +188,7 @@ def _check_sealed(report: SessionReport, folder: Path, metadata: StoredMetadata)
     session = metadata.session
     _check_events(report, folder / MARKERS_NAME, session.markers if session is not None else None)
     _check_clock(report, folder / CLOCK_NAME, session)
+    _check_warm_up(report, file.notes)
     _check_sums(problems, folder, str(content.get("sha256")))
     stances, overview = folder / STANCES_NAME, folder / OVERVIEW_NAME
     _check_derived_file(report, stances, lambda path: read_stances(path).frames_sha256)
@@ -277,6 +279,25 @@ def _check_clock(report: SessionReport, path: Path, session: Session | None) -> 
     by_stream = sorted(session.clock, key=lambda row: row.stream_id)
     if by_stream and sorted(stored.offsets, key=lambda row: row.stream_id) != by_stream:
         report.problems.append(f"{path.name} has other rows than {SESSION_NAME}")
+
+
+def _check_warm_up(report: SessionReport, notes: Mapping[str, object]) -> None:
+    """Verify the warm-up frames; the session is whole without them.
+
+    Args:
+        report: findings are added here.
+        notes: notes of the session's frames, which have their hash.
+    """
+    try:
+        read_warm_up(report.path / FRAMES_NAME, notes)
+    except DamagedFileError as error:
+        report.problems.append(
+            f"{WARM_UP_NAME}: {error.what}; deleted, `foottile estimate` begins without history"
+        )
+    except FileFormatError as error:
+        report.unproven.append(
+            f"{WARM_UP_NAME} {error.what}: `foottile estimate` begins without history"
+        )
 
 
 def _check_derived_file(

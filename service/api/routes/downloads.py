@@ -46,7 +46,7 @@ from storage.formats.slice import Slice
 from storage.formats.writers.format import DrainedBuffer
 from storage.formats.writers.registry import FORMATS
 from storage.formats.writers.tables import PARQUET
-from storage.sessions.folder import FRAMES_NAME, Session
+from storage.sessions.folder import FRAMES_NAME, WARM_UP_NAME, Session
 from storage.sessions.metadata import MARKERS_NAME, SESSION_NAME, SUMS_NAME
 from storage.sessions.stances import STANCES_NAME
 
@@ -171,7 +171,7 @@ _ZIP_DATES_S = (315_619_200, 4_354_732_800)
 
 Files of 1970, from a machine without a clock, get the nearest date.
 """
-_SIDECARS = (MARKERS_NAME, CLOCK_NAME, STANCES_NAME, SUMS_NAME)
+_SIDECARS = (MARKERS_NAME, CLOCK_NAME, WARM_UP_NAME, STANCES_NAME, SUMS_NAME)
 """Files beside the frames. Each can be verified; without estimates there are no stances."""
 
 

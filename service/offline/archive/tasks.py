@@ -26,7 +26,7 @@ from storage.clock.table import CLOCK_NAME
 from storage.documents import append_json_checksum
 from storage.formats.writers.registry import get_format
 from storage.parquet_hash import compute_sha256
-from storage.sessions.folder import FRAMES_NAME
+from storage.sessions.folder import FRAMES_NAME, WARM_UP_NAME
 from storage.sessions.metadata import (
     LEDGER_NAME,
     MARKERS_NAME,
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from service.offline.comparison import CompareOptions
     from service.offline.estimate.session import EstimateResult
 
-_SIDECAR_NAMES = (MARKERS_NAME, CLOCK_NAME, LEDGER_NAME, PULLED_MARKERS_NAME)
+_SIDECAR_NAMES = (MARKERS_NAME, CLOCK_NAME, WARM_UP_NAME, LEDGER_NAME, PULLED_MARKERS_NAME)
 
 
 class SessionTask(Protocol):

@@ -1,8 +1,9 @@
 """Preparation of a session's re-estimation: options, time range, calibration, models, tares.
 
 Models have state: rubber creep, gas temperature, temperature trend. They start before the part by
-several times their longest time constant, so that the effect of earlier frames is small. State
-without a time limit, such as open hysteresis loops and past faults, starts empty.
+several times their longest time constant, so that the effect of earlier frames is small; before the
+session's first frame with its warm-up frames. State without a time limit, such as open hysteresis
+loops and past faults, starts empty.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from storage.formats.slice import Slice
 from storage.schema import INDENTER_COLUMNS, PART_COLUMNS, TRUTH_COLUMNS
 from storage.sessions.reader import SealedFileReader
 from storage.sessions.time_axis import NODE_AXIS, TimeAxis
+from storage.sessions.warm_up import read_warm_up, with_part_column
 
 _ALL = Slice()
 CHUNK_FRAMES = 1 << 20
@@ -147,6 +149,26 @@ def compute_estimation_range(
     until_ns = None if end_ns is None else end_ns + plan.lag_ns + _READ_MARGIN_NS
     groups = tuple(session.find_overlapping_row_groups(from_ns, until_ns))
     return EstimationRange(from_ns, begin_ns, end_ns, until_ns, groups, session.time_axis)
+
+
+def read_warm_up_or_remark(
+    session: SealedFileReader, stretch: EstimationRange, on_remark: Callable[[str], None]
+) -> Iterator[BatchWithColumns]:
+    """Yield a session's warm-up frames, if models run from its begin; none if they are damaged.
+
+    Args:
+        session: the session.
+        stretch: range of the estimate.
+        on_remark: called if there should be some and there are none.
+    """
+    if stretch.run_from_ns is not None:
+        return
+    try:
+        found = read_warm_up(session.path, session.notes)
+    except FileFormatError as error:
+        on_remark(f"models begin without history, as far as flags and sigma say: {error}")
+        return
+    yield from map(with_part_column, found)
 
 
 def select_tares_in_force(tares: Sequence[Tare], from_ns: int | None) -> tuple[Tare, ...]:

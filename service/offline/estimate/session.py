@@ -33,6 +33,7 @@ from service.offline.estimate.preparation import (
     PreparedEstimate,
     compute_estimation_range,
     prepare_estimate,
+    read_warm_up_or_remark,
     select_tares_in_force,
 )
 from service.offline.estimate.table_angle import AngleTrack, TableServo
@@ -48,9 +49,10 @@ from storage.sessions.folder import FRAMES_NAME
 from storage.sessions.ledger import iterate_checking_order
 from storage.sessions.reader import SealedFileReader
 from storage.sessions.time_axis import TIME_AXIS_NOTE
+from storage.sessions.warm_up import WARM_UP_NOTE
 from storage.sessions.writer import SealedFileWriter
 
-_WHOLE_SESSION_NOTES = frozenset({"session", "ledger"})
+_WHOLE_SESSION_NOTES = frozenset({"session", "ledger", WARM_UP_NOTE})
 """Notes of a session that do not hold for a part."""
 _ESTIMATOR_NOTE = "estimator"
 """Note of the estimator, if it is not that of the models."""
@@ -141,7 +143,13 @@ def estimate_session(
         )
         if servo is not None:
             ordered = servo.replace_positions(ordered)
-        given = stretch.select_output(stream.estimate_batches(stretch.select_needed(ordered)))
+        before = read_warm_up_or_remark(session, stretch, on_remark)
+        if angle is not None:
+            of_table = TableServo(info, request.scene, angle, session.time_axis)
+            before = of_table.replace_positions(before)
+        given = stretch.select_output(
+            stream.estimate_batches(stretch.select_needed(ordered), warm_up=before)
+        )
         watched = given if judged is None else judged.observe(given, stream)
         if servo is not None:
             watched = servo.restore_positions(watched)
@@ -335,7 +343,9 @@ def estimate_next_chunk(
 
         def yield_estimates() -> Iterator[BatchWithColumns]:
             yield from stream.estimate_batches(
-                iterate_checking_order(source_frames(), where=str(source)), is_final=False
+                iterate_checking_order(source_frames(), where=str(source)),
+                warm_up=read_warm_up_or_remark(session, EstimationRange(), on_remark),
+                is_final=False,
             )
             if done + len(taken) == len(rows):
                 yield from stream.estimate_batches((), is_final=True)

@@ -20,7 +20,7 @@ from service.estimation import LIVE_LAG_MS, LONG_GAP_NS
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.compilation import is_compiling
 from service.estimation.models.static import StaticParams, compute_forces
-from service.estimation.pipeline.plan import EstimationPlan, make_plan
+from service.estimation.pipeline.plan import SETTLING_MIN_S, EstimationPlan, make_plan
 from service.estimation.records import ColumnDict
 from service.estimation.tare.automatic import (
     HISTORY_NS,
@@ -212,8 +212,12 @@ class LiveEstimator:
         """Id of the calibration in use: a hash that is slow to compute."""
         self.ranges: TileRanges | None = None
         """Calibrated ranges of the tiles; None without a calibration."""
+        self.settling_time_s = SETTLING_MIN_S
+        """Time until the models have settled; the shortest one without a calibration."""
         self.airborne_since_t_ns: int | None = None
         """Time since which all estimates are without contact; None: not yet."""
+        self.unloaded_seq: int | None = None
+        """Number of the newest frame without contact; None: not yet."""
         self._run: EstimateRun | None = None
         self._recent: deque[FrameBatch] = deque()
         self._flushed: list[tuple[FrameBatch, ColumnDict]] = []
@@ -225,7 +229,8 @@ class LiveEstimator:
             self.epochs = previous.epochs
         if calibration is not None:
             try:
-                EstimateStream(info, EstimateOptions(calibration, info.models, LIVE_LAG_MS))
+                options = EstimateOptions(calibration, info.models, LIVE_LAG_MS)
+                self.settling_time_s = EstimateStream(info, options).settling_time_s
                 self.calibration = calibration
                 self.calibration_id = calibration.id
                 self.ranges = TileRanges.from_calibration(info, calibration)
@@ -399,6 +404,8 @@ class LiveEstimator:
 
     def _update_contact(self, frames: FrameBatch, columns: ColumnDict) -> None:
         t_ns = frames.t_ns
+        if len(unloaded := np.flatnonzero(columns["contact"] == 0)):
+            self.unloaded_seq = int(frames.seq[unloaded[-1]])
         before_t_ns = self._estimated_t_ns if self._estimated_t_ns is not None else int(t_ns[0])
         may_have_contact = columns["contact"] != 0  # in contact, or unknown
         # A gap that is too short for a step, such as a missed slot, cannot hide a contact.

@@ -30,7 +30,7 @@ from service.server.server import Server
 from service.user_folders import PublicText
 from storage.clock.table import CLOCK_NAME, ClockSummary
 from storage.formats.writers.tables import PARQUET
-from storage.sessions.folder import FRAMES_NAME, Ledger
+from storage.sessions.folder import FRAMES_NAME, WARM_UP_NAME, Ledger
 from storage.sessions.metadata import load_clock_table
 from storage.verify.session import verify_session
 
@@ -169,6 +169,24 @@ async def get_clock(
         table = server.recorder.collect_inputs_from_journals(session_id).make_clock_table()
         return await run_in_threadpool(table.summarize_streams)
     return await run_in_threadpool(_read_sealed_clock, session_id, server)
+
+
+@router.get(
+    "/{session_id}/warm-up",
+    summary="Frames before the session",
+    response_class=Response,
+    responses=problem_responses(
+        {200: {"description": "The stored frames.", "content": {_PARQUET: {}}}},
+        _404="No such session, or its models had no history.",
+        _409="They are stored when the session is sealed.",
+    ),
+)
+async def get_warm_up(session_id: str, server: ServerState) -> Response:
+    """Return `warm_up.parquet`: the frames from which the session's models had their history."""
+    session = server.sessions.get_session(session_id)
+    return stored_table_response(
+        session, server.sessions.folder.get_path(session_id) / WARM_UP_NAME
+    )
 
 
 def _read_sealed_clock(session_id: str, server: Server) -> ClockSummary:
