@@ -109,8 +109,8 @@ def pull_session(server: foottile.Client, session_id: str, out_folder: Path) -> 
     for name, content in (("session", session), ("markers", markers), ("ledger", ledger)):
         write_checksummed_json(folder / f"{name}.json", json.dumps(content, indent=1).encode())
     for name in ("markers", "clock", "warm-up"):
-        path = folder / f"{name.replace('-', '_')}.parquet"
-        _pull_table(server, f"/sessions/{session_id}/{name}", path)
+        table = f"{name.replace('-', '_')}.parquet"
+        _pull_table(server, f"/sessions/{session_id}/{name}", folder / table)
     write_sha256_sums(folder, session["sha256"])
     return {**session, "path": str(path), "resumed_bytes": resumed}
 

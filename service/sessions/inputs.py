@@ -6,9 +6,8 @@ and `foottile recover` estimate only when they seal. Without numba and scipy fra
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,13 @@ from devices.frames import ArrayInfo, FrameBatch
 from service.estimation import OFFLINE_LAG_MS
 from service.estimation.calibration import Calibration
 from service.estimation.tare.tare import Tare
-from service.sessions.parts import RATE_MAX_HZ, NodeFacts, SessionStream, close_at_likely_end
+from service.sessions.parts import (
+    RATE_MAX_HZ,
+    NodeFacts,
+    SessionStream,
+    close_at_likely_end,
+    find_usable_warm_up,
+)
 from service.sessions.tares import TareHistory
 from storage.clock.table import ClockTable, StreamClockFacts, group_rows_by_stream_in_given_order
 from storage.intervals import NO_END
@@ -66,36 +71,6 @@ class SessionInputs:
             else StreamClockFacts(stream_id)
             for stream_id in stream_ids
         )
-
-    @cached_property
-    def warm_up(self) -> tuple[FrameBatch, ...]:
-        """Frames just before the session's first part, as far as they are stored and undamaged.
-
-        They are read once: all that uses these inputs has the same ones.
-
-        Raises:
-            StorageError: the journal cannot be read.
-        """
-        before, found = self.session.warm_up, list[FrameBatch]()
-        journal = None if before is None else self.journals.get(before.stream_id)
-        if (
-            before is None
-            or before.seq_last is None
-            or journal is None
-            or before.stream_id != self.session.parts[0].stream_id
-        ):
-            return ()
-        seq = before.seq_first
-        while seq <= before.seq_last:
-            try:
-                for frames in journal.read_frames(seq, before.seq_last):
-                    if len(frames):
-                        found.append(frames)
-                        seq = int(frames.seq[-1]) + 1
-                break
-            except DamagedFramesError as error:  # nobody waits for these: the others do
-                seq = error.seq_last + 1
-        return tuple(found)
 
     def make_clock_table(self) -> ClockTable:
         """Return the clock table of a session that is not sealed yet."""
@@ -250,12 +225,17 @@ class SessionFrames:
 
     After the first frames, `notes` has the file's metadata of the estimates, and `problem` the
     reason why there are none, or not for all frames.
+
+    Args:
+        inputs: inputs of the session.
+        warm_up: frames before the first one, for the models' history.
     """
 
-    def __init__(self, inputs: SessionInputs) -> None:
+    def __init__(self, inputs: SessionInputs, warm_up: Iterable[FrameBatch] = ()) -> None:
         self.notes: dict[str, Any] = {}
         self.problem: str | None = None
         self._inputs = inputs
+        self._warm_up = warm_up
 
     def __iter__(self) -> Iterator[tuple[FrameBatch, Columns]]:
         if self._inputs.calibration is None:
@@ -291,7 +271,7 @@ class SessionFrames:
         )
         stream = EstimateStream(sources.info, options)
         for frames, columns in stream.estimate_batches(
-            iterate_raw_frames_with_part(sources), warm_up=iterate_warm_up_with_part(sources)
+            iterate_raw_frames_with_part(sources), warm_up=map(with_part_column, self._warm_up)
         ):
             if not self.notes and stream.plan is not None:
                 self.notes = make_estimate_metadata(stream.plan, stream.rounding, sources.tares)
@@ -310,9 +290,25 @@ class SessionFrames:
             self.notes["tares"] = [tare.as_dict() for tare in tares]
 
 
-def iterate_warm_up_with_part(inputs: SessionInputs) -> Iterator[tuple[FrameBatch, Columns]]:
-    """Yield the warm-up frames, with the column `part`; read when the first one is taken."""
-    yield from map(with_part_column, inputs.warm_up)
+def iterate_warm_up(inputs: SessionInputs) -> Iterator[FrameBatch]:
+    """Yield the frames just before the session's first part that are stored and undamaged.
+
+    Raises:
+        StorageError: the journal cannot be read.
+    """
+    if (before := find_usable_warm_up(inputs.session)) is None:
+        return
+    journal, seq, last = inputs.journals.get(before.stream_id), before.seq_first, before.seq_last
+    while journal is not None and last is not None and seq <= last:
+        try:
+            for frames in journal.read_frames(seq, last):
+                if len(frames):
+                    yield frames
+                    seq = int(frames.seq[-1]) + 1
+        except DamagedFramesError as error:  # nobody waits for these: the others do
+            seq = error.seq_last + 1
+        else:
+            return
 
 
 def iterate_raw_frames_with_part(

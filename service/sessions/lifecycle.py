@@ -42,6 +42,7 @@ from service.sessions.parts import (
     close_where_stream_passed_stop,
     find_begin_t_ns,
     find_later_streams,
+    find_usable_warm_up,
     has_begun_before_stop,
     reopen_earlier_part,
 )
@@ -406,8 +407,8 @@ def iterate_needed_parts(session: Session, node: NodeFacts) -> Iterator[Part]:
 
     Its warm-up frames are among them: they are kept, and sent again, but not waited for.
     """
-    if session.warm_up is not None:
-        yield session.warm_up
+    if (warm_up := find_usable_warm_up(session)) is not None:
+        yield warm_up
     yield from session.parts
     if session.parts[-1].seq_last is None:
         # The stream in which the session was stopped is not known yet.

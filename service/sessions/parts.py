@@ -358,6 +358,12 @@ def compute_warm_up(
     return Part(stream_id=info.stream_id, seq_first=first, seq_last=seq_first - 1)
 
 
+def find_usable_warm_up(session: Session) -> Part | None:
+    """Return the warm-up frames; None if the session turned out to begin with a later stream."""
+    before = session.warm_up
+    return before if before and before.stream_id == session.parts[0].stream_id else None
+
+
 def reopen_earlier_part(session: Session, node: NodeFacts) -> Session:
     """Return the session with its open end in an earlier stream that was resumed.
 

@@ -32,7 +32,7 @@ from service.sessions.estimate_stream import EstimateOptions, EstimateStream
 from service.sessions.inputs import (
     SessionInputs,
     iterate_raw_frames_with_part,
-    iterate_warm_up_with_part,
+    iterate_warm_up,
 )
 from service.sessions.overview import BinnedSlice
 from storage.durable_files import ScratchBlock, ScratchFile
@@ -45,6 +45,7 @@ from storage.sessions.pyramid import (
     select_and_downsample_bins,
     shift_bins_to_axis,
 )
+from storage.sessions.warm_up import with_part_column
 
 CHECKPOINT_FRAMES = 6144
 """Least distance between two checkpoints, in frames. Estimating so many frames of eight tiles takes
@@ -314,7 +315,7 @@ class SessionPreview:
             iter(pieces)
             if self._stream is None
             else self._stream.estimate_batches(
-                pieces, warm_up=iterate_warm_up_with_part(self._inputs), is_final=False
+                pieces, warm_up=map(with_part_column, iterate_warm_up(self._inputs)), is_final=False
             )
         )
         names = bin_source_columns(has_estimates=self.has_estimate_stream)

@@ -16,7 +16,7 @@ from devices.frames import FrameBatch
 from service.sessions.inputs import (
     SessionInputs,
     iterate_raw_frames_with_part,
-    iterate_warm_up_with_part,
+    iterate_warm_up,
 )
 from service.sessions.preview import SessionPreview
 from storage.formats.export import FrameSource, make_one_pass_frame_source
@@ -24,6 +24,7 @@ from storage.formats.slice import Slice
 from storage.intervals import NO_END
 from storage.schema import ROUNDING_STEP_KEY
 from storage.sessions.time_axis import NODE_AXIS
+from storage.sessions.warm_up import with_part_column
 
 Pieces = Iterator[tuple[FrameBatch, Columns]]
 
@@ -102,7 +103,7 @@ class PreviewFrames:
         )
         if stream is not None:
             pieces = stream.estimate_batches(
-                pieces, warm_up=iterate_warm_up_with_part(self._inputs)
+                pieces, warm_up=map(with_part_column, iterate_warm_up(self._inputs))
             )
         for frames, columns in pieces:
             if stream is not None and not self.notes:

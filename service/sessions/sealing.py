@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from devices.errors import DamagedFileError, FileFormatError, StorageError
 from service.sessions.edges import collect_edge_markers
-from service.sessions.inputs import SessionFrames, SessionInputs
+from service.sessions.inputs import SessionFrames, SessionInputs, iterate_warm_up
 from service.sessions.overview import OverviewWriter
 from service.sessions.stances import StancesWriter
 from storage.clock.table import CLOCK_NAME, read_clock_file, write_clock_file
@@ -50,13 +50,14 @@ def write_sealed_files(inputs: SessionInputs, folder: Path, ledger: Ledger) -> S
     if not ledger.recorded:
         update = {"state": "sealed", "ledger": ledger, "problem": "no frame was recorded"}
         return session.model_copy(update=update)
-    frames, stances = SessionFrames(inputs), StancesWriter()
+    warm_up = tuple(iterate_warm_up(inputs))  # read once: more may come
+    frames, stances = SessionFrames(inputs, warm_up), StancesWriter()
     overview = OverviewWriter(len(inputs.info.tiles))
     path = folder / FRAMES_NAME
     count = duration_ns = earlier_ns = part_begin_ns = 0
     notes: dict[str, object] = {
         **inputs.notes,
-        **write_or_delete_warm_up(folder, inputs.info, inputs.warm_up),
+        **write_or_delete_warm_up(folder, inputs.info, warm_up),
         "session": session.model_dump(
             mode="json",
             include=_FIELDS_IN_FILE

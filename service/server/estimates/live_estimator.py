@@ -226,7 +226,7 @@ class LiveEstimator:
         self.epochs = EpochHistory()
         """Epochs of the estimates, to recompute frames as they were."""
         if previous is not None and previous.info.stream_id == info.stream_id:
-            self.epochs = previous.epochs
+            self.epochs, self.unloaded_seq = previous.epochs, previous.unloaded_seq
         if calibration is not None:
             try:
                 options = EstimateOptions(calibration, info.models, LIVE_LAG_MS)

@@ -43,7 +43,7 @@ def test_a_pulled_session_has_the_file_and_verified_sidecars(
     folder = tmp_path / sealed.id
     assert {path.name for path in folder.iterdir()} == {
         *("frames.parquet", "session.json", "markers.json", "markers.parquet", "ledger.json"),
-        *("clock.parquet", "SHA256SUMS"),
+        *("clock.parquet", "warm_up.parquet", "SHA256SUMS"),
     }
     subprocess.run(["sha256sum", "--check", "--strict", "SHA256SUMS"], cwd=folder, check=True)
     written_ns = Path(pulled["path"]).stat().st_mtime_ns

@@ -54,6 +54,16 @@ def test_what_was_before_a_session_is_kept_until_it_is_sealed(
     assert session.frames().seq[0] == first
 
 
+def test_a_foot_that_stands_for_long_has_the_frames_since_it_was_in_the_air(
+    running: Running, tared: FakeNode
+) -> None:
+    tared.deliver(200)
+    tared.deliver(6000, [20.0, 60.0])  # models settle in 5000
+    tared.record()
+    ((first, _),) = needed_of(running, tared)
+    assert 200 < first < 270  # the last one in the air, and a little before
+
+
 def test_a_session_does_not_wait_for_the_frames_before_it(tared: FakeNode) -> None:
     tared.frames(100)  # which the node has, and does not send
     tared.deliver(50, [20.0, 60.0])
