@@ -63,7 +63,7 @@ export function makeTakeRow(sessions, pick) {
     el("div", { cls: "c-take", role: "cell", "aria-colspan": String(HEADS.length) },
       el("span", { cls: "take-word", text: "Take" }), " ", el("strong", { text: names.join(", ") }),
       el("span", { cls: "why", text: ` ${started}, ${sessions.length} nodes: ${sessions.map(({ node }) => node).join(", ")}` }),
-      share ? el("span", { cls: "take-missed", text: `, up to ${percentText(share)} not sampled` }) : ""));
+      share ? el("span", { cls: "why take-missed", text: `, up to ${percentText(share)} not sampled` }) : ""));
 }
 
 /** Return the texts that change during a recording, by class. @param {SessionView} session */
