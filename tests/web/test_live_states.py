@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import cycle
 
 import numpy as np
 import pytest
@@ -264,11 +265,22 @@ def test_force_and_numbers_and_foot_are_of_one_frame(
         within = {page: 0.16, cards: 1.1}  # of rounding: tenths on the page, newtons on a card
         for one in within:
             one.wait_for_function("window.seen.length > 0")
-        for force_n in (5.0, 15.0) * 10:  # it changes all the time
-            play.force_n = force_n
+        forces_n = cycle((5.0, 15.0))
+
+        def change() -> bool:
+            """Change the force; return whether both pages have shown changes."""
+            play.force_n = next(forces_n)
             page.wait_for_timeout(170)
+            return all(len(seen := seen_by(one)) and np.ptp(seen[:, 0]) > 15.0 for one in within)
+
+        for _ in range(20):
+            change()
+        until(change)
     for one, within_n in within.items():
-        seen = np.array(one.evaluate("window.seen.slice(1)"))  # in each picture
-        force_n, sum_n = seen.T
-        assert np.ptp(force_n) > 15.0
+        force_n, sum_n = seen_by(one).T
         assert sum_n == pytest.approx(force_n, abs=within_n)
+
+
+def seen_by(page: Page) -> np.ndarray:
+    """Force and sum of the numbers in each picture."""
+    return np.array(page.evaluate("window.seen.slice(1)"))

@@ -71,22 +71,20 @@ setInterval(() => {
 """
 
 
-def switch(page: Page, title: str) -> str:
-    """Press a switch of the device's menu, and return the state that it shows."""
+def switch(page: Page, title: str, state: str) -> None:
+    """Press a switch of the device's menu, which then shows this state."""
     page.click("#device")
     item = page.get_by_role("menuitemcheckbox", name=title)
     item.click()
-    page.wait_for_timeout(300)
-    state = item.locator("small").inner_text()
+    expect(item.locator("small")).to_have_text(state)
     page.keyboard.press("Escape")
-    return state
 
 
 def test_the_screen_is_locked_on_and_again_when_the_page_is_back(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     page = open_page(scripted.url, *PHONE, first=LOCKS)
-    assert switch(page, "Keep screen on") == "screen stays on"
+    switch(page, "Keep screen on", "screen stays on")
     page.evaluate("locks.at(-1).release()")
     expect(page.locator("#device")).to_have_text("⚠")
     expect(page.locator("#notices")).to_contain_text("The screen may go dark: the device refuses")
@@ -104,7 +102,7 @@ def test_the_screen_is_locked_on_and_again_when_the_page_is_back(
     page.click("#device")
     assert complaints_at(page, PHONE, SMALL_PHONE) == []
     page.keyboard.press("Escape")
-    assert switch(page, "Keep screen on") == "off"
+    switch(page, "Keep screen on", "off")
     expect(page.locator("#notices")).not_to_contain_text("dark")
 
 
@@ -114,7 +112,7 @@ def test_over_plain_http_a_silent_video_keeps_the_screen_on_after_a_tap(
     address = scripted.url.replace("127.0.0.1", "192.0.2.1")
     page = open_page(f"{address}/nodes", *PHONE, first=BLOCKED_VIDEO)
     assert page.evaluate("navigator.wakeLock") is None
-    assert switch(page, "Keep screen on") == "screen stays on"
+    switch(page, "Keep screen on", "screen stays on")
     page.reload()
     expect(page.locator("#notices")).to_contain_text("The screen may go dark: tap this page once.")
     page.mouse.click(200, 400)
@@ -123,7 +121,7 @@ def test_over_plain_http_a_silent_video_keeps_the_screen_on_after_a_tap(
     expect(video).to_have_js_property("paused", False)
     page.wait_for_timeout(3000)  # beyond the first rewind
     expect(video).to_have_js_property("paused", False)
-    assert switch(page, "Keep screen on") == "off"
+    switch(page, "Keep screen on", "off")
     expect(video).to_have_count(0)
 
 
@@ -136,8 +134,8 @@ def test_alerts_sound_and_buzz_once_and_their_reasons_stay(
         expect(page.locator("#last-session")).to_contain_text("before")
         assert page.evaluate("tones.length + buzzes.length") == 0
         expect(page.locator("#notices")).to_be_empty()
-        assert switch(page, "Sound") == "on"
-        assert switch(page, "Vibration") == "on"
+        switch(page, "Sound", "on")
+        switch(page, "Vibration", "on")
         assert page.evaluate("[tones.length, buzzes.length]") == [1, 1]
         play.force_n = 200.0
         notices = page.locator("#notices")
