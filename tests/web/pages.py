@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -20,7 +21,11 @@ _RUN_AXE = "axe.run(document, { resultTypes: ['violations'] }).then((found) => f
 
 def live(page: Page) -> Page:
     """The page, once it shows data."""
-    expect(page.locator(LIVE)).to_have_count(1)
+    try:
+        expect(page.locator(LIVE)).to_have_count(1)
+    except AssertionError:
+        sys.stderr.write(f"{page.url} is not live, but says:\n{page.inner_text('body')}\n")
+        raise
     return page
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
-from playwright.sync_api import Error, sync_playwright
+from playwright.sync_api import Error, Playwright
 
 from service.api.certificates import OwnAuthority
 from tests.service.patient import be_patient
@@ -39,9 +39,8 @@ def secure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Ow
 
 
 @pytest.mark.slow(parts=8)
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium; on Debian: apt-get install chromium")
 def test_a_page_over_tls_is_a_secure_context(
-    secure: tuple[OwnAuthority, int], tmp_path: Path
+    secure: tuple[OwnAuthority, int], playwright: Playwright, tmp_path: Path
 ) -> None:
     authority, port = secure
     options = [*CHROMIUM_OPTIONS, "--host-resolver-rules=MAP foottile.local 127.0.0.1"]
@@ -57,21 +56,20 @@ def test_a_page_over_tls_is_a_secure_context(
         digest = base64.b64encode(hashlib.sha256(spki).digest()).decode()
         trusting.append(f"--ignore-certificate-errors-spki-list={digest}")
     (tmp_path / "other").mkdir()
-    with sync_playwright() as playwright:
-        for home, args in ((tmp_path, trusting), (tmp_path / "other", options)):
-            browser = playwright.chromium.launch(
-                executable_path=CHROMIUM, args=args, env={**os.environ, "HOME": str(home)}
-            )
-            page = browser.new_page()
-            for host in ("127.0.0.1", "foottile.local"):
-                url = f"https://{host}:{port}/sessions"
-                if args is trusting:
+    for home, args in ((tmp_path, trusting), (tmp_path / "other", options)):
+        browser = playwright.chromium.launch(
+            executable_path=CHROMIUM, args=args, env={**os.environ, "HOME": str(home)}
+        )
+        page = browser.new_page()
+        for host in ("127.0.0.1", "foottile.local"):
+            url = f"https://{host}:{port}/sessions"
+            if args is trusting:
+                page.goto(url)
+                assert page.evaluate("isSecureContext")
+            else:
+                with pytest.raises(Error, match="ERR_CERT_AUTHORITY_INVALID"):
                     page.goto(url)
-                    assert page.evaluate("isSecureContext")
-                else:
-                    with pytest.raises(Error, match="ERR_CERT_AUTHORITY_INVALID"):
-                        page.goto(url)
-            browser.close()
+        browser.close()
 
 
 @pytest.mark.slow(parts=8)
