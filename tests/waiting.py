@@ -21,9 +21,13 @@ Who claims a time measures it."""
 def in_a_loop(test: Callable[P, Coroutine[Any, Any, None]]) -> Callable[P, None]:
     """A test that is a coroutine, run in an event loop of its own; its waits end."""
 
+    async def run_for_a_time(*arguments: P.args, **options: P.kwargs) -> None:
+        async with asyncio.timeout(4 * PATIENCE_S):  # in the same task, unlike `wait_for`
+            await test(*arguments, **options)
+
     @functools.wraps(test)
     def run(*arguments: P.args, **options: P.kwargs) -> None:
-        asyncio.run(asyncio.wait_for(test(*arguments, **options), 4 * PATIENCE_S))
+        asyncio.run(run_for_a_time(*arguments, **options))
 
     return run
 
