@@ -167,7 +167,7 @@ class ServerNode:
 
     @property
     def clock_offset(self) -> ClockOffset | None:
-        """Latest offset of its clock in the present stream; None before the first measurement."""
+        """Latest offset of its clock in the present stream; None: not measured yet."""
         return self.present_stream.clock_offset
 
     @property

@@ -90,8 +90,8 @@ class SessionClocks:
                 # A log may be long: read it only if the session lacks its newest row.
                 if (
                     stream is not None
-                    and stream.clock_offset is not None
-                    and (stream.clock_offset.t_mono_ns > max(times_ns, default=-1))
+                    and stream.clock_offsets
+                    and (stream.clock_offsets[-1].t_mono_ns > max(times_ns, default=-1))
                 ):
                     session = session.with_newer_clock_rows(stream.read_clock_offsets())
         except StorageError as error:  # frames matter more than clock measurements

@@ -8,6 +8,9 @@ states its clock and its next number, and from the server's clock, which counts 
 steps (`devices.clock`). A node's clock gains no more on it than `DISCIPLINE_RATE_LIMIT`; it
 may fall behind, where the node was suspended. So neither a date that was set nor an offset that the
 node measured changes them, and frames of the past are never beyond them.
+
+A server that is started anew may have another date. Offsets in the log are then of a former clock:
+hello, which is later than the node's clock in it, shows whether the latest one still applies.
 """
 
 from __future__ import annotations
@@ -90,6 +93,21 @@ class StreamLimit:
         off_ns = abs(t_mono_ns - self._clock_ns(now_t_ns))
         return off_ns <= self._tolerance_ns(now_t_ns) + uncertainty_ns
 
+    def is_offset_of_this_clock(self, row: ClockOffset, utc_offset_ns: int) -> bool:
+        """Return whether a former measurement can be of the server's present clock.
+
+        It bounds the offset from above, since hello took some time to arrive. One that seems too
+        low by less than a minute is accepted: with it sessions end later, and no frame is lost.
+
+        Args:
+            row: the measurement.
+            utc_offset_ns: `t_ns` minus `t_mono_ns` of the stream.
+        """
+        late_ns = self.hello_t_ns - self.t_mono_ns - utc_offset_ns - row.server_minus_node_ns
+        drift_ns = math.ceil(DISCIPLINE_RATE_LIMIT * abs(self.t_mono_ns - row.t_mono_ns))
+        tolerance_ns = row.uncertainty_ns + drift_ns
+        return -tolerance_ns <= late_ns <= AHEAD_MAX_NS + tolerance_ns
+
     def _clock_ns(self, now_t_ns: int) -> int:
         return self.t_mono_ns + now_t_ns - self.hello_t_ns
 
@@ -122,7 +140,10 @@ class ServerStream:
         self.first_t_ns: int | None = None
         """Time of the oldest frame that the node has of an earlier stream, node's UTC."""
         self.clock_offsets: deque[ClockOffset] = deque(maxlen=CLOCK_OFFSETS_MAX)
-        """Measured offsets of the node's clock, oldest first."""
+        """Measured offsets of the node's clock, oldest first; the first may be of a former date."""
+        self.clock_offset: ClockOffset | None = None
+        """Latest offset of the node's clock to the present one; None: not measured since the server
+        was started, and no earlier one is known to apply."""
         self.last_seen_t_ns: int | None = None
         """Arrival time of the last frame, server's UTC."""
         self.missed_slots = 0
@@ -180,11 +201,6 @@ class ServerStream:
         """Id of the stream."""
         return self.info.stream_id
 
-    @property
-    def clock_offset(self) -> ClockOffset | None:
-        """Latest offset of the node's clock; None before the first measurement."""
-        return self.clock_offsets[-1] if self.clock_offsets else None
-
     def read_clock_offsets(self) -> tuple[ClockOffset, ...]:
         """Read all clock measurements of the stream, oldest first.
 
@@ -194,7 +210,12 @@ class ServerStream:
         return self._clock_log.read_undamaged_rows()
 
     def list_clock_offsets_since(self, seq_first: int) -> tuple[ClockOffset, ...]:
-        """Return the clock measurements since a frame, and the last one before."""
+        """Return the clock measurements since a frame, and the last one before.
+
+        Empty while none is known to be of the present clock.
+        """
+        if self.clock_offset is None:
+            return ()
         begin_t_ns = (
             self.journal.find_batch_t_ns_near(seq_first, at_or_before=False)
             if self.journal is not None
@@ -214,6 +235,7 @@ class ServerStream:
             StorageError: the log cannot be written; the measurement is used all the same.
         """
         offset = ClockOffset(stream_id=self.stream_id, **row.model_dump(exclude={"type"}))
+        self.clock_offset = offset
         self.clock_offsets.append(offset)
         if self.journal is not None:
             self._append_to_clock_log(offset)
@@ -281,6 +303,10 @@ class ServerStream:
     def apply_present_hello(self, hello: Hello, now_t_ns: int) -> None:
         """Apply a hello that names this stream as present: bounds, obtainable frames, losses."""
         self.limit = StreamLimit.from_hello(hello, now_t_ns)
+        if self.clock_offset is None and self.clock_offsets:
+            latest = self.clock_offsets[-1]
+            if self.limit.is_offset_of_this_clock(latest, self.info.utc_offset_ns):
+                self.clock_offset = latest
         self.node_ranges = Intervals((*hello.stored, (hello.next_seq, NO_END)))
         self._update_notes(hello.lost, next_seq=None)
         self._extend_start(min((first for first, _ in hello.stored), default=hello.next_seq))

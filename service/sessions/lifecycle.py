@@ -232,6 +232,8 @@ def _stop(session: Session, node: NodeFacts) -> Session:
         "problem": None,
         "vitals_at_stop": node.vitals,
     }
+    if node.present_id is not None and node.offset_ns is not None:
+        update["server_minus_node_ns_at_stop"] = {node.present_id: node.offset_ns}
     present = node.find_stream(node.present_id) if node.present_id is not None else None
     if present is None or not node.is_connected:
         return session.model_copy(update=update)

@@ -183,20 +183,38 @@ class NodeFacts:
         return self.stream_ids[-1] if self.stream_ids else None
 
     def get_stream(self, session: Session, stream_id: str) -> SessionStream:
-        """Return a stream's facts; a missing offset of its clock is taken from the session.
+        """Return a stream's facts, with the offset of its clock to the one of the session's stop.
 
-        Until the node has reported its streams, all frames of an unknown one are obtainable.
+        Without a measurement at the stop it is the present one, else the session's last one; a
+        present stream is measured soon. Until the node has reported its streams, all frames of an
+        unknown one are obtainable.
         """
         stream = self.find_stream(stream_id)
         if stream is None:
             is_gone = self.has_reported or self.frames_to_come == "none"
             return SessionStream(obtainable=Intervals(() if is_gone else [(0, NO_END)]))
-        if stream.offset_ns is not None:
+        at_stop_ns = session.server_minus_node_ns_at_stop.get(stream_id)
+        if at_stop_ns is not None:
+            return replace(stream, offset_ns=at_stop_ns)
+        if stream.offset_ns is not None or (self.has_reported and stream_id == self.present_id):
             return stream
         rows = [row for row in session.clock if row.stream_id == stream_id]
         # No link during that stream: most likely the node's clock was as wrong as now.
         offset_ns = rows[-1].server_minus_node_ns if rows else self.offset_ns
         return stream if offset_ns is None else replace(stream, offset_ns=offset_ns)
+
+    def is_clock_of_stop_known(self, session: Session, stream_id: str) -> bool:
+        """Return whether a stream's times can be compared with the time of the session's stop.
+
+        Measurements before the server's last start may be to a clock of another date. A clock that
+        was never measured was most likely as wrong as the present one.
+        """
+        stream = self.find_stream(stream_id)
+        if stream_id in session.server_minus_node_ns_at_stop or (
+            stream is not None and stream.offset_ns is not None
+        ):
+            return True
+        return self.has_reported and all(row.stream_id != stream_id for row in session.clock)
 
     def collect_streams(self, session: Session) -> dict[str, SessionStream]:
         """Return the facts of a session's streams, by stream id."""
@@ -224,7 +242,7 @@ def close_where_stream_passed_stop(
     if session.stopped_t_ns is None:
         return session
     for part in session.parts:
-        if part.seq_last is None:
+        if part.seq_last is None and node.is_clock_of_stop_known(session, part.stream_id):
             stream = node.get_stream(session, part.stream_id)
             last = _find_last_seq_at_stop(
                 session, part, stream, leave_open_while_missing=leave_open_while_missing

@@ -160,6 +160,9 @@ class Session(_Record):
     missed_slots_at_start: int = 0
     missed_slots_at_stop: dict[str, int] = Field(default_factory=dict)
     """Count by stream_id, of the stream at the stop, if the node was connected."""
+    server_minus_node_ns_at_stop: dict[str, int] = Field(default_factory=dict)
+    """Offset by stream_id, of the stream at the stop, to the clock of `stopped_t_ns`: from its next
+    start on a server may have another date."""
     vitals_at_start: Vitals | None = None
     """Vitals of the node's machine when it was started."""
     vitals_at_stop: Vitals | None = None

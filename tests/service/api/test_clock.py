@@ -7,6 +7,7 @@ import io
 import json
 import time
 from collections.abc import Iterator
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from storage.parquet_hash import write_hashed_table
 from tests.builders.arrays import PERIOD_NS
 from tests.service.command import command
 from tests.service.fake_node import FakeNode
-from tests.service.recording import Recording, read_table
+from tests.service.recording import Recording, read_table, whole_parts_of
 from tests.service.running import Running, assert_refused, content_of
 from tests.storage.faulty_disk import refusing
 from tests.waiting import until
@@ -61,6 +62,11 @@ def record(node: FakeNode, offset_ns: int | None, **changes: Any) -> Recording:
             send_sample(node, offset_ns + later_ns)
     node.taken_in()
     return session
+
+
+def set_servers_date(monkeypatch: pytest.MonkeyPatch, step_ns: int) -> None:
+    """Have the server's date set, as it sees it from its next start on."""
+    monkeypatch.setattr(devices.clock, "_UTC_OFFSET_NS", devices.clock._UTC_OFFSET_NS + step_ns)
 
 
 @pytest.fixture(scope="module")
@@ -203,12 +209,67 @@ def test_a_date_set_on_the_server_is_a_step_of_the_session(
     node.send(50)
     node.taken_in()
     node.leave()
-    monkeypatch.setattr(devices.clock, "_UTC_OFFSET_NS", devices.clock._UTC_OFFSET_NS + HOUR_NS)
+    set_servers_date(monkeypatch, HOUR_NS)
     node.greet()
     send_sample(node, HOUR_NS)
     (stream,) = session.clock()["streams"]
     (step,) = stream["steps"]
     assert abs(step["jump_ns"] - HOUR_NS) <= step["jump_uncertainty_ns"] < 4 * HALF_NS
+
+
+@pytest.mark.parametrize("step_ns", [-HOUR_NS, 0, HOUR_NS])
+@pytest.mark.parametrize("order", [*permutations(("restart", "stop", "return"))][:4])
+def test_a_date_set_before_a_servers_restart_moves_no_end(
+    running: Running,
+    node: FakeNode,
+    monkeypatch: pytest.MonkeyPatch,
+    step_ns: int,
+    order: tuple[str, ...],
+) -> None:
+    node.connect()
+    node.deliver(20, now=True)
+    session = node.record()
+    node.deliver(50, now=True)
+    node.leave()
+    unsent = node.frames(10, now=True)
+    for event in order:
+        if event == "restart":
+            running.stop()
+            set_servers_date(monkeypatch, step_ns)
+            running.start()
+        elif event == "stop":
+            until(lambda: time.monotonic_ns() > node.next_t_mono_ns)
+            session.stop()
+        elif event == "return":
+            node.greet()
+            node.send_again(unsent)
+            node.acknowledged(79)
+    if order[-1] == "restart":
+        node.leave()
+        node.greet()
+    node.say_clock(step_ns, t_mono_ns=time.monotonic_ns())
+    node.send(20, now=True)
+    assert whole_parts_of(session.sealed()) == [(node.stream_id, 20, 79)]
+
+
+def test_a_measurement_of_a_former_date_is_not_the_present_one(
+    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node.connect()
+    node.deliver(20, now=True)
+    node.leave()
+    running.stop()
+    set_servers_date(monkeypatch, -HOUR_NS)
+    running.start()
+    node.greet()
+    node.deliver(10, now=True)
+    session = node.record()
+    node.deliver(30, now=True)
+    session.stop()
+    session.sealed()
+    assert running.node(node.name)["clock"] is None
+    (stream,) = session.clock()["streams"]
+    assert (stream["state"], stream["rows"]) == ("unmeasured", 0)
 
 
 def test_an_impossible_sample_is_dropped(

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from devices.frames import FrameBatch
 from service.server.streams import AHEAD_MAX_NS, StreamLimit
 from storage.clock.bounds import DISCIPLINE_RATE_LIMIT
+from storage.clock.log import ClockOffset
 from storage.message_layout import MAX_MESSAGE_FRAMES
 from tests.builders.frames import make_frames
 
@@ -19,6 +20,7 @@ SECOND_NS = 10**9
 HOUR_NS = 3600 * SECOND_NS
 HELLO_T_NS = 1_800_000_000 * SECOND_NS
 MONO_NS = 7 * HOUR_NS
+UTC_OFFSET_NS = 1_700_000_000 * SECOND_NS
 RATE_HZ = 500.0
 LIMIT = StreamLimit(HELLO_T_NS, MONO_NS, next_seq=1000, rate_hz=RATE_HZ)
 
@@ -43,6 +45,31 @@ def test_what_a_clock_of_any_crystal_says_is_taken_also_after_a_suspend(
     """`late_ns`: how long hello was under way; `stopped_ns`: how long the node was suspended."""
     t_mono_ns = MONO_NS + late_ns + since_ns + math.floor(gain * since_ns) - stopped_ns
     assert LIMIT.describe_frames_ahead(frames(t_mono_ns), HELLO_T_NS + since_ns) == ""
+
+
+@given(
+    apart_ns=since,
+    gain=st.floats(-DISCIPLINE_RATE_LIMIT, DISCIPLINE_RATE_LIMIT),
+    late_ns=st.integers(0, 5 * SECOND_NS),
+    step_ns=st.just(0) | st.integers(-(2**59), 2**59),
+)
+def test_a_former_measurement_applies_unless_hello_shows_another_date(
+    apart_ns: int, gain: float, late_ns: int, step_ns: int
+) -> None:
+    """`apart_ns`: time since the measurement; `step_ns`: by how much the date was set since."""
+    true_ns = HELLO_T_NS - late_ns - MONO_NS - UTC_OFFSET_NS
+    row = ClockOffset(
+        stream_id="a" * 32,
+        t_mono_ns=MONO_NS - apart_ns,
+        server_minus_node_ns=true_ns - step_ns - math.floor(gain * apart_ns),
+        uncertainty_ns=SECOND_NS // 1000,
+    )
+    drift_ns = math.ceil(DISCIPLINE_RATE_LIMIT * apart_ns) + row.uncertainty_ns
+    applies = LIMIT.is_offset_of_this_clock(row, UTC_OFFSET_NS)
+    if step_ns == 0:
+        assert applies
+    if not -late_ns - 2 * drift_ns <= step_ns <= AHEAD_MAX_NS + 2 * drift_ns:
+        assert not applies
 
 
 @given(since_ns=since, back_ns=st.integers(0, 2**59))

@@ -36,6 +36,7 @@ from service.sessions.parts import (
     SessionStream,
     close_part,
 )
+from storage.clock.log import ClockOffset
 from storage.intervals import NO_END, Intervals, Losses
 from storage.sessions.folder import Part, Session, SessionState
 from storage.sessions.ledger import group_numbers_by_stream
@@ -179,6 +180,40 @@ class Frames(SessionStream):
         after = self.stored.restricted_to(last + 1, NO_END).first
         assert after is not None
         return SeqsAround(last, after)
+
+
+@pytest.mark.parametrize("at_stop", [{}, {STREAM: -9 * PERIOD_NS}])
+def test_a_stream_is_cut_by_no_measurement_to_another_clock_than_the_stops(
+    at_stop: dict[str, int],
+) -> None:
+    """The server was started anew with an earlier date, then stopped, and both streams came."""
+    later = "b" * 32
+    row = ClockOffset(stream_id=STREAM, t_mono_ns=0, server_minus_node_ns=0, uncertainty_ns=1)
+    stopped_t_ns = UTC_NS - 5 * PERIOD_NS
+    before = session(
+        "pending",
+        stopped_t_ns=stopped_t_ns,
+        parts=(Part(stream_id=STREAM, seq_first=0),),
+        clock=(row,),
+        server_minus_node_ns_at_stop=at_stop,
+    )
+    stored = Intervals([(0, 9)])
+    streams = {
+        STREAM: Frames(stored=stored, next_seq=10, begin_t_ns=UTC_NS),
+        later: Frames(begin_t_ns=UTC_NS + 20 * PERIOD_NS, offset_ns=-9 * PERIOD_NS),
+    }
+    node = NodeFacts(
+        now_t_ns=UTC_NS + 30 * PERIOD_NS,
+        find_stream=streams.get,
+        stream_ids=(STREAM, later),
+        is_running=True,
+        has_reported=True,
+        offset_ns=-9 * PERIOD_NS,
+        report=NodeReport(UTC_NS + 20 * PERIOD_NS, 5, 0, UTC_NS + 20 * PERIOD_NS),
+    )
+    (part,) = apply_event(before, Reevaluate(), node).session.parts
+    # Without a measurement at the stop, all frames are kept rather than some lost.
+    assert part.seq_last == (4 if at_stop else 9)
 
 
 @dataclass

@@ -193,6 +193,7 @@ def test_a_server_and_recovery_in_its_folder_come_to_the_same_session(
         stopped_t_ns=t_ns(stopped) + row.server_minus_node_ns,
         parts=(Part(stream_id=BOOT, seq_first=first, seq_last=end),),
         clock=(row,) if is_measured else (),
+        server_minus_node_ns_at_stop={BOOT: row.server_minus_node_ns} if is_measured else {},
         missed_slots_at_start=2,
         missed_slots_at_stop={} if missed_slots_at_stop is None else {BOOT: missed_slots_at_stop},
         calibration=calibration,

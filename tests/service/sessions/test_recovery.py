@@ -16,7 +16,6 @@ from devices.errors import StorageError
 from service.sessions import recovery as recover_module
 from service.sessions.recovery import recover_locked_folder
 from service.sessions.sealing import write_sealed_files
-from storage.clock.log import ClockOffset
 from storage.durable_files import lock_folder
 from storage.journal.node.in_flight import InFlightWriter
 from storage.journal.stream_notes import compute_max_lost_tail_frames
@@ -185,9 +184,11 @@ def test_abandoned_frames_are_lost_with_this_reason(tmp_path: Path) -> None:
 
 def test_an_unreached_stop_bounds_the_abandoned_tail(tmp_path: Path) -> None:
     stream(servers(tmp_path), info_of(), (0, 99))
-    clock = ClockOffset(stream_id=BOOT, t_mono_ns=0, server_minus_node_ns=10**9, uncertainty_ns=1)
+    at_stop = {BOOT: 10**9}
     stopped_t_ns = t_ns(99) + 10**9 + 4 * 10**9
-    session(tmp_path, state="pending", stopped_t_ns=stopped_t_ns, clock=(clock,))
+    session(
+        tmp_path, state="pending", stopped_t_ns=stopped_t_ns, server_minus_node_ns_at_stop=at_stop
+    )
     assert outcomes(recover_locked_folder(tmp_path)) == ["waiting"]
     (one,) = recover_locked_folder(tmp_path, abandon_missing=True).sessions
     assert one.session.max_lost_tail_frames == {BOOT: 2000}
@@ -195,8 +196,11 @@ def test_an_unreached_stop_bounds_the_abandoned_tail(tmp_path: Path) -> None:
 
 def test_a_session_that_was_stopped_is_ended_by_its_clock(tmp_path: Path) -> None:
     stream(servers(tmp_path), info_of(), (0, 99))
-    clock = ClockOffset(stream_id=BOOT, t_mono_ns=0, server_minus_node_ns=10**9, uncertainty_ns=1)
-    session(tmp_path, state="pending", stopped_t_ns=t_ns(50) + 10**9, clock=(clock,))
+    at_stop = {BOOT: 10**9}
+    stopped_t_ns = t_ns(50) + 10**9
+    session(
+        tmp_path, state="pending", stopped_t_ns=stopped_t_ns, server_minus_node_ns_at_stop=at_stop
+    )
     (one,) = recover_locked_folder(tmp_path).sessions
     assert (one.outcome, one.session.parts[0].seq_last) == ("sealed", 50)
 
