@@ -49,8 +49,9 @@ class Facts:
     """When the start of the session had been answered, by `time.monotonic`."""
     stopped_s: float = 0.0
     """When it was asked to stop."""
-    stop_sigma_s: float = 0.0
-    """How well the server knew the node's clock then."""
+    stop_sigma_s: float | None = 0.0
+    """How well the server knew the node's clock then; None: not at all, as just after a date was
+    set. Then the session ends with the newest frame that had come."""
     ends: dict[str, End] = field(default_factory=dict)
     """Streams that were ended by a fault, by stream_id."""
     kept_by_node: dict[str, Columns] = field(default_factory=dict)

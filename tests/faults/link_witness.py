@@ -69,6 +69,18 @@ class Witness:
             found[ack.stream_id].append(np.arange(ack.seq_first, ack.seq_last + 1, dtype=np.uint64))
         return {stream_id: np.unique(np.concatenate(pieces)) for stream_id, pieces in found.items()}
 
+    def newest_promised_s(self, until_s: float) -> float:
+        """When the newest frame of those that were promised by then was seen first."""
+        found_s = float("-inf")
+        for stream_id, promised in self.acknowledged(until_s).items():
+            schema, newest = wire_schema(self.infos[stream_id]), promised[-1]
+            for sent in [sent for sent in list(self.sent) if sent.stream_id == stream_id]:
+                batch = pa.ipc.read_record_batch(pa.py_buffer(sent.payload), schema)
+                if newest in columns_of(batch)["seq"]:
+                    found_s = max(found_s, sent.at_s)
+                    break
+        return found_s
+
     def frames(self, stream_id: str, until_s: float = float("inf")) -> Columns | None:
         """All frames of a stream that were seen, each once, in order; None: not one."""
         info = self.infos.get(stream_id)

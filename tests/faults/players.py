@@ -166,8 +166,11 @@ class Players:
 
     def _before_stop(self) -> None:
         node = self.server.node() or {}
-        clock = node.get("clock") or {}
-        self.facts.stop_sigma_s = clock.get("uncertainty_ns", 0) * 1e-9
+        clock = node.get("clock")
+        if clock is not None:
+            self.facts.stop_sigma_s = clock["uncertainty_ns"] * 1e-9
+        elif node.get("connected"):  # else it is measured before the session ends
+            self.facts.stop_sigma_s = None
         self.facts.stopped_s = time.monotonic()
         self._stopped = True
 

@@ -176,6 +176,19 @@ def test_a_bound_remembers_an_earlier_wait_for_the_disk_and_a_loss_does_not(fact
     assert any("lost {'corrupt': 80}, where 5" in finding for finding in findings(facts))
 
 
+@pytest.mark.parametrize(("last", "is_good"), [(89, True), (88, False)])
+def test_of_a_clock_never_measured_the_session_has_all_that_was_acknowledged_before_the_stop(
+    facts: Facts, last: int, is_good: bool
+) -> None:
+    facts.stopped_s, facts.stop_sigma_s = 11.05, None  # 89 was acknowledged at 11.0, 99 at 11.1
+    facts.ledger["parts"][1] |= {"seq_last": last, "recorded": last + 1}
+    facts.session["parts"][1]["seq_last"] = last
+    seal(facts, parquet([np.arange(50, FRAMES), np.arange(last + 1)]))
+    assert (findings(facts) == []) is is_good
+    facts.stop_sigma_s = 0.0
+    assert findings(facts)
+
+
 def _without_the_second_stream(facts: Facts) -> None:
     del facts.ledger["parts"][1], facts.session["parts"][1]
     seal(facts, parquet([np.arange(50, FRAMES)]))
