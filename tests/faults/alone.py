@@ -15,9 +15,9 @@ from tests.faults.machines import Machine, RoundError, wait_for
 from tests.faults.product import NODE, run_command
 from tests.faults.stage import Stage
 from tests.faults.stories import Fault
+from tests.waiting import PATIENCE_S
 
 _FRAMES = 20
-_BACK_S = 30.0
 _RECOVERED = (0, 3)
 
 
@@ -72,7 +72,7 @@ class Alone(Stage):
                     return True
             return False
 
-        wait_for("the node journals", back, _BACK_S)
+        wait_for("the node journals", back, PATIENCE_S)
         self._known = self._stream_ids()
 
     def _set_up(self, small: Mapping[str, Path | None]) -> None:

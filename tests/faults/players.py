@@ -21,10 +21,9 @@ from tests.faults.machines import Machine, NodeMachine, RoundError, ServerMachin
 from tests.faults.product import NODE, run_command
 from tests.faults.proxy import Proxy
 from tests.faults.stories import SMALL_DISK_BYTES, Story
+from tests.waiting import PATIENCE_S
 
 RATE_HZ = 200
-_BACK_S = 30.0
-_SEALED_S = 25.0
 
 
 def scene_file(folder: Path, tiles: int) -> Path:
@@ -117,7 +116,7 @@ class Players:
                 and node["stream_id"] != boot_before
             )
 
-        wait_for("the node sends", back, _BACK_S)
+        wait_for("the node sends", back, PATIENCE_S)
 
     def end_node_when_it_dies(self, how: str, rng: random.Random) -> None:
         """The node will be killed at a call that was chosen; then it is started again.
@@ -131,7 +130,7 @@ class Players:
         """
 
         def dies() -> None:
-            wait_for("the node is killed", lambda: not self.node.is_alive, 20.0)
+            wait_for("the node is killed", lambda: not self.node.is_alive, PATIENCE_S)
             self.node.kill()
 
         stream_id = self._end_node(how, dies)
@@ -148,7 +147,7 @@ class Players:
                 return dict(answer)
             return None
 
-        session = wait_for("the session begins", begun, 10.0)
+        session = wait_for("the session begins", begun, PATIENCE_S)
         assert session is not None
         self.session_id = session["id"]
         self.facts.started_s = time.monotonic()
@@ -180,7 +179,7 @@ class Players:
             return bool(session["state"] == "sealed")
 
         with suppress(RoundError):  # what it is instead is for the checks
-            wait_for("sealed", sealed, _SEALED_S)
+            wait_for("sealed", sealed, PATIENCE_S)
 
     def _fetch(self) -> None:
         facts = self.facts

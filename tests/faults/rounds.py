@@ -43,7 +43,7 @@ from tests.faults.machines import RoundError
 from tests.faults.stage import Stage
 from tests.faults.stories import Story, draw_story
 
-ROUND_S = 150.0
+ROUND_S = 600.0
 """A round that takes longer is ended and has failed."""
 _INTERRUPTED = 130
 

@@ -16,6 +16,7 @@ from tests.faults.machines import Machine, RoundError, wait_for
 from tests.faults.players import Players
 from tests.faults.proxy import Quality
 from tests.faults.stories import Fault
+from tests.waiting import PATIENCE_S
 
 _POINTS_OF_SEALING = 20
 """So many files and folders are synced or renamed, about, from stop to sealed."""
@@ -116,7 +117,7 @@ class Stage(Players):
         def noticed() -> bool:
             return not self.node.is_alive or self._stream_id() != stream_id
 
-        wait_for("the node notices that its acquisition is dead", noticed, 20.0)
+        wait_for("the node notices that its acquisition is dead", noticed, PATIENCE_S)
         self._end_node("killed", lambda: None, only=stream_id)
         if not self.node.is_alive:
             self.node.kill()

@@ -33,6 +33,7 @@ from tests.faults.stories import (
     Story,
     draw_story,
 )
+from tests.waiting import PATIENCE_S
 
 CALLS = "fsync+replace"
 SYNCS = ("fsync@journal/:1:before", "fsync@journal/:2:after", "fsync@journal/:3:before")
@@ -177,7 +178,7 @@ def test_a_server_that_dies_at_syncs_of_its_journal_keeps_what_it_has_promised(
     server = stage.server
     for call in SYNCS:
         server.kill_at(call)
-        wait_for("the server is killed", lambda: not server.is_alive, 20.0)
+        wait_for("the server is killed", lambda: not server.is_alive, PATIENCE_S)
         server.kill()
         if how == "power":
             stage.note(f"{call}, power of the server: {server.cut_power(rng)}")
