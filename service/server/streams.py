@@ -96,8 +96,8 @@ class StreamLimit:
     def is_offset_of_this_clock(self, row: ClockOffset, utc_offset_ns: int) -> bool:
         """Return whether a former measurement can be of the server's present clock.
 
-        It bounds the offset from above, since hello took some time to arrive. One that seems too
-        low by less than a minute is accepted: with it sessions end later, and no frame is lost.
+        Hello bounds the offset from above, since it took some time to arrive. A measurement below
+        that by less than a minute is accepted: with it sessions end later, and no frame is lost.
 
         Args:
             row: the measurement.
