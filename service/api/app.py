@@ -29,6 +29,7 @@ from devices.errors import FootTileError
 from service.api import problems
 from service.api.access import AccessGuard, Logins
 from service.api.connection_limits import ConnectionLimiter, open_files_max
+from service.api.message_limits import MessageLimiter
 from service.api.protocols import LimitedConfig, LimitedHttp, LimitedWebSocket, accept_connections
 from service.api.routes import (
     calibrations,
@@ -317,6 +318,7 @@ async def run_uvicorn(
         forwarded_allow_ips=limits.trusted_peers,  # uvicorn trusts loopback by default
     )
     config.limiter = ConnectionLimiter(limits, open_files_max())
+    config.messages = MessageLimiter(limits)
     config.proxies = ProxyHeadersMiddleware(app, limits.trusted_peers)  # type: ignore[arg-type]  # Starlette's scope is wider
     logging.getLogger("uvicorn.error").addFilter(_is_relevant)
     server = _Uvicorn(config)

@@ -27,11 +27,11 @@ from uvicorn._types import ASGIReceiveEvent
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 from uvicorn.protocols.utils import ClientDisconnected
-from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.frames import CloseCode
 from websockets.http11 import Request
 
 from service.api.connection_limits import ConnectionLimiter
+from service.api.message_limits import MessageLimiter, SlicedWebSocket
 from service.api.problems import problem_response
 from service.protocol.codec import LinkCloseCode
 from service.protocol.link import INGEST_PATH, SUBPROTOCOL
@@ -57,7 +57,7 @@ class LimitedConfig(uvicorn.Config):
     """Configuration of uvicorn with the connection limiter."""
 
     limiter: ConnectionLimiter
-
+    messages: MessageLimiter
     proxies: ProxyHeadersMiddleware
 
     def find_forwarded_client(self, peer: str, forwarded_for: Sequence[str]) -> str | None:
@@ -290,7 +290,7 @@ def reset_connection(transport: asyncio.Transport) -> None:
     transport.abort()
 
 
-class LimitedWebSocket(WebSocketsSansIOProtocol):
+class LimitedWebSocket(SlicedWebSocket):
     """Websocket with a place: a node's after its first message, else a subscriber's."""
 
     config: LimitedConfig
@@ -316,7 +316,16 @@ class LimitedWebSocket(WebSocketsSansIOProtocol):
             self.conn.max_message_size = CLIENT_MESSAGE_BYTES_MAX
         named = event.headers.get_all("X-Forwarded-For")
         client = self.config.find_forwarded_client(_address(self.client), named)
-        if limiter.has_max_nodes if self._is_node else not limiter.acquire(self.transport, client):
+        messages = self.config.messages
+        if self._is_node:
+            allowance = None if limiter.has_max_nodes else messages.make_node_allowance()
+        else:
+            address = client if client is not None else _address(self.client)
+            allowance = messages.admit_subscriber(address)
+            if allowance is not None and not limiter.acquire(self.transport, client):
+                allowance = None
+        self.allowance = allowance or messages.make_refused_allowance()
+        if allowance is None:
             self.app = refuse_connection
         super().handle_connect(event)
         if not self.close_sent:
@@ -335,21 +344,6 @@ class LimitedWebSocket(WebSocketsSansIOProtocol):
         """Write whole frames beside uvicorn's own `send`, which frames each message again."""
         if not (self.close_sent or self.disconnected or self.transport.is_closing()):
             self.transport.write(framed)
-
-    def close_now(self, code: int, reason: str) -> None:
-        """Close with a reason without waiting for room, behind all earlier writes.
-
-        Until the peer has answered, or for `close_timeout`, the connection stays open and received
-        data is ignored: closing earlier would be a reset, which discards the reason.
-        """
-        if not (self.close_sent or self.disconnected or self.transport.is_closing()):
-            self.conn.send_close(code, reason)
-            self.transport.write(b"".join(self.conn.data_to_send()))
-            self.close_sent = True
-            if self.read_paused:
-                self.read_paused = False
-                self.transport.resume_reading()
-            self.close_timer = self.loop.call_later(self.close_timeout, self.transport.close)
 
     async def receive(self) -> ASGIReceiveEvent:
         """Return a message, or the end; the first message of a node acquires its place."""

@@ -19,6 +19,7 @@ from foottile.environment import read_variable
 from service.user_folders import resolve_user_folder
 
 _Seconds = Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)]
+_Rate = Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)]
 _Connections = Annotated[int, Field(ge=1, le=100_000)]
 _IPV4 = 4
 
@@ -35,6 +36,13 @@ class LimitSettings(BaseModel):
     not trusted."""
     max_nodes: _Connections = 32
     """Nodes at once."""
+    max_messages_per_s: _Rate = 2.0
+    """Messages and control frames of a subscriber a second, and of a minute at once; beyond it
+    1008. A page sends one."""
+    max_messages_per_s_per_address: _Rate = 500.0
+    """Limit per address; a new subscriber counts as ten messages."""
+    max_messages_per_s_in_all: _Rate = 1000.0
+    """Limit of all subscribers together."""
     max_header_bytes: Annotated[int, Field(ge=4096, le=1 << 20)] = 32 << 10
     """Size limit of request line and headers; beyond it 431."""
     header_timeout_s: _Seconds = 10.0

@@ -13,7 +13,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from devices.clock import server_utc_ns
 from devices.errors import LinkError, StorageError, escape_control_chars
-from service.api.protocols import send_message
+from service.api.protocols import SOCKET_EXTENSION, send_message
 from service.protocol.codec import (
     CloseConnection,
     LinkCloseCode,
@@ -58,6 +58,7 @@ async def serve_node(socket: WebSocket, server: Server) -> None:
         claim = await _challenge_node(socket, server, offered)
         hello = await _receive_hello(socket, claim)
         with _registered_node(server, hello, claim) as link:
+            socket.scope["extensions"][SOCKET_EXTENSION]["outlet"].has_free_messages = True
             await _send_welcome(socket, server, link)
             await _run_tasks(socket, server, link)
     except CloseConnection as end:
