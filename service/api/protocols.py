@@ -25,6 +25,7 @@ from starlette.websockets import WebSocket as StarletteWebSocket
 from starlette.websockets import WebSocketDisconnect
 from uvicorn._types import ASGIReceiveEvent
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
+from uvicorn.protocols.http.flow_control import FlowControl
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 from uvicorn.protocols.utils import ClientDisconnected
 from websockets.frames import CloseCode
@@ -43,6 +44,9 @@ SOCKET_EXTENSION = "foottile.outlet"
 CLIENT_MESSAGE_BYTES_MAX = 4096
 """Size limit of a message by clients other than nodes."""
 _BUFFER_BYTES = 64 << 10
+_HEAD_SLICE_BYTES = 1 << 10
+"""Bytes that are parsed before it shows whether a request waits: forty small ones at most."""
+_BODY_SLICE_BYTES = 16 << 10
 _TIMED_BODY_BYTES = 256 << 10
 _UNREAD_BYTES_MAX = 1 << 20
 """Limit of unsent bytes for a client that sends requests and does not read."""
@@ -71,10 +75,26 @@ class LimitedConfig(uvicorn.Config):
         return trusted.get_trusted_client_address(", ".join(forwarded_for))[0] or None
 
 
+class HeldFlow(FlowControl):
+    """Flow control of a connection that reads nothing while received bytes wait."""
+
+    is_held = False
+
+    def resume_reading(self) -> None:
+        """Read on, unless bytes wait."""
+        if not self.is_held:
+            super().resume_reading()
+
+
 class LimitedHttp(HttpToolsProtocol):
-    """HTTP with limits on the size and time of headers and bodies."""
+    """HTTP with limits on the size and time of headers and bodies.
+
+    Requests behind an unanswered one stay unparsed, beside those of the same slice: a read of 256
+    KiB may have ten thousand, and each would take memory and time.
+    """
 
     config: LimitedConfig
+    flow: HeldFlow
     _timer: asyncio.TimerHandle | None = None
     _in_head = False
     _unparsed_bytes = 0
@@ -90,6 +110,8 @@ class LimitedHttp(HttpToolsProtocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn
         """Add the connection as idle."""
         super().connection_made(transport)
+        self.flow = HeldFlow(transport)
+        self._unparsed = bytearray()
         transport.set_write_buffer_limits(_BUFFER_BYTES)  # with TLS the default is eight times this
         self._unanswered: deque[RequestResponseCycle] = deque()
         """Requests without an answer, in their order; uvicorn has only the newest."""
@@ -104,7 +126,26 @@ class LimitedHttp(HttpToolsProtocol):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Parse bytes, up to the limit of headers."""
+        """Parse bytes slice by slice, until a request waits for the answer to another."""
+        self._unparsed += data
+        self._parse_slices()
+
+    def _parse_slices(self) -> None:
+        while self._unparsed and not self.pipeline and not self.transport.is_closing():
+            is_body = bool(self._unanswered) and self._unanswered[-1].more_body
+            piece = bytes(self._unparsed[: _BODY_SLICE_BYTES if is_body else _HEAD_SLICE_BYTES])
+            del self._unparsed[: len(piece)]
+            self._parse(piece)
+            if self._is_upgraded:
+                return
+        if self.transport.is_closing():
+            self._unparsed.clear()
+        self.flow.is_held = bool(self._unparsed)
+        if self.flow.is_held:
+            self.flow.pause_reading()
+
+    def _parse(self, data: bytes) -> None:
+        """Parse a slice, up to the limit of headers."""
         self._unparsed_bytes += len(data)
         super().data_received(data)
         if self.transport.is_closing() or self._is_upgraded:
@@ -179,6 +220,14 @@ class LimitedHttp(HttpToolsProtocol):
         super().on_response_complete()
         if is_last:
             self.config.limiter.release(self.transport)
+        if self._unparsed:
+            self.loop.call_soon(self._parse_waiting)
+
+    def _parse_waiting(self) -> None:
+        if not self.transport.is_closing():
+            self.flow.is_held = False
+            self.flow.resume_reading()
+            self._parse_slices()
 
     def handle_websocket_upgrade(self) -> None:
         """Hand the connection over to the websocket."""

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosed
 
 from service.api.connection_limits import OWN_FILES, RESERVE, ConnectionLimiter
-from service.api.protocols import accept_connections
+from service.api.protocols import LimitedHttp, accept_connections
 from service.api.settings import LimitSettings
 from service.protocol.codec import LinkCloseCode
 from service.protocol.link import INGEST_PATH, PROTOCOL, Identify
@@ -412,6 +412,26 @@ def test_too_long_headers_are_refused(raw: socket.socket, piece: bytes) -> None:
         pass
     content = read_all(raw)
     assert content == b"" or parse_problem(content)[0] == 431  # a reset may overtake it
+
+
+def test_pipelined_requests_wait_unparsed_and_are_answered_in_order(
+    shared: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    most_waiting, on_response_complete = 0, LimitedHttp.on_response_complete
+
+    def note_waiting(protocol: LimitedHttp) -> None:
+        nonlocal most_waiting
+        most_waiting = max(most_waiting, len(protocol.pipeline))
+        on_response_complete(protocol)
+
+    monkeypatch.setattr(LimitedHttp, "on_response_complete", note_waiting)
+    requests = [make_head(f"GET /api/v1/{'health' if n % 3 else 'none'}") for n in range(900)]
+    requests.append(make_head("GET /api/v1/health", "Connection: close"))
+    with dial(shared) as connection:
+        connection.sendall(b"".join(requests))
+        statuses = [int(each) for each in re.findall(rb"HTTP/1.1 (\d+) ", read_all(connection))]
+    assert statuses == [200 if n % 3 else 404 for n in range(900)] + [200]
+    assert most_waiting <= 40
 
 
 @pytest.fixture(scope="module", params=[None, TOKEN], ids=["waited for", "refused already"])
