@@ -54,6 +54,7 @@ _OUT_OF_RESOURCES = {errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM}
 _OUT_OF_RESOURCES_PAUSE_S = 0.1
 _PAUSE_S = 0.01
 _RETRY_AFTER_S = 5
+_REFUSAL_DELAY_S = 1.0
 _TOO_MANY = "There are too many connections; try again in some seconds"
 
 
@@ -375,6 +376,7 @@ class LimitedWebSocket(SlicedWebSocket):
                 allowance = None
         self.allowance = allowance or messages.make_refused_allowance()
         if allowance is None:
+            self._pause_reading()
             self.app = refuse_connection
         super().handle_connect(event)
         if not self.close_sent:
@@ -437,8 +439,9 @@ async def send_message(socket: StarletteWebSocket, message: str | bytes) -> None
 
 
 async def refuse_connection(scope: Scope, receive: Receive, send: Send) -> None:
-    """Refuse a connection for lack of room, by HTTP or websocket."""
+    """Refuse a connection for lack of room: HTTP at once, a websocket later, as it comes again."""
     if scope["type"] == "websocket":
+        await asyncio.sleep(_REFUSAL_DELAY_S)
         chosen = SUBPROTOCOL if SUBPROTOCOL in scope["subprotocols"] else None
         await receive()
         await send({"type": "websocket.accept", "subprotocol": chosen})
