@@ -96,7 +96,15 @@ def many_screens(play: Play) -> Outcome:
     outcome = Outcome()
     _want_files(2 * play.tries + 512)
     bound = play.tries + 8  # the screen that watches before, and requests
-    options = ("--max-connections", bound, "--max-connections-per-address", bound)
+    options = (
+        *("--max-connections", bound, "--max-connections-per-address", bound),
+        *(
+            "--max-messages-per-s-per-address",
+            10 * bound,
+            "--max-messages-per-s-in-all",
+            10 * bound,
+        ),
+    )
     with (
         Served(play.folder, "serve", *options, outcome=outcome) as served,
         ExitStack() as screens,
