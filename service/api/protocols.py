@@ -386,6 +386,20 @@ class LimitedWebSocket(SlicedWebSocket):
                 SOCKET_EXTENSION: {"outlet": self},
             }
 
+    def send_receive_event_to_app(self) -> None:
+        """Pass on a message; a text that is no UTF-8 ends the connection.
+
+        uvicorn would log a traceback, as of an own fault, for what any viewer may send.
+        """
+        if self.curr_msg_data_type == "text" and not self.close_sent:
+            try:
+                b"".join(self.frames).decode()
+            except UnicodeDecodeError:
+                self.conn.send_close(CloseCode.INVALID_DATA, "a text is no UTF-8")
+                self.handle_parser_exception()
+                return
+        super().send_receive_event_to_app()
+
     @property
     def is_writable(self) -> bool:
         """True if all earlier writes are sent, up to the transport buffer (64 KiB)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import socket as sockets
 import time
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 import service.server.broadcast.broadcaster
+from service.protocol.link import INGEST_PATH
 from service.protocol.live import SessionDeleted
 from tests.service.api.sealed import Sealed
 from tests.service.fake_node import FakeNode, NodeOf, Play
@@ -105,6 +107,17 @@ def test_any_message_but_a_ping_closes(shared: Running, message: str | bytes) ->
         assert (code, "ping" in reason) == (1008, True)
         other.send('{"type":"ping","t_ms":1}')
         receive(other, "pong")
+
+
+@pytest.mark.parametrize("path", [LIVE, INGEST_PATH])
+@pytest.mark.parametrize("message", [b"\xff\xfe", [b"{", b"\xff}"]], ids=["one", "fragments"])
+def test_a_text_that_is_no_utf8_closes_and_is_no_fault_of_the_server(
+    shared: Running, path: str, message: bytes | list[bytes], caplog: pytest.LogCaptureFixture
+) -> None:
+    with shared.socket(path) as socket:
+        socket.send(message, text=True)
+        assert closed(socket) == (1007, "a text is no UTF-8")
+    assert [record for record in caplog.records if record.levelno >= logging.ERROR] == []
 
 
 @pytest.mark.parametrize(
