@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
@@ -175,6 +175,19 @@ class Calibration(CalibrationPart):
         """Identifier: first 16 hexadecimal digits of the SHA-256 of the content."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
 
+    def check_serials(self) -> None:
+        """Refuse a tile with two entries, or with a curve and a reason for having none.
+
+        Only files are checked: calibrations in sessions were used as they are.
+
+        Raises:
+            ValueError: there is one.
+        """
+        serials = [*(tile.serial for tile in self.tiles), *self.refused]
+        for serial in serials:
+            if serials.count(serial) > 1:
+                raise ValueError(f"tile {serial} has two entries: keep the one to use")
+
     def find_tile_or_wildcard(self, serial: str) -> TileCalibration | None:
         """Return the entry for a serial, else for any (`*`); None without, as for bare tiles."""
         by_serial = {tile.serial: tile for tile in self.tiles}
@@ -247,10 +260,11 @@ class Calibration(CalibrationPart):
             CalibrationError: not JSON, a field is missing or unknown, or the id does not match.
         """
         try:
-            content = json.loads(text)
+            content = _parse_object(text)
             stated_id = content.pop("id", None)
             calibration = cls.model_validate(content)
-        except (ValueError, AttributeError, TypeError) as error:
+            calibration.check_serials()
+        except (ValueError, TypeError) as error:
             detail = error.errors()[0] if isinstance(error, ValidationError) else None
             what = (
                 f"{'.'.join(str(part) for part in detail['loc'])}: {detail['msg']}"
@@ -272,6 +286,13 @@ class Calibration(CalibrationPart):
                 remedy=EDITED_REMEDY,
             )
         return calibration
+
+
+def _parse_object(text: str) -> dict[str, Any]:
+    content = json.loads(text)
+    if not isinstance(content, dict):
+        raise ValueError("it is no JSON object")  # noqa: TRY004  # as for a text that is no JSON
+    return content
 
 
 def compute_share_of_final_loop_width(force_n: Floats) -> Floats:

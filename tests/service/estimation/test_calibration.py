@@ -132,8 +132,19 @@ def test_an_edit_of_any_field_of_the_file_is_refused() -> None:
     ["", "no json", "[]", "3", '"text"', "null", "{}", '{"id": "0", "tiles": []}', '{"id": [1]}'],
 )
 def test_a_text_that_is_no_calibration_is_refused_by_name(text: str) -> None:
-    with pytest.raises(CalibrationError, match=r"bench\.json: not a calibration"):
+    with pytest.raises(CalibrationError, match=r"bench\.json: not a calibration") as caught:
         Calibration.from_json_verifying_id(text, where="bench.json")
+    assert "attribute" not in str(caught.value), "words of Python"
+
+
+@pytest.mark.parametrize("is_refused_too", [False, True])
+def test_a_tile_with_two_entries_is_refused_by_its_serial(is_refused_too: bool) -> None:
+    content = make_one_tile_content()
+    (tile,) = content["tiles"]
+    again = {"refused": {tile["serial"]: "it slipped"}} if is_refused_too else {}
+    content |= again or {"tiles": [tile, tile | {"f_scale_n": 2 * tile["f_scale_n"]}]}
+    with pytest.raises(CalibrationError, match=f"tile {tile['serial']} has two entries"):
+        Calibration.from_json_verifying_id(json.dumps(content), where="x")
 
 
 def test_an_unknown_a_missing_and_a_later_field_are_refused_by_name() -> None:
