@@ -17,6 +17,7 @@ import pytest
 import foottile
 from devices.errors import StorageError
 from devices.frames import Edge
+from devices.types import T_NS_END
 from service.pull import pull_session
 from storage.journal.journal import Journal
 from storage.schema import wire_schema
@@ -218,8 +219,10 @@ def test_a_marker_is_renamed_moved_and_removed(session: Recording) -> None:
     assert verify_session(session.folder).problems == []
     labels = labels_in(session.data(format="csv"), "csv")
     assert labels == {MARKED: "mud", MARKED + 10: "a boulder"}
-    for wrong in ({"label": ""}, {"t_ns": -1}, {"t_ns": 1.5}, {"name": "x"}):
+    for wrong in ({"label": ""}, {"t_ns": -1}, {"t_ns": 1.5}, {"t_ns": T_NS_END}, {"name": "x"}):
         assert http.patch(url, json=wrong).status_code == 422, wrong
+        added = {"label": "x"} | wrong
+        assert http.post(f"{session.url}/markers", json=added).status_code == 422, wrong
     assert http.delete(url).status_code == 204
     assert [marker["label"] for marker in list_markers(session)] == ["mud"]
     assert session.now()["marker_count"] == 1

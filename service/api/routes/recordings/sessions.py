@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Query, Response
 from pydantic import AfterValidator, Field, StringConstraints
 
-from devices.types import StrictModel, check_user_name, check_user_text
+from devices.types import StrictModel, TNs, check_user_name, check_user_text
 from service.api.routes.common import (
     CHANGED,
     FULL,
@@ -94,7 +94,7 @@ class AddMarker(StrictModel):
     """New marker."""
 
     label: Name = Field(examples=["stepped on a stone"])
-    t_ns: Annotated[int, Field(ge=0, lt=2**63, strict=True)] | None = Field(
+    t_ns: Annotated[TNs, Field(strict=True)] | None = Field(
         default=None, description="Server's UTC; default: now."
     )
     id: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{12}$")] | None = Field(
@@ -106,7 +106,7 @@ class ChangeMarker(StrictModel):
     """Changes of a marker; omitted fields are unchanged."""
 
     label: Name | None = None
-    t_ns: Annotated[int, Field(ge=0, lt=2**63, strict=True)] | None = Field(
+    t_ns: Annotated[TNs, Field(strict=True)] | None = Field(
         default=None, description="Server's UTC."
     )
 
