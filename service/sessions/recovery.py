@@ -269,8 +269,6 @@ def recover_locked_folder(
     loaded, unreadable = sessions.load_all()
     loaded.sort(key=lambda session: session.id)
     for session_id, error in sorted(unreadable.items()):
-        if not any(sessions.get_path(session_id).iterdir()):
-            continue
         if rebuild_damaged_session_json(sessions, session_id) is None:
             recovery.problems.append(str(error))
         else:

@@ -293,6 +293,20 @@ def test_unreadable_files_are_named_and_hold_up_nothing_else(data: Path) -> None
     assert OTHER_BOOT in text
 
 
+@pytest.mark.parametrize("target", [None, "nowhere", "a file"], ids=["itself", "nothing", "a file"])
+def test_a_session_that_is_no_folder_is_named_and_holds_up_nothing_else(
+    data: Path, target: str | None
+) -> None:
+    bad = data / "sessions" / (ID[:-1] + "b")
+    if target == "a file":
+        bad.write_bytes(b"x")
+    else:
+        bad.symlink_to(target or bad.name)
+    recovery = recover_locked_folder(data)
+    assert outcomes(recovery) == ["sealed"]
+    assert bad.name in "; ".join(recovery.problems)
+
+
 def test_a_file_that_does_not_prove_itself_is_not_called_recovered(
     data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
