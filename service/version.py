@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import hashlib
+from datetime import UTC, datetime
 from functools import cache
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 
 SOFTWARE_VERSION = f"foottile {version('foottile')}"
+
+SOFTWARE_DATE = datetime(2026, 11, 1, tzinfo=UTC)
+"""Date before which no clock is right: that of a recent version. A machine without a battery clock
+begins in 1970; nothing that lasts is dated before."""
 
 
 @cache

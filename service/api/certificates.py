@@ -3,7 +3,7 @@
 A phone or a node trusts the CA once; the server's own certificate follows the machine's names and
 addresses. The CA is constrained to names and addresses of local networks, so that a thief of its
 key can pretend to be another machine there, and no site of the internet. Both begin a month early:
-clocks in the field are behind.
+clocks in the field are behind. A clock from before this software counts as its date.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from devices.errors import DamagedFileError, UsageError
 from devices.input_files import read_bytes
+from service.version import SOFTWARE_DATE
 from storage.durable_files import (
     make_synced_folder,
     read_small_file,
@@ -56,7 +57,7 @@ class OwnAuthority:
     Args:
         data: data folder.
         names: names and addresses of the machine; a new CA permits them beside local ones.
-        now: present time.
+        now: present time by the machine's clock.
 
     Raises:
         DamagedFileError: the file of the CA is damaged, or its time has ended.
@@ -64,6 +65,7 @@ class OwnAuthority:
     """
 
     def __init__(self, data: Path, names: Iterable[str], now: datetime) -> None:
+        now = max(now, SOFTWARE_DATE)
         self._folder = data / FOLDER_NAME
         self._leaf_path = self._folder / _LEAF_NAME
         self.ca_path = self._folder / CA_NAME
@@ -103,6 +105,7 @@ class OwnAuthority:
         Returns:
             The names that the CA may not certify, and the certificate does not cover.
         """
+        now = max(now, SOFTWARE_DATE)
         wanted = {each: _to_general_name(each) for each in names}
         allowed = {n for n in wanted.values() if n is not None and _is_within(n, self._permitted)}
         try:

@@ -16,7 +16,9 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from devices.errors import DamagedFileError, UsageError
 from foottile.connection import make_context, make_local_context
+from service.api import certificates
 from service.api.certificates import OwnAuthority, load_given_context
+from service.version import SOFTWARE_DATE
 from storage.permissions import set_umask_and_create_private_folder
 
 NAMES = ["foottile.local", "laptop", "localhost", "192.168.4.1", "fe80::1%eth0", "::1"]
@@ -145,9 +147,24 @@ def test_a_certificate_is_renewed_a_month_before_its_end(data: Path) -> None:
     assert read_leaf(data).not_valid_after_utc > last + timedelta(days=300)
 
 
+def test_what_is_made_in_1970_lasts_as_long_once_the_clock_is_right(data: Path) -> None:
+    authority = make(data, now=datetime(1970, 1, 1, 0, 1, tzinfo=UTC))
+    leaf = read_leaf(data)
+    assert "1970" not in authority.certificate.subject.rfc4514_string()
+    assert leaf.not_valid_before_utc <= SOFTWARE_DATE < leaf.not_valid_after_utc
+    assert make(data, now=datetime(1970, 1, 1, 0, 2, tzinfo=UTC)).fingerprint == (
+        authority.fingerprint
+    )
+    assert read_leaf(data) == leaf
+    for years in (0, 1, 9):
+        right = SOFTWARE_DATE + timedelta(days=365 * years)
+        assert make(data, now=right).fingerprint == authority.fingerprint
+        assert read_leaf(data).not_valid_before_utc <= right < read_leaf(data).not_valid_after_utc
+
+
 def test_it_is_made_again_for_a_clock_that_was_set_back(data: Path) -> None:
-    authority = make(data)
-    past = NOW - timedelta(days=100)
+    authority = make(data, now=NOW + timedelta(days=100))
+    past = NOW
     authority.certify(NAMES, past)
     assert read_leaf(data).not_valid_before_utc < past
 
@@ -185,7 +202,9 @@ def test_an_expired_ca_is_refused(data: Path) -> None:
         OwnAuthority(data, NAMES, NOW + timedelta(days=3660))
 
 
-def test_a_given_certificate_is_checked(data: Path, tmp_path: Path) -> None:
+def test_a_given_certificate_is_checked(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     make(data)
     good = data / "tls" / "server.pem"
     _, remarks = load_given_context(good, good)
@@ -200,7 +219,8 @@ def test_a_given_certificate_is_checked(data: Path, tmp_path: Path) -> None:
     good.chmod(0o644)
     _, remarks = load_given_context(good, good)
     assert "chmod 600" in remarks[0]
-    make(tmp_path / "old", now=NOW - timedelta(days=400))
+    monkeypatch.setattr(certificates, "_LEAF_LIFE", timedelta(days=1))  # it began a month before
+    make(tmp_path / "old")
     old = tmp_path / "old" / "tls" / "server.pem"
     with pytest.raises(UsageError, match="expired"):
         load_given_context(old, old)
