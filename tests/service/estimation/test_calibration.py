@@ -141,8 +141,10 @@ def test_a_text_that_is_no_calibration_is_refused_by_name(text: str) -> None:
 def test_a_tile_with_two_entries_is_refused_by_its_serial(is_refused_too: bool) -> None:
     content = make_one_tile_content()
     (tile,) = content["tiles"]
-    again = {"refused": {tile["serial"]: "it slipped"}} if is_refused_too else {}
-    content |= again or {"tiles": [tile, tile | {"f_scale_n": 2 * tile["f_scale_n"]}]}
+    if is_refused_too:
+        content["refused"] = {tile["serial"]: "it slipped"}
+    else:
+        content["tiles"].append(tile | {"f_scale_n": 2 * tile["f_scale_n"]})
     with pytest.raises(CalibrationError, match=f"tile {tile['serial']} has two entries"):
         Calibration.from_json_verifying_id(json.dumps(content), where="x")
 
