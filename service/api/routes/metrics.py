@@ -2,7 +2,8 @@
 
 Names, units and suffixes are those of its conventions (prometheus.io, "Metric and label naming").
 All values are read when a scraper asks: without one it costs nothing. Received frames and bytes
-count from the server's start; other counts of a node are those of its present stream.
+count from the server's start; other counts of a node are those of its present stream. Of a node
+that is away, backlog, clock, warnings and vitals are unknown, and left out.
 """
 
 from __future__ import annotations
@@ -52,21 +53,24 @@ _Value = tuple[str, float | None]
 
 def _list_node_values(node: ServerNode) -> dict[str, _Value]:
     """Return the values of a node by the metric's name; counters end in `_total`."""
-    now_t_ns, clock = server_utc_ns(), node.clock_offset
-    backlog = node.present_stream_backlog_frames
+    now_t_ns, is_here = server_utc_ns(), node.is_connected
+    clock = node.clock_offset if is_here else None
+    backlog = node.present_stream_backlog_frames if is_here else None
+    backlog_age_s = node.compute_backlog_age_s(now_t_ns) if is_here else None
     frame_bytes = node.received_bytes / node.received_frames if node.received_frames else None
     silent_ns = None if node.last_seen_t_ns is None else now_t_ns - node.last_seen_t_ns
-    rate_hz = node.rate_hz if node.is_connected else 0.0
+    backlog_bytes = None if backlog is None or frame_bytes is None else backlog * frame_bytes
+    rate_hz = node.rate_hz if is_here else 0.0
     return {
-        "connected": ("1 if the node is connected.", node.is_connected),
+        "connected": ("1 if the node is connected.", is_here),
         "received_frames_total": ("Frames received, repeated ones, too.", node.received_frames),
         "received_bytes_total": ("Bytes of received frames.", node.received_bytes),
         "frame_rate_hertz": ("Sampled frames per second, over the last second.", rate_hz),
         "nominal_frame_rate_hertz": ("Rate that the bus allows.", node.last_info.nominal_rate_hz),
         "missed_slots_total": ("Frames not sampled: too late.", node.present_stream.missed_slots),
         "backlog_frames": ("Frames that the node still has to send.", backlog),
-        "backlog_bytes": ("Their bytes, by the mean.", frame_bytes and backlog * frame_bytes),
-        "backlog_age_seconds": ("Age of the oldest.", node.compute_backlog_age_s(now_t_ns)),
+        "backlog_bytes": ("Their bytes, by the mean.", backlog_bytes),
+        "backlog_age_seconds": ("Age of the oldest.", backlog_age_s),
         "last_frame_age_seconds": ("Time since a frame.", silent_ns and silent_ns * 1e-9),
         "clock_offset_seconds": (
             "Clock of the server minus clock of the node.",
@@ -76,7 +80,7 @@ def _list_node_values(node: ServerNode) -> dict[str, _Value]:
             "Greatest error of this offset.",
             None if clock is None else clock.uncertainty_ns * 1e-9,
         ),
-        "warnings": ("Present warnings of the node.", len(node.warnings)),
+        "warnings": ("Present warnings of the node.", len(node.warnings) if is_here else None),
         "storage_failed": ("1: its frames cannot be stored.", node.storage_problem is not None),
     } | {
         f"vitals_{name}": (f"{title}; of the node's machine.", getattr(node.vitals, field, None))

@@ -92,6 +92,25 @@ def test_a_node_that_left_is_counted_on_as_not_connected(running: Running, node:
     assert series["foottile_node_received_frames_total", node.name] == 10
 
 
+def test_what_only_the_node_can_tell_is_left_out_while_it_is_away(
+    running: Running, node: FakeNode
+) -> None:
+    node.connect()
+    node.say_clock(0, uncertainty_ns=1000)
+    node.deliver(10)
+    told = {
+        f"foottile_node_{name}"
+        for name in (
+            *("backlog_frames", "backlog_bytes", "backlog_age_seconds", "warnings"),
+            *("clock_offset_seconds", "clock_offset_bound_seconds"),
+        )
+    }
+    until(lambda: told <= {name for name, *_ in read_series(running)})
+    node.leave()
+    until(lambda: read_series(running)["foottile_node_connected", node.name] == 0)
+    assert not told & {name for name, *_ in read_series(running)}
+
+
 def test_a_private_server_needs_the_token(serve_with: ServeWith) -> None:
     private = serve_with(token=TOKEN, is_private=True)
     assert_refused(private.http.get(private.url + "/metrics"), 401, "token")
