@@ -1,8 +1,9 @@
 """MQTT: summaries, states of nodes and events of sessions as JSON on a broker.
 
 Under `foottile/`: `NODE/summary` is a message `frame` of the live page, `NODE/state` is retained,
-`NODE/event` is a marker or a change of a session. `bridge` is retained, too: `online`, or by the
-last will `offline`, after which no state of a node holds.
+`NODE/event` is a marker or a change of a session. `bridge/ID` is retained, too: `online`, or by the
+last will `offline`, after which no state with this `bridge` holds. The id is the client's, and
+stays: after a change of network the broker ends the connection before; a late will is corrected.
 
 Of a slow broker's summaries only the newest of each node waits, and of its events the newest
 thousand. While there is no broker, summaries are dropped.
@@ -11,9 +12,11 @@ thousand. While there is no broker, summaries are dropped.
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import json
 import os
 import re
+import uuid
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -48,6 +51,7 @@ class MqttOutlet(Outlet):
             may be in variables instead.
         rate_hz: rate of summaries, 1 to 60.
         reporter: reporter of problems.
+        source: server and nodes that the bridge follows: each has an id of its own.
         ca: file or folder of further CA certificates.
 
     Raises:
@@ -59,6 +63,7 @@ class MqttOutlet(Outlet):
         broker: str,
         rate_hz: float,
         reporter: Reporter,
+        source: str,
         ca: str | os.PathLike[str] | None = None,
     ) -> None:
         self.rate_hz, self._reporter = rate_hz, reporter
@@ -73,15 +78,22 @@ class MqttOutlet(Outlet):
                 "the broker's address is invalid", expected="mqtt://HOST:PORT, or mqtts:// with TLS"
             )
         self._topic = unquote(parts.path).strip("/") or "foottile"
+        if re.search("[+#\0]|^\\$", self._topic):
+            raise UsageError(
+                f"the topic {self._topic!r} cannot be published to",
+                expected="the address's path as topic: without + and #, and no $ at its begin",
+            )
+        self.id = make_bridge_id(source, self._topic)
         self._subject = f"broker {parts.hostname}"
         user, password = parts.username, parts.password
         self._options: dict[str, Any] = {
+            "identifier": self.id,
             "hostname": parts.hostname,
             "port": port or (8883 if has_tls else 1883),
             "username": unquote(user) if user else read_variable(USER_VARIABLE),
             "password": unquote(password) if password else read_variable(PASSWORD_VARIABLE),
             "tls_context": make_context(ca) if has_tls else None,
-            "will": aiomqtt.Will(f"{self._topic}/bridge", "offline", _AT_LEAST_ONCE, retain=True),
+            "will": aiomqtt.Will(*self._make_bridge_message("offline")),
         }
         self._has_pending = asyncio.Event()
         self._is_connected = False
@@ -107,7 +119,7 @@ class MqttOutlet(Outlet):
 
     def write_node(self, node: str, view: Mapping[str, Any] | None) -> None:
         """Queue a state that has changed."""
-        state: dict[str, Any] = {"node": node, "state": "unknown"}
+        state: dict[str, Any] = {"node": node, "state": "unknown", "bridge": self.id}
         if view is not None:
             state["state"] = "online" if view["connected"] else "offline"
             state |= {name: view[name] for name in _STATE_FIELDS}
@@ -128,7 +140,7 @@ class MqttOutlet(Outlet):
                     self._is_connected = True
                     try:
                         await run_until_first_ends(
-                            self._publish(client), _wait_for_disconnect(client)
+                            self._publish(client), self._correct_late_wills(client)
                         )
                     except asyncio.CancelledError:  # a regular end sends no last will
                         await client.publish(
@@ -142,6 +154,14 @@ class MqttOutlet(Outlet):
             self._is_connected = False
             self._summaries.clear()
             await asyncio.sleep(_RETRY_S)
+
+    async def _correct_late_wills(self, client: aiomqtt.Client) -> None:
+        """Publish `online` whenever the bridge's topic says otherwise, until disconnected."""
+        topic, online, *_ = self._make_bridge_message("online")
+        await client.subscribe(topic, _AT_LEAST_ONCE)
+        async for message in client.messages:  # raises an error once it is disconnected
+            if message.payload != online.encode():
+                await client.publish(*self._make_bridge_message("online"))
 
     async def _publish(self, client: aiomqtt.Client) -> None:
         await client.publish(*self._make_bridge_message("online"))
@@ -161,13 +181,16 @@ class MqttOutlet(Outlet):
                 await self._has_pending.wait()
 
     def _make_bridge_message(self, state: str) -> tuple[str, str, int, bool]:
-        return f"{self._topic}/bridge", state, _AT_LEAST_ONCE, True
+        return f"{self._topic}/bridge/{self.id}", state, _AT_LEAST_ONCE, True
 
     def _make_topic(self, node: str, kind: str) -> str:
         return f"{self._topic}/{re.sub('[+#/$]', '_', node)}/{kind}"
 
 
-async def _wait_for_disconnect(client: aiomqtt.Client) -> None:
-    """Wait until the broker disconnects, which raises an error."""
-    async for _ in client.messages:
-        pass
+def make_bridge_id(source: str, topic: str) -> str:
+    """Return the id of a bridge: the same at each start, another one for each machine and source.
+
+    It has at most the 23 characters that every broker accepts.
+    """
+    content = f"{uuid.getnode()} {source} {topic}"
+    return f"foottile-{hashlib.sha256(content.encode()).hexdigest()[:12]}"

@@ -58,7 +58,7 @@ def bridge_command(
         if broker is not None:
             from service.bridges.mqtt import MqttOutlet
 
-            return MqttOutlet(broker, rate, reporter, ca)
+            return MqttOutlet(broker, rate, reporter, f"{source.url} {sorted(node or ())}", ca)
         if kind == "lsl":
             from service.bridges.lsl import LslOutlet, limit_to_this_machine
 

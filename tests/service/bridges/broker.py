@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from fnmatch import fnmatch
 from typing import Any, NamedTuple
 
 from paho.mqtt.client import Client, MQTTMessage
@@ -65,12 +66,16 @@ class RunningBroker:
         self._process.kill()
         self._process.communicate()
 
+    def publish_retained(self, topic: str, text: str) -> None:
+        """Publish for another client, as the broker does a last will."""
+        self._client.publish(topic, text, qos=1, retain=True)
+
     def receive(self, topic: str, is_wanted: Callable[[Any], bool] = lambda _: True) -> Received:
-        """The next message of a topic that is wanted; others are dropped."""
+        """The next message of a topic, or of a pattern of topics, that is wanted; others go."""
         end_s = time.monotonic() + PATIENCE_S
         while True:
             message = self.received.get(timeout=left_s(end_s))
-            if message.topic == topic and is_wanted(message.content):
+            if fnmatch(message.topic, topic) and is_wanted(message.content):
                 return message
 
     def _take(self, message: MQTTMessage) -> None:

@@ -25,6 +25,9 @@ from tests.waiting import PATIENCE_S, in_a_loop, until
 
 pytestmark = pytest.mark.process
 
+BRIDGE = "foottile/bridge/*"
+SOURCE = "http://here []"
+
 
 @pytest.fixture
 def broker() -> Iterator[RunningBroker]:
@@ -37,7 +40,7 @@ def test_summaries_states_and_events_of_a_node_are_on_the_broker(
     running: Running, tared: FakeNode, foottile: Start, broker: RunningBroker
 ) -> None:
     foottile("bridge", "mqtt", broker.url, "--rate", 5, "--server", running.url)
-    assert broker.receive("foottile/bridge").content == "online"
+    assert broker.receive(BRIDGE).content == "online"
     state = broker.receive("foottile/bench/state").content
     assert (state["state"], state["tiles"]) == ("online", ["T01", "T02"])
     with running.socket("/api/v1/live?rate_hz=5") as page, Play(tared, [20.0, 160.0]):
@@ -70,11 +73,11 @@ def test_a_bridge_that_is_ended_is_offline(
     running: Running, tared: FakeNode, foottile: Start, broker: RunningBroker
 ) -> None:
     bridge = foottile("bridge", "mqtt", broker.url, "--server", running.url)
-    assert broker.receive("foottile/bridge").content == "online"
+    assert broker.receive(BRIDGE).content == "online"
     broker.receive("foottile/bench/state")
     time.sleep(1.0)  # until no message waits for its acknowledgement
     bridge.process.send_signal(signal.SIGINT)
-    assert broker.receive("foottile/bridge").content == "offline"
+    assert broker.receive(BRIDGE).content == "offline"
     assert bridge.ended() == 0
 
 
@@ -83,9 +86,43 @@ def test_a_bridge_that_is_killed_is_offline_by_its_last_will(
     running: Running, tared: FakeNode, foottile: Start, broker: RunningBroker
 ) -> None:
     bridge = foottile("bridge", "mqtt", broker.url, "--server", running.url)
-    assert broker.receive("foottile/bridge").content == "online"
+    assert broker.receive(BRIDGE).content == "online"
     bridge.process.kill()
-    assert broker.receive("foottile/bridge").content == "offline"
+    assert broker.receive(BRIDGE).content == "offline"
+
+
+def test_a_late_will_of_an_earlier_connection_is_corrected(
+    running: Running, tared: FakeNode, foottile: Start, broker: RunningBroker
+) -> None:
+    foottile("bridge", "mqtt", broker.url, "--server", running.url)
+    state = broker.receive("foottile/bench/state").content
+    status = f"foottile/bridge/{state['bridge']}"
+    for _ in range(2):
+        broker.publish_retained(status, "offline")
+        assert broker.receive(status, lambda each: each == "offline")
+        assert broker.receive(status).content == "online"
+
+
+def test_a_bridge_keeps_its_id_and_shares_it_with_no_other() -> None:
+    ids = {
+        MqttOutlet(f"mqtt://host/{topic}", 1.0, Reporter(print), source).id
+        for topic in ("", "lab")
+        for source in (SOURCE, "http://there []", "http://here ['left']")
+        for _ in range(2)
+    }
+    assert len(ids) == 6
+    assert max(map(len, ids)) <= 23
+    first, second = (
+        MqttOutlet("mqtt://host", 1.0, Reporter(print), source)._options["will"]
+        for source in (SOURCE, "http://there []")
+    )
+    assert first.topic != second.topic, "one speaks for the other"
+
+
+@pytest.mark.parametrize("topic", ["a/+", "%23", "$SYS", "a%00"])
+def test_a_topic_that_no_broker_takes_is_refused(topic: str) -> None:
+    with pytest.raises(UsageError, match="topic"):
+        make_outlet(f"mqtt://host/{topic}", [])
 
 
 @pytest.mark.slow
@@ -105,7 +142,7 @@ def test_a_broker_that_comes_back_gets_states_and_the_events_of_meanwhile(
 
 
 def make_outlet(url: str, said: list[str]) -> MqttOutlet:
-    return MqttOutlet(url, 1.0, Reporter(said.append))
+    return MqttOutlet(url, 1.0, Reporter(said.append), SOURCE)
 
 
 def test_what_waits_for_a_broker_is_bounded() -> None:
@@ -198,7 +235,7 @@ def test_address_user_and_password_come_from_the_url_or_the_environment(
     assert (options["hostname"], options["port"]) == ("host", 8883)
     assert (options["username"], options["password"]) == ("me", "a@b")
     assert options["tls_context"].check_hostname
-    assert options["will"].topic == "lab/feet/bridge"
+    assert options["will"].topic == f"lab/feet/bridge/{options['identifier']}"
     monkeypatch.setenv("FOOTTILE_MQTT_USER", "you")
     monkeypatch.setenv("FOOTTILE_MQTT_PASSWORD", "secret")
     options = make_outlet("mqtt://host", [])._options
