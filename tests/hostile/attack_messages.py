@@ -57,6 +57,14 @@ _CODES = (1007, 1008, 1009, 4001, 4002, 4004, 4009, 4010, 4013)
 """With which whoever says nonsense may be let go."""
 
 
+_UNLIMITED = tuple(
+    word
+    for name in ("", "-per-address", "-in-all")
+    for word in (f"--max-messages-per-s{name}", 100_000)
+)
+"""Its connections come as quickly as they can: how many may is another attack."""
+
+
 @attack("mutated and well-formed but wrong messages", tries=200, soak_tries=100_000)
 def messages(play: Play) -> Outcome:
     """Messages to `/api/v1/ingest` and `/api/v1/live` of a server that records, with a screen.
@@ -70,7 +78,7 @@ def messages(play: Play) -> Outcome:
     folder, or `foottile verify` finds damage in it.
     """
     outcome = Outcome()
-    with Served(play.folder, outcome=outcome) as served:
+    with Served(play.folder, "serve", *_UNLIMITED, outcome=outcome) as served:
         with recording(served, outcome):
             asyncio.run(_attacked(play, served, outcome))
         _check_gap(outcome)
