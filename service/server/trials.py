@@ -7,6 +7,7 @@ a restart; that the server waits for a contact does not.
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -37,7 +38,7 @@ STOP_AFTER_S_MAX = 3600
 PRE_ROLL_S = 1.0
 """Pre-roll of a trial that a contact starts."""
 _NAME_LENGTH_MAX = 200
-_RULE = "`name; tag, tag`, or names with commas between"
+_RULE = "`name; tag, tag`, a tab for `;`, or names with commas between"
 
 
 _TrialName = Annotated[
@@ -83,7 +84,8 @@ class _StoredTrials(StrictModel):
 def parse_trials(text: str) -> tuple[ListedTrial, ...]:
     """Parse a text: a trial a line, `name; tag, tag`; a line without `;` may name several trials.
 
-    Empty lines, and lines that begin with `#`, are ignored.
+    The tabs of a spreadsheet stand for `;` and commas. A comma between digits of several names is
+    refused: it may be a decimal one. Empty lines, and lines that begin with `#`, are ignored.
 
     Raises:
         UsageError: a line is no trial.
@@ -92,7 +94,15 @@ def parse_trials(text: str) -> tuple[ListedTrial, ...]:
     for number, line in enumerate(text.removeprefix("\ufeff").replace("\r\n", "\n").split("\n"), 1):
         if not line.strip() or line.strip().startswith("#"):
             continue
-        names, has_tags, tags = line.partition(";")
+        row = line.rstrip().replace("\t", ";", 1).replace("\t", ",")
+        names, has_tags, tags = row.partition(";")
+        if not has_tags and (decimal := re.search(r"\d,\d", names)):
+            raise UsageError(
+                f"{line.strip()[:80]!r}: is the comma in {decimal[0]!r} of a number, or between "
+                "two trials?",
+                where=f"line {number}",
+                expected="a `;` behind a name with commas, or a space behind each comma",
+            )
         try:
             trials += [
                 ListedTrial(name=name, tags=tuple(tag for tag in tags.split(",") if tag.strip()))

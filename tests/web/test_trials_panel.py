@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from playwright.sync_api import expect
@@ -111,6 +112,21 @@ def test_an_armed_trial_begins_at_the_contact_and_can_be_disarmed(
         expect(page.locator("#trial-place")).to_have_text(re.compile(r"^Recording, \d s left$"))
         expect(page.locator("#trial-name")).to_have_text("mud 2")  # stopped by the server
         expect(page.locator("#recordings")).to_be_hidden()
+
+
+def test_a_list_from_a_file_is_read_in_the_encodings_of_spreadsheets(
+    scripted: Scripted, open_page: OpenPage, tmp_path: Path
+) -> None:
+    page = live(open_page(scripted.url))
+    page.click("#device")
+    page.get_by_role("menuitem", name="Trial list …").click()
+    for encoding in ("utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "latin-1"):
+        path = tmp_path / f"{encoding}.txt"
+        path.write_text(f"Füße {encoding}\twet", encoding)
+        page.set_input_files("#trials-dialog input[type=file]", path)
+        expect(page.locator("#trials-text")).to_have_value(f"Füße {encoding}\twet")
+    page.click("#trials-use")
+    expect(page.locator("#trials-rows li")).to_have_text(re.compile("Füße latin-1.*wet"))
 
 
 def test_the_dialog_sends_one_setting_and_shows_what_another_page_has_changed(

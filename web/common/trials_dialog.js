@@ -15,7 +15,7 @@ export function openTrials(trials) {
   const file = el("input", { type: "file", accept: ".txt,.csv,text/plain", "aria-label": "List from a file" });
   file.addEventListener("change", async () => {
     const [chosen] = file.files ?? [];
-    if (chosen) text.value = await chosen.text();
+    if (chosen) text.value = decodeText(await chosen.arrayBuffer());
   });
   const use = el("button", { type: "button", id: "trials-use", text: "Use this list" });
   use.addEventListener("click", () => tell(async () => {
@@ -75,5 +75,18 @@ export function openTrials(trials) {
     const known = new Set([...document.querySelectorAll("#node-select option, .node h2 a")].map((one) => one.textContent).concat(list.node ?? []));
     node.replaceChildren(el("option", { value: "", text: "all connected nodes" }), ...[...known].map((name) => el("option", { value: name, text: name })));
     node.value = list.node ?? "";
+  }
+}
+
+/** Return the text of a file as editors and spreadsheets save it: UTF-8, UTF-16, or else Windows' Latin. @param {ArrayBuffer} content */
+function decodeText(content) {
+  const head = new Uint8Array(content.slice(0, 2));
+  const isWide = (low, high) => low === 0xff && high === 0xfe || low !== 0 && high === 0;
+  if (isWide(head[0], head[1])) return new TextDecoder("utf-16le").decode(content);
+  if (isWide(head[1], head[0])) return new TextDecoder("utf-16be").decode(content);
+  try {
+    return new TextDecoder("utf-8", { fatal: true }).decode(content);
+  } catch {
+    return new TextDecoder("windows-1252").decode(content);
   }
 }

@@ -82,8 +82,24 @@ def test_a_line_is_a_name_with_tags_or_names_with_commas_between() -> None:
     ]
 
 
+def test_rows_of_a_spreadsheet_are_names_with_tags() -> None:
+    text = "mud 1\twet\tdeep\nmud 2\t\t\n1,5 km/h\tdry\n"
+    assert [(one.name, one.tags) for one in parse_trials(text)] == [
+        ("mud 1", ("wet", "deep")),
+        ("mud 2", ()),
+        ("1,5 km/h", ("dry",)),
+    ]
+
+
+def test_a_decimal_comma_never_makes_two_trials_of_one() -> None:
+    with pytest.raises(UsageError, match=r"line 2.*'1,5'"):
+        parse_trials("# speeds\nwalk 1,5 km/h\n")
+    (trial,) = parse_trials("walk 1,5 km/h;\n")
+    assert trial.name == "walk 1,5 km/h"
+
+
 @pytest.mark.parametrize(
-    "line", ["; wet", "a,, b", "a\tb", "a; b; c\x07", "x" * 201, "a; " + "t" * 101, "\u202ea"]
+    "line", ["; wet", "a,, b", "\twet", "a; b; c\x07", "x" * 201, "a; " + "t" * 101, "\u202ea"]
 )
 def test_a_bad_line_is_refused_with_its_number(line: str) -> None:
     with pytest.raises(UsageError, match="line 3") as found:
