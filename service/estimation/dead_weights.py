@@ -21,9 +21,15 @@ LEVELS_MIN = 4
 LEVEL_RATIO_MIN = 1.1
 """Least ratio of two different weights."""
 _WEIGHT = re.compile(
-    r"(?P<size>\d{1,6}(?:\.\d{1,6})?) ?(?P<unit>g|kg|N)"
-    r"(?: ?(?:\+-|±) ?(?P<off>\d{1,2}(?:\.\d{1,4})?) ?%)?"
+    r"(?P<size>\d{1,6}(?:[.,]\d{1,6})?)\s?(?P<unit>g|kg|n)"
+    r"(?:\s?(?:\+-|±)\s?(?P<off>\d{1,2}(?:[.,]\d{1,4})?)\s?%)?",
+    re.IGNORECASE,
 )
+_SEPARATOR = re.compile(r";|,(?!\d)|(?<!\d),")
+"""Between weights; a comma between digits is a decimal comma."""
+_THOUSANDS = re.compile(r"[1-9]\d*,\d{3}(?!\d)")
+"""Comma of thousands, or a decimal comma."""
+_UNITS = {"g": "g", "kg": "kg", "n": "N"}
 _NEWTONS = {"g": 1e-3 * STANDARD_GRAVITY_M_S2, "kg": STANDARD_GRAVITY_M_S2, "N": 1.0}
 _HEAVIEST_N = 1000.0
 
@@ -37,17 +43,22 @@ class DeadWeight:
 
 
 def parse_weight(text: str) -> DeadWeight | None:
-    """Parse a weight such as `500 g`, `0.5 kg +-1 %` or `4.9 N`; None: the text is no weight."""
+    """Parse a weight such as `500 g`, `0,5 kg +-1 %` or `4.9 N`; None: the text is no weight."""
     found = _WEIGHT.fullmatch(text.strip())
-    if found is None:
+    if found is None or _THOUSANDS.match(found["size"]):
         return None
-    force_n = float(found["size"]) * _NEWTONS[found["unit"]]
+    unit = _UNITS[found["unit"].lower()]
+    force_n = _parse_number(found["size"]) * _NEWTONS[unit]
     if not 0.0 < force_n <= _HEAVIEST_N:
         return None
     # A tolerance bounds the error: its standard uncertainty is that of a uniform distribution.
-    percent = TOLERANCE_PERCENT if found["off"] is None else float(found["off"])
-    gravity = 0.0 if found["unit"] == "N" else GRAVITY_SIGMA
+    percent = TOLERANCE_PERCENT if found["off"] is None else _parse_number(found["off"])
+    gravity = 0.0 if unit == "N" else GRAVITY_SIGMA
     return DeadWeight(force_n, float(np.hypot(0.01 * percent / np.sqrt(3.0), gravity)))
+
+
+def _parse_number(text: str) -> float:
+    return float(text.replace(",", "."))
 
 
 def check_and_label_weights(
@@ -55,18 +66,27 @@ def check_and_label_weights(
 ) -> tuple[str, ...]:
     """Check that weights suffice for a curve; label them `500 g +-0.5 %`, a stated tolerance stays.
 
+    Args:
+        texts: each of one weight, or of several with commas or semicolons between.
+        default_tolerance_percent: tolerance of a weight that states none.
+
     Raises:
         UsageError: a text is no weight, or there are too few for a curve.
     """
     labels, forces_n = [], []
-    for text in texts:
+    for text in (one.strip() for line in texts for one in _SEPARATOR.split(line)):
+        if not text:
+            continue
         label = text if "%" in text else f"{text} +-{round(default_tolerance_percent, 4):g} %"
         found, weight = _WEIGHT.fullmatch(label.strip()), parse_weight(label)
         if found is None or weight is None:
             raise UsageError(
-                f"{text[:40]!r} is no weight", expected="masses or forces, as 200 g, 1 kg or 4.9 N"
+                f"{text[:40]!r} is no weight",
+                expected="masses or forces, as 200 g, 1.5 kg or 4,9 N; with a decimal comma, not "
+                "one of thousands",
             )
-        labels.append(f"{found['size']} {found['unit']} +-{found['off']} %")
+        size, off = found["size"].replace(",", "."), found["off"].replace(",", ".")
+        labels.append(f"{size} {_UNITS[found['unit'].lower()]} +-{off} %")
         forces_n.append(weight.force_n)
     try:
         check_enough_distinct_weights(forces_n)

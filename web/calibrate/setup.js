@@ -92,7 +92,7 @@ export class Setup {
 
   /** Weights of the form. */
   get list() {
-    return this.weights.value.split(/[,;]/).map((one) => one.trim()).filter(Boolean);
+    return this.weights.value.split(/;|,(?!\d)|[gN%],/i).map((one) => one.trim()).filter(Boolean);
   }
 
   /** Update order, duration and the start button. */
@@ -111,7 +111,7 @@ export class Setup {
   body() {
     const valueOf = (id) => byId(id, HTMLInputElement).value.trim();
     return {
-      tiles: this.order, weights: this.list, within_percent: Number(this.within.value), method: this.method,
+      tiles: this.order, weights: [this.weights.value], within_percent: Number(this.within.value), method: this.method,
       ...(valueOf("reference") ? { reference: valueOf("reference") } : {}), ...(valueOf("name") ? { name: valueOf("name") } : {}),
     };
   }

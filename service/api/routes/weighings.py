@@ -52,10 +52,11 @@ class StartWeighing(StrictModel):
         Field(min_length=1, max_length=_TILES_MAX),
     ] = Field(description="Serials, in the order in which they are loaded.", examples=[["T01"]])
     weights: Annotated[
-        tuple[Annotated[str, StringConstraints(max_length=40)], ...],
+        tuple[Annotated[str, StringConstraints(max_length=40 * _WEIGHTS_MAX)], ...],
         Field(min_length=1, max_length=_WEIGHTS_MAX),
     ] = Field(
-        description="In the order in which they are put on each tile; five or more, in g, kg or N.",
+        description="In the order in which they are put on each tile; five or more, in g, kg or N. "
+        "A text may have several, with `;` or commas between; a comma between digits is decimal.",
         examples=[["200 g", "500 g", "1 kg", "1.5 kg", "2 kg"]],
     )
     within_percent: Annotated[float, Field(ge=0, le=50)] = Field(

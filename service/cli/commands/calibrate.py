@@ -73,7 +73,7 @@ def calibrate_live(
     from service.sessions.calibration_file import parse_calibration
     from storage.durable_files import write_atomically
 
-    weights = check_and_label_weights(request.weights.split(","), request.within_percent)
+    weights = check_and_label_weights([request.weights], request.within_percent)
     with foottile.connect(server, ca=ca) as source:
         node = _select_node(source, request.node)
         _check_assignable(node, request)

@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 
 from devices.chips.mpl115a2 import MPL115A2
-from devices.errors import CalibrationError
+from devices.errors import CalibrationError, UsageError
 from service.estimation.calibration import TileCalibration
-from service.estimation.dead_weights import STANDARD_GRAVITY_M_S2, parse_weight
+from service.estimation.dead_weights import (
+    STANDARD_GRAVITY_M_S2,
+    check_and_label_weights,
+    parse_weight,
+)
 from service.estimation.fitting.rig.indentation import Indentation
 from service.estimation.fitting.weights_fit import fit_curve_to_dead_weights
 
@@ -66,6 +70,9 @@ def read_half_width_n(tile: TileCalibration) -> float:
         ("0.5kg ±0%", 0.5 * STANDARD_GRAVITY_M_S2, 0.15),
         ("4.9 N +-0 %", 4.9, 0.0),
         ("4.9 N", 4.9, 1.0 / np.sqrt(3.0)),
+        ("0,5\u00a0Kg +-0,0\u202f%", 0.5 * STANDARD_GRAVITY_M_S2, 0.15),
+        ("0,125 KG +-0 %", 0.125 * STANDARD_GRAVITY_M_S2, 0.15),
+        ("4,9 n +-0 %", 4.9, 0.0),
     ],
 )
 def test_a_weight_is_a_force_with_its_uncertainty(
@@ -77,9 +84,32 @@ def test_a_weight_is_a_force_with_its_uncertainty(
     assert 100.0 * weight.relative_sigma == pytest.approx(percent)
 
 
-@pytest.mark.parametrize("text", ["500", "g", "0 g", "500 lb", "rest", "-5 N", "1e3 g", "9999 kg"])
+@pytest.mark.parametrize(
+    "text",
+    ["500", "g", "0 g", "500 lb", "rest", "-5 N", "1e3 g", "9999 kg", "1,500 g", "12,500 kg"],
+)
 def test_another_text_is_no_weight(text: str) -> None:
     assert parse_weight(text) is None
+
+
+@pytest.mark.parametrize(
+    "texts",
+    [
+        ("0,2 kg", "0,5 kg", "1 kg", "1,5 kg", "2 kg"),
+        ("0,2 kg, 0,5 kg, 1 kg, 1,5 kg, 2 kg",),
+        ("0.2kg,0.5kg,1kg,1.5kg,2kg",),
+        ("0,2\u00a0Kg; 0,5\u00a0Kg; 1\u00a0Kg; 1,5\u00a0Kg; 2\u00a0Kg;",),
+    ],
+)
+def test_a_comma_between_digits_is_decimal_and_another_one_separates(texts: list[str]) -> None:
+    labels = check_and_label_weights(texts, 1.0)
+    assert [*labels] == [f"{kg} kg +-1 %" for kg in ("0.2", "0.5", "1", "1.5", "2")]
+
+
+@pytest.mark.parametrize("text", ["1,500 g", "200,500 g", "0.2 kg 0.5 kg"])
+def test_a_text_that_may_be_another_number_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="decimal comma"):
+        check_and_label_weights([text], 1.0)
 
 
 def test_five_weights_give_the_curve_of_a_tile() -> None:
