@@ -129,7 +129,7 @@ def read_table(
     """
     ending = path.suffix.lower()
     chosen = next((one for one in TABLE_FORMATS if ending in one.endings), TEXT)
-    if rosbag.is_bag_folder(path):
+    if rosbag.is_bag_folder(path) or rosbag.is_cut_off_bag1(path):
         chosen = BAG
     with _complete_errors(path, chosen.form):
         if chosen is TEXT:

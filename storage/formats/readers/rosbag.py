@@ -35,6 +35,9 @@ WRENCHES = (WRENCH, "geometry_msgs/WrenchStamped")
 YEAR_2000_NS = 946_684_800_000_000_000
 """Year 2000; earlier stamps are from a simulation or from a clock that was never set."""
 _COLUMNS = ("fz", "fx", "fy", "cop_x", "cop_y")
+_METADATA_NAME = "metadata.yaml"
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+"""Begin and end of an MCAP file."""
 _Message = tuple[str, int, Any]
 """Topic, time of recording in ns, and the decoded message."""
 
@@ -48,11 +51,19 @@ class _Bag:
 
 
 def is_bag_folder(path: Path) -> bool:
-    """Return whether a path is the folder of a ROS 2 bag."""
+    """Return whether a path is the folder of a ROS 2 bag; a cut-off one lacks `metadata.yaml`."""
     try:
-        return (path / "metadata.yaml").is_file()
-    except OSError:  # name too long
+        return any(
+            file.name == _METADATA_NAME or file.suffix in (".mcap", ".db3")
+            for file in path.iterdir()
+        )
+    except OSError:  # no folder, or its name is too long
         return False
+
+
+def is_cut_off_bag1(path: Path) -> bool:
+    """Return whether a path is the file in which ROS 1 records, left behind without an index."""
+    return path.name.lower().endswith(".bag.active")
 
 
 @require_extra("mcap", "To read ROS bags and MCAP")
@@ -66,6 +77,7 @@ def read_bag_wrenches(path: Path, is_needed: ColumnFilter, values_max: int) -> F
         for file in path.iterdir() if path.is_dir() else (path,):
             if not file.is_dir():
                 check_regular_file(file)  # the libraries would block on a pipe or a device
+        _check_end(path)
         bag = _open_mcap(path) if path.suffix.lower() == ".mcap" else _open_rosbag(path)
         return _make_table(bag, is_needed, values_max)
     except (FootTileError, ModuleNotFoundError, MemoryError):
@@ -73,6 +85,40 @@ def read_bag_wrenches(path: Path, is_needed: ColumnFilter, values_max: int) -> F
     except Exception as error:  # libraries raise whatever damaged bytes lead to
         kind = type(error).__name__
         raise FileFormatError(f"cannot be read: {str(error)[:200] or kind}") from error
+
+
+def _check_end(path: Path) -> None:
+    """Refuse a recording that was cut off, before the libraries complain of its content.
+
+    Raises:
+        FileFormatError: it was cut off; with the tool that repairs it.
+        OSError: it cannot be read.
+    """
+    tool = ""
+    if path.is_dir():
+        if not (path / _METADATA_NAME).exists():
+            tool = f"ros2 bag reindex {path}"
+    elif path.suffix.lower() == ".mcap":
+        with path.open("rb") as file:
+            is_mcap = file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
+            file.seek(max(0, path.stat().st_size - len(_MCAP_MAGIC)))
+            if is_mcap and file.read() != _MCAP_MAGIC:
+                tool = f"mcap recover {path} -o repaired.mcap"
+    elif is_cut_off_bag1(path) or (path.suffix.lower() == ".bag" and _lacks_index(path)):
+        tool = f"rosbag reindex {path}"
+    if tool:
+        raise FileFormatError(
+            "its recording was cut off: its end is missing", remedy=f"Repair it: `{tool}`"
+        )
+
+
+def _lacks_index(path: Path) -> bool:
+    """Return whether a bag of ROS 1 has no index, or ends before it."""
+    with path.open("rb") as file:
+        head = file.read(4096)
+    _, found, rest = head.partition(b"index_pos=")
+    position = int.from_bytes(rest[:8], "little")
+    return bool(found) and not 0 < position < path.stat().st_size
 
 
 def _make_table(bag: _Bag, is_needed: ColumnFilter, values_max: int) -> ForceTable:
@@ -209,11 +255,7 @@ def _open_mcap(path: Path) -> _Bag:
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
     if summary is None:
-        raise FileFormatError(
-            "it is cut off: it has no summary",
-            where=str(path),
-            remedy="Repair it with `mcap recover`",
-        )
+        raise FileFormatError("it has no summary", remedy=f"Add one: `mcap recover {path}`")
     found = [
         channel.topic
         for channel in summary.channels.values()

@@ -189,6 +189,34 @@ def test_a_cut_or_damaged_bag_is_refused_by_our_own_errors(tmp_path: Path, write
             read_reference(path, ReferenceOptions())
 
 
+@pytest.mark.parametrize("write", [write_mcap2, write_mcap1, write_bag1])
+def test_a_recording_that_was_cut_off_says_so_and_names_its_tool(
+    tmp_path: Path, write: Write
+) -> None:
+    path = write(tmp_path, walk())
+    content = path.read_bytes()
+    tool = "rosbag reindex" if path.suffix == ".bag" else "mcap recover"
+    for missing_bytes in (len(content) // 2, len(content) - 100) + (40,) * (tool[0] == "m"):
+        path.write_bytes(content[:-missing_bytes])
+        with pytest.raises(FileFormatError, match=rf"cut off.*{tool}"):
+            read_reference(path, ReferenceOptions())
+
+
+def test_a_bag_of_ros_1_that_is_still_recorded_names_its_tool(tmp_path: Path) -> None:
+    path = tmp_path / "walk.bag.active"
+    write_bag1(tmp_path, walk()).rename(path)
+    with pytest.raises(FileFormatError, match=r"cut off.*rosbag reindex"):
+        read_reference(path, ReferenceOptions())
+
+
+@pytest.mark.parametrize("write", [write_bag2, write_mcap_folder])
+def test_a_folder_without_metadata_names_its_tool(tmp_path: Path, write: Write) -> None:
+    path = write(tmp_path, walk())
+    (path / "metadata.yaml").unlink()
+    with pytest.raises(FileFormatError, match=r"cut off.*ros2 bag reindex"):
+        read_reference(path, ReferenceOptions())
+
+
 def test_soles_are_added_up_where_their_stamps_are_the_same(tmp_path: Path) -> None:
     both = ReferenceOptions({"grf_n": "left_foot_fz+right_fz"})
     path = write_bag1(tmp_path, [*walk(), *walk("/right", turned=2.0)])
