@@ -284,7 +284,18 @@ def _read_stamps(
             stamps.append(stamp)
     if not stamps:
         raise FileFormatError("the film has no picture with a time", where=str(path))
-    return np.unique(np.array(stamps, dtype=np.int64))
+    distinct = np.unique(np.array(stamps, dtype=np.int64))
+    # As with a time scale of 0. Some films repeat a few instants; an edit list may hide pictures.
+    count = max(packet_count, stream.frames)
+    if len(distinct) == 1 < count or 2 * len(distinct) < len(stamps):
+        raise FileFormatError(
+            f"the film's {count} pictures are shown at {len(distinct)} instants: its "
+            "header is damaged",
+            where=str(path),
+            expected="pictures one after the other",
+            remedy="Copy the file from the camera again",
+        )
+    return distinct
 
 
 def _check_length(

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from devices.errors import FileFormatError
 from service.video import edit_list
 from service.video.container import iterate_pictures, read_film
 from service.video.edit_list import EditList, read_edit_list
@@ -104,3 +105,20 @@ def test_a_list_that_is_not_found_leaves_it_unknown(
     monkeypatch.undo()
     monkeypatch.setattr(edit_list, "_BOXES_MAX", 1)
     assert read_edit_list(path) == EditList(hidden_count=None)
+
+
+@pytest.mark.parametrize("codec", CODECS)
+@pytest.mark.parametrize(
+    ("box", "at", "value"), [(b"mdhd", 12, 0), (b"mdhd", 12, 2**32 - 1), (b"stts", 12, 0)]
+)
+def test_a_film_whose_pictures_are_at_one_instant_is_refused(
+    tmp_path: Path, box: bytes, at: int, value: int, codec: str
+) -> None:
+    """Time scale, and interval of all pictures."""
+    path = make_film(tmp_path / "film.mp4", codec)
+    content = bytearray(path.read_bytes())
+    place = content.index(box) + len(box) + at
+    content[place : place + 4] = value.to_bytes(4, "big")
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError, match=rf"{PICTURES} pictures are shown at 1 instants"):
+        read_film(path)
