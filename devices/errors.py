@@ -43,6 +43,7 @@ flag and a NaN (see `devices.frames`); these errors stop a command, never a stre
 
 from __future__ import annotations
 
+import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import ClassVar, Literal, TypedDict, Unpack
@@ -82,6 +83,8 @@ Extra = Literal[
     "gpio", "rig", "archive", "mocap", "mcap", "bridges", "video",
 ]  # fmt: skip  # two lines, not twelve
 
+_WITHOUT_ARM_WHEELS: dict[Extra, str] = {"mocap": "ezc3d"}
+"""Package of an extra that has wheels for x86 only."""
 OUR_PACKAGES = ("devices", "storage", "service", "studies", "foottile")
 
 
@@ -107,8 +110,19 @@ def require_extra(extra: Extra, feature: str, *, remedy: str = "") -> Iterator[N
             raise
         raise MissingExtraError(
             f"{feature} needs {package}, which is not installed",
-            remedy=remedy or f"Install it: pip install 'foottile[{extra}]'",
+            remedy=remedy or _describe_installation(extra),
         ) from error
+
+
+def _describe_installation(extra: Extra) -> str:
+    command = f"pip install 'foottile[{extra}]'"
+    package = _WITHOUT_ARM_WHEELS.get(extra)
+    if package is None or not platform.machine().startswith(("aarch", "arm")):
+        return f"Install it: {command}"
+    return (
+        f"{package} has no wheel for ARM: pull the session to a PC, and write the file there, "
+        f"after {command}; or build {package} from its source"
+    )
 
 
 class _ErrorFacts(TypedDict, total=False):

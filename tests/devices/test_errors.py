@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import platform
 import sys
 from collections.abc import Iterator
 
@@ -109,3 +110,18 @@ def test_a_missing_package_is_named_with_the_extra_that_brings_it(
 def test_a_missing_module_of_foottile_is_no_missing_extra() -> None:
     with pytest.raises(ModuleNotFoundError), require_extra("server", "a server"):
         raise ModuleNotFoundError("no such module", name="service.no_such_module")
+
+
+@pytest.mark.parametrize("machine", ["aarch64", "armv7l", "x86_64"])
+def test_an_extra_without_wheels_for_arm_says_so_where_it_is_asked_for(
+    machine: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(platform, "machine", lambda: machine)
+    for extra in ("mocap", "video"):
+        with (
+            pytest.raises(MissingExtraError, match=rf"foottile\[{extra}\]") as caught,
+            require_extra(extra, "it"),
+        ):
+            raise ModuleNotFoundError(name="ezc3d")
+        has_none = extra == "mocap" and machine != "x86_64"
+        assert ("no wheel for ARM" in str(caught.value)) == has_none
