@@ -117,16 +117,17 @@ def test_an_armed_trial_begins_at_the_contact_and_can_be_disarmed(
 def test_a_list_from_a_file_is_read_in_the_encodings_of_spreadsheets(
     scripted: Scripted, open_page: OpenPage, tmp_path: Path
 ) -> None:
-    page = live(open_page(scripted.url))
-    page.click("#device")
-    page.get_by_role("menuitem", name="Trial list …").click()
-    for encoding in ("utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "latin-1"):
-        path = tmp_path / f"{encoding}.txt"
-        path.write_text(f"Füße {encoding}\twet", encoding)
-        page.set_input_files("#trials-dialog input[type=file]", path)
-        expect(page.locator("#trials-text")).to_have_value(f"Füße {encoding}\twet")
-    page.click("#trials-use")
-    expect(page.locator("#trials-rows li")).to_have_text(re.compile("Füße latin-1.*wet"))
+    with Play(scripted.node, 0.0):
+        page = live(open_page(scripted.url))
+        page.click("#device")
+        page.get_by_role("menuitem", name="Trial list …").click()
+        for encoding in ("utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "latin-1"):
+            path = tmp_path / f"{encoding}.txt"
+            path.write_text(f"Füße {encoding}\twet", encoding)
+            page.set_input_files("#trials-dialog input[type=file]", path)
+            expect(page.locator("#trials-text")).to_have_value(f"Füße {encoding}\twet")
+        page.click("#trials-use")
+        expect(page.locator("#trials-rows li")).to_have_text(re.compile("Füße latin-1.*wet"))
 
 
 def test_the_dialog_sends_one_setting_and_shows_what_another_page_has_changed(
