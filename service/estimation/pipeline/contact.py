@@ -3,7 +3,7 @@
 The force is that on all domes, without creep and loop that loads before left. It is the greater of
 two: that of the frame's instant, and the sum of the readings as they are, which tiles sample within
 some milliseconds after it. Its thresholds are multiples of the unloaded noise, or shares of the
-greatest recent force if these are more: what the models leave is proportional to the load.
+greatest recent force if these are more: models leave a share of each load.
 
 A change is accepted if it lasts `contact_min_ns`, and is then dated back to its beginning within
 the look-ahead: with a look-ahead of at least `contact_min_ns` contact begins with the first loaded
