@@ -130,8 +130,8 @@ def pull_export(
     its pages' checksums, and its metadata state the session.
 
     Returns:
-        The session's metadata, with `path`, `bytes` and `remarks`: what the format filled or left
-        out; empty: nothing.
+        The session's metadata, with `path`, `bytes` and `remarks` of the format: filled gaps and
+        rows left out; empty: none.
 
     Raises:
         foottile.DamagedError: the download cannot be read.
