@@ -79,7 +79,7 @@ class _Packets(NamedTuple):
 
 
 def read_edit_list(path: Path) -> EditList:
-    """Read what the edit list of a film does.
+    """Read the edit list of a film.
 
     Raises:
         FileFormatError: the file is no film.
