@@ -6,8 +6,8 @@ lost), or none with a known contact and GRF. During a longer one, or a restart o
 may have been lifted: the stance is cut there, and another one begins.
 
 In a short gap the force is interpolated linearly, and lies within the rhombus of all forces that
-change no faster than elsewhere in the stance (docs/method.md). Its half area is the uncertainty of
-the impulse, and its tip the highest possible peak.
+change no faster than elsewhere in the stance (docs/method.md). Half its area bounds the error of
+the impulse, and its tip the peak.
 """
 
 from __future__ import annotations
