@@ -122,7 +122,7 @@ class TrialRows:
 def select_trial_rows(
     reactions: Sequence[GroundReaction], forces: Sequence[BridgedForce], exports: Sequence[Export]
 ) -> TrialRows:
-    """Select the rows from the first to the last with a known force of every foot.
+    """Select the rows between the first and the last known force of all feet.
 
     Args:
         reactions: ground reactions on one time axis, one for each foot.
