@@ -136,7 +136,7 @@ class _Match(NamedTuple):
 def match_contacts(
     touchdowns: Instants, contacts: Instants, near_s: tuple[float, float] = (-math.inf, math.inf)
 ) -> list[tuple[int, int]]:
-    """Match the touchdowns of a film with the contacts of a session; either may lack some.
+    """Match touchdowns in a film with contacts in a session; either may lack some.
 
     Each of the first touchdowns is tried with every contact. The others then agree within their
     uncertainties and the drift, or were missed. A touchdown outside the session costs nothing, but
