@@ -26,6 +26,8 @@ CONNECTION_TOKENS = 10
 """Tokens of a new connection: its handshake and hello cost more than a frame."""
 CONNECTION_BURST_S = 60.0
 """Burst of a connection, in seconds of its rate; a page that wakes sends several pings."""
+NODE_PINGS_PER_S, NODE_BURST_S = 40.0, 3.0
+"""Rate and burst of a node: it measures its clock by pings, some ten a second."""
 SHARED_BURST_S = 4.0
 """Burst of an address and of all; many pages come back at once after a restart."""
 SLICE_FRAMES = 8
@@ -132,7 +134,8 @@ class MessageLimiter:
 
     def make_node_allowance(self) -> Allowance:
         """Return the allowance of a node."""
-        return Allowance(self._make_own(CONNECTION_BURST_S), None, self._clock)
+        own = TokenBucket(NODE_PINGS_PER_S, NODE_BURST_S, self._clock())
+        return Allowance(own, None, self._clock)
 
     def make_refused_allowance(self) -> Allowance:
         """Return the allowance of a connection that is refused: it has to answer a close frame."""
